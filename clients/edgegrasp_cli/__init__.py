@@ -1,0 +1,1 @@
+"""The edgegrasp command line."""

@@ -1,0 +1,1 @@
+"""Light client of the grasp-detection service, over gRPC or REST."""

@@ -1,0 +1,1 @@
+"""PyBullet clutter-removal trials."""

@@ -1,0 +1,1 @@
+"""Edge Grasp Network: networks, pipeline and weights."""

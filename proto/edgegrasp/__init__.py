@@ -1,0 +1,1 @@
+"""Generated protocol of the grasp-detection service."""

@@ -1,0 +1,1 @@
+"""edgegrasp.v1: protobuf messages and gRPC stubs."""

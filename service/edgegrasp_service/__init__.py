@@ -1,0 +1,1 @@
+"""The grasp-detection server: one core, REST and gRPC transports."""
