@@ -1,0 +1,49 @@
+"""Errors the model and the pipeline raise.
+
+EdgeGraspError
+  + InvalidRequest        the caller's input is wrong: names the field, the value and the fix
+  + UnknownModel          no weights of that name are loaded
+  + InvalidCheckpoint     a weights file cannot be used
+  + InvalidGripper        a gripper file cannot be used
+"""
+
+from collections.abc import Iterable
+
+
+class EdgeGraspError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class InvalidRequest(EdgeGraspError):  # noqa: N818
+    """The caller's input is wrong.
+
+    Args:
+        field: Name of the request field, as it is spelled on the wire (`cloud`, `options.seed`).
+        value: What was received, short enough to print.
+        fix: What to send instead, as an imperative sentence.
+    """
+
+    def __init__(self, field: str, value: str, fix: str) -> None:
+        self.field = field
+        self.value = value
+        self.fix = fix
+        super().__init__(f"{field}: got {value}. {fix}")
+
+
+class UnknownModel(EdgeGraspError):  # noqa: N818
+    """No weights of that name are loaded."""
+
+    def __init__(self, name: str, known: Iterable[str]) -> None:
+        self.name = name
+        self.known = sorted(known)
+        super().__init__(
+            f"model: got {name!r}. Use one of: {', '.join(self.known) or 'none loaded'}."
+        )
+
+
+class InvalidCheckpoint(EdgeGraspError):  # noqa: N818
+    """A weights file cannot be used: truncated, foreign, or of another architecture."""
+
+
+class InvalidGripper(EdgeGraspError):  # noqa: N818
+    """A gripper file cannot be used."""
