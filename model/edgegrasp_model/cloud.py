@@ -1,0 +1,137 @@
+"""Turn a raw point cloud into the small, clean cloud with normals that the network sees."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from edgegrasp_model.errors import InvalidRequest
+
+Float32 = NDArray[np.float32]
+
+MAX_EXTENT = 20.0  # metres; a wider cloud is millimetres taken for metres
+OUTLIER_NEIGHBORS = 8
+OUTLIER_DEVIATIONS = 2.5
+NORMAL_RADIUS = 0.012  # metres; about three voxels
+NORMAL_NEIGHBORS = 24
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points and their unit normals, metres, in the caller's frame."""
+
+    points: Float32  # (N, 3)
+    normals: Float32  # (N, 3)
+
+
+def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
+    """Check a caller's array and give it back as float32.
+
+    Args:
+        cloud: (N, 3) float32 or float64, metres.
+        num_approach_points: How many of its points the caller wants as approach points.
+
+    Returns:
+        (N, 3) float32.
+
+    Raises:
+        InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity, an extent that
+            suggests millimetres, or fewer points than approach points.
+    """
+    if not isinstance(cloud, np.ndarray):
+        kind = type(cloud).__name__
+        raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
+    if cloud.dtype not in (np.float32, np.float64):
+        raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise InvalidRequest("cloud", f"shape {cloud.shape}", "Send shape (N, 3): x, y, z a row.")
+    if len(cloud) == 0:
+        raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
+    finite = np.isfinite(cloud).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise InvalidRequest(
+            "cloud",
+            f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
+            "Remove points without a finite x, y, z.",
+        )
+    extent = float(np.ptp(cloud.astype(np.float64), axis=0).max())
+    if extent > MAX_EXTENT:
+        raise InvalidRequest(
+            "cloud",
+            f"an extent of {extent:.4g} m, which suggests millimetres",
+            "Send metres: divide by 1000.",
+        )
+    if len(cloud) < num_approach_points:
+        raise InvalidRequest(
+            "cloud",
+            f"{len(cloud)} points for num_approach_points = {num_approach_points}",
+            "Send more points or lower options.num_approach_points.",
+        )
+    return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
+def voxel_downsample(points: Float32, voxel_size: float) -> Float32:
+    """Replace the points of each occupied voxel by their mean.
+
+    Args:
+        points: (N, 3).
+        voxel_size: Edge of a voxel, metres.
+
+    Returns:
+        (V, 3), ordered by voxel, so that the order of the input does not matter.
+    """
+    low = points.min(axis=0).astype(np.float64)
+    cells = np.floor((points - low) / voxel_size).astype(np.int64)  # (N, 3)
+    sizes = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(voxel, weights=points[:, axis]) for axis in range(3)], axis=1)
+    return (sums / count[:, None]).astype(np.float32)
+
+
+def without_outliers(points: Float32) -> Float32:
+    """Drop points whose mean distance to their neighbours is far above the cloud's own."""
+    if len(points) <= OUTLIER_NEIGHBORS:
+        return points
+    distances, _ = cKDTree(points).query(points, k=OUTLIER_NEIGHBORS + 1)
+    mean = distances[:, 1:].mean(axis=1)
+    return points[mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()]
+
+
+def estimate_normals(points: Float32) -> Float32:
+    """Unit normals by principal components of each neighbourhood, of either sign.
+
+    Args:
+        points: (N, 3).
+
+    Returns:
+        (N, 3): the direction of least variance among at most NORMAL_NEIGHBORS points within
+        NORMAL_RADIUS; z where a point has fewer than two neighbours.
+    """
+    k = min(NORMAL_NEIGHBORS, len(points))
+    distances, rows = cKDTree(points).query(points, k=k, distance_upper_bound=NORMAL_RADIUS)
+    distances, rows = distances.reshape(len(points), k), rows.reshape(len(points), k)
+    present = np.isfinite(distances)
+    rows = np.where(present, rows, np.arange(len(points))[:, None])
+    offsets = points[rows].astype(np.float64) - points[:, None]  # (N, k, 3)
+    weight = present / present.sum(axis=1, keepdims=True)  # (N, k)
+    mean = np.einsum("nk,nkd->nd", weight, offsets)
+    second = np.einsum("nk,nkd,nke->nde", weight, offsets, offsets)  # (N, 3, 3)
+    _, vectors = np.linalg.eigh(second - mean[:, :, None] * mean[:, None, :])
+    normals = vectors[:, :, 0]
+    normals[present.sum(axis=1) < 3] = (0.0, 0.0, 1.0)
+    return normals.astype(np.float32)
+
+
+def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
+    """Turn each normal to the side of its surface that the viewpoint sees."""
+    away = np.einsum("nd,nd->n", normals, viewpoint - points) < 0
+    return np.where(away[:, None], -normals, normals).astype(np.float32)
+
+
+def assumed_viewpoint(points: Float32, up: Float32) -> Float32:
+    """A stand-in for an unknown camera: one metre above the cloud's middle."""
+    middle: Float32 = (points.min(axis=0) + points.max(axis=0)) / 2
+    return middle + up / np.linalg.norm(up)
