@@ -1,0 +1,78 @@
+"""Layers that both networks share."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from edgegrasp_model.ball_batch import BallBatch
+
+
+class SharedLinear(nn.Linear):
+    """A linear layer on rows [own, shared[row]] that multiplies each shared part only once.
+
+    Many ball points (or edge grasps) share one ball feature: W [a, b] = W_a a + W_b b.
+    """
+
+    def forward(self, own: Tensor, shared: Tensor, shared_of_row: Tensor) -> Tensor:  # type: ignore[override]
+        """Applies the layer to own (M, ..., C1) and shared (B, ..., C2)[shared_of_row (M,)]."""
+        own_weight, shared_weight = torch.split(
+            self.weight, [own.shape[-1], shared.shape[-1]], dim=1
+        )
+        once_per_ball = F.linear(shared, shared_weight)  # (B, ..., out)
+        return F.linear(own, own_weight, self.bias) + once_per_ball.index_select(0, shared_of_row)
+
+
+class HandDescription(nn.Module):
+    """Reads a batch's hand description, standardised by stored statistics.
+
+    Until they are set, the description passes as it is.
+    """
+
+    mean: Tensor  # (F,)
+    std: Tensor  # (F,)
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("std", torch.ones(size))
+
+    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Stores mean (F,) and standard deviation (F,) of the training data."""
+        self.mean.copy_(mean)
+        self.std.copy_(std.clamp_min(1e-6))
+
+    def forward(self, batch: BallBatch) -> Tensor:
+        """The standardised description (E, F).
+
+        Raises:
+            ValueError: The batch carries none, or one of another size.
+        """
+        description, size = batch.hand_description, len(self.mean)
+        if description is None or description.shape[1] != size:
+            got = "none" if description is None else f"{description.shape[1]} numbers"
+            raise ValueError(
+                f"hand_description: got {got}. This network takes {size} per edge grasp."
+            )
+        return (description - self.mean) / self.std
+
+
+def mlp(widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def maximum(values: Tensor, dim: int) -> Tensor:
+    """Maximum along a dimension."""
+    # On a processor amax is some ten times faster forward, but its backward several times slower.
+    return values.max(dim).values if torch.is_grad_enabled() else values.amax(dim)
+
+
+def ball_maximum(values: Tensor, batch: BallBatch) -> Tensor:
+    """Maximum of values (P, C) over the points of each ball: (num_balls, C)."""
+    return torch.stack([maximum(ball, dim=0) for ball in torch.split(values, batch.ball_sizes)])

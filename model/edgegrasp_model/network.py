@@ -1,0 +1,129 @@
+"""EdgeGraspNet: scores edge grasps from local, global and grasp features.
+
+Huang, Wang, Zhu, Walters, Platt: "Edge Grasp Network: A Graph-Based SE(3)-invariant Approach to
+Grasp Detection", ICRA 2023, section IV. Widths below are the paper's; P points, B balls, E grasps.
+"""
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.layers import (
+    HandDescription,
+    SharedLinear,
+    ball_maximum,
+    maximum,
+    mlp,
+)
+from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.vn_network import VNEdgeGraspNet
+
+GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
+
+
+class PointNetConv(nn.Module):
+    """Graph convolution: a two-layer MLP on [f_j, p_j - p_i], maximum over neighbours j."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(inputs + 3, width)
+        self.output = nn.Linear(width, width)
+
+    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, inputs) to (P, width)."""
+        # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
+        feature_weight, point_weight = torch.split(
+            self.hidden.weight, [features.shape[1], 3], dim=1
+        )
+        v = F.linear(batch.points, point_weight)  # (P, width)
+        u = F.linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
+        u_of_neighbor = F.embedding(batch.neighbors, u)  # (P, k, width)
+        messages = F.relu(u_of_neighbor - v.unsqueeze(1))  # (P, k, width)
+        # The bias is the same for all neighbours: added once, after the maximum.
+        return maximum(F.linear(messages, self.output.weight), dim=1) + self.output.bias
+
+
+class GlobalFeature(nn.Module):
+    """One feature per ball: MLP, maximum over the ball, joined to each point; the same again."""
+
+    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
+        super().__init__()
+        self.mlp_1 = mlp((inputs, *widths_1))
+        self.join = SharedLinear(inputs + widths_1[-1], widths_2[0])
+        self.mlp_2 = mlp(widths_2)
+
+    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 224) to ball features (B, 1024)."""
+        pooled = ball_maximum(self.mlp_1(local), batch)  # (B, 512)
+        joined = F.relu(self.join(local, pooled, batch.ball_of_point))  # (P, 1024)
+        return ball_maximum(self.mlp_2(joined), batch)
+
+
+class EdgeGraspNet(nn.Module):
+    """The paper's network; with `hand_description_size` also told the cloud in the hand's frame."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width_1, width_2, width_3 = config.conv_widths
+        self.conv1 = PointNetConv(3 + 3, width_1)
+        self.conv2 = PointNetConv(width_1, width_2)
+        self.conv3 = PointNetConv(width_2, width_3)
+        self.ball_feature = GlobalFeature(
+            config.local_width, config.global_widths_1, config.global_widths_2
+        )
+        described = config.hand_description_size
+        self.description = HandDescription(described) if described else None
+        own_width = GRASP_WIDTH + width_3 + described
+        self.join = SharedLinear(
+            own_width + config.global_widths_2[-1], config.classifier_widths[0]
+        )
+        self.classifier = mlp((*config.classifier_widths, 1))
+
+    def forward(self, batch: BallBatch) -> Tensor:
+        """Scores the edge grasps of a batch: logits (E,) of success.
+
+        Raises:
+            ValueError: The batch has no hand description of the size this network was built for.
+        """
+        f1 = F.relu(self.conv1(torch.cat((batch.points, batch.normals), dim=1), batch))  # (P, 32)
+        f2 = F.relu(self.conv2(f1, batch))  # (P, 64)
+        f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
+        ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
+        grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138 + F)
+        hidden = F.relu(self.join(grasp, ball, batch.ball_of_edge))  # (E, 512)
+        logits: Tensor = self.classifier(hidden).squeeze(1)  # (E, 1) -> (E,)
+        return logits
+
+    def _grasp_features(self, batch: BallBatch) -> Tensor:
+        """What is told of each grasp itself, (E, 10 + F)."""
+        contact = batch.contact
+        parts: list[Tensor] = [
+            batch.points[contact],
+            batch.normals[contact],
+            batch.depth.unsqueeze(1),
+            batch.approach,
+        ]
+        if self.description is not None:
+            parts.append(self.description(batch))
+        return torch.cat(parts, dim=1)
+
+
+def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
+    """Builds a network with random weights.
+
+    Args:
+        config: Its architecture and widths.
+        generator: Source of the weights; without one, those of seed 0.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    network = (EdgeGraspNet if config.architecture == "edgegrasp" else VNEdgeGraspNet)(config)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.
+            bound = module.in_features**-0.5
+            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
+            if module.bias is not None:
+                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
+    return network

@@ -1,0 +1,140 @@
+"""VNEdgeGraspNet: EdgeGraspNet on vector neurons; its scores do not change when the cloud turns.
+
+Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. Features are
+(M, 3, C), see `vn_layers`; P points in B balls, E grasps.
+"""
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.layers import HandDescription, mlp
+from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.vn_layers import (
+    VNLinearReLU,
+    VNReLU,
+    VNSharedLinearReLU,
+    vector_maximum,
+    vector_relu,
+)
+
+_POINTS_AT_ONCE = 1024  # bounds the memory of the (points, k, 3, C) messages when not training
+
+
+class VNPointNetConv(nn.Module):
+    """Graph convolution: a two-layer vector MLP on [f_j, p_j - p_i], maximum over neighbours j."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(inputs + 1, width, bias=False)
+        self.hidden_relu = VNReLU(width)
+        self.output = nn.Linear(width, width, bias=False)
+        self.reach = nn.Linear(width, width, bias=False)
+        self.output_relu = VNReLU(width)
+
+    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, inputs) to (P, 3, width)."""
+        # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
+        feature_weight, point_weight = torch.split(
+            self.hidden.weight, [features.shape[2], 1], dim=1
+        )
+        v = F.linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
+        u = F.linear(features, feature_weight) + v  # (P, 3, width)
+        v_direction = self.hidden_relu.direction(v)
+        u_direction = self.hidden_relu.direction(u)
+        pooled = []
+        for rows in torch.split(torch.arange(len(u), device=u.device), _POINTS_AT_ONCE):
+            neighbors = batch.neighbors[rows]  # (p, k)
+            hidden = u[neighbors] - v[rows].unsqueeze(1)  # (p, k, 3, width)
+            direction = u_direction[neighbors] - v_direction[rows].unsqueeze(1)
+            messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
+            pooled.append(vector_maximum(messages, self.reach(messages), dim=1))
+        vectors: Tensor = self.output_relu(torch.cat(pooled))
+        return vectors
+
+
+class VNBallMaximum(nn.Module):
+    """Per channel the vector of each ball that reaches furthest along its learned direction."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.reach = nn.Linear(width, width, bias=False)
+        self.relu = VNReLU(width)
+
+    def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, width) to ball features (B, 3, width)."""
+        sizes = batch.ball_sizes
+        balls = zip(
+            torch.split(vectors, sizes), torch.split(self.reach(vectors), sizes), strict=True
+        )
+        furthest = [vector_maximum(ball, directions, dim=0) for ball, directions in balls]
+        pooled: Tensor = self.relu(torch.stack(furthest))
+        return pooled
+
+
+class VNGlobalFeature(nn.Module):
+    """One feature per ball: vector MLP, maximum, joined to each point; the same again."""
+
+    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
+        super().__init__()
+        self.vn_1 = VNLinearReLU(inputs, widths_1[0])
+        self.vn_2 = VNLinearReLU(widths_1[0], widths_1[1])
+        self.vn_3 = nn.Linear(widths_1[1], widths_1[2], bias=False)
+        self.maximum_1 = VNBallMaximum(widths_1[2])
+        self.join = VNSharedLinearReLU(inputs + widths_1[2], widths_2[0])
+        self.vn_5 = nn.Linear(widths_2[0], widths_2[1], bias=False)
+        self.maximum_2 = VNBallMaximum(widths_2[1])
+
+    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
+        hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
+        pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
+        joined = self.join(local, pooled, batch.ball_of_point)  # (P, 3, 381)
+        ball: Tensor = self.maximum_2(self.vn_5(joined), batch)
+        return ball
+
+
+class VNEdgeGraspNet(nn.Module):
+    """The paper's rotation-invariant network."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width_1, width_2, width_3 = config.conv_widths
+        self.conv1 = VNPointNetConv(2, width_1)
+        self.conv2 = VNPointNetConv(width_1, width_2)
+        self.conv3 = VNPointNetConv(width_2, width_3)
+        self.ball_feature = VNGlobalFeature(
+            config.local_width, config.global_widths_1, config.global_widths_2
+        )
+        channels = 3 + width_3 + config.global_widths_2[-1]  # 3: approach, contact and normal
+        self.frame_1 = VNSharedLinearReLU(channels, channels // 2)
+        self.frame_2 = VNLinearReLU(channels // 2, channels // 4)
+        self.frame_3 = nn.Linear(channels // 4, 3, bias=False)
+        described = config.hand_description_size
+        self.description = HandDescription(described) if described else None
+        self.classifier = mlp((3 * channels + described, *config.classifier_widths, 1))
+
+    def forward(self, batch: BallBatch) -> Tensor:
+        """Scores the edge grasps of a batch: logits (E,) of success.
+
+        Raises:
+            ValueError: The batch has no hand description of the size this network was built for.
+        """
+        contact = batch.contact
+        f1 = self.conv1(torch.stack((batch.points, batch.normals), dim=2), batch)  # (P, 3, 32)
+        f2 = self.conv2(f1, batch)  # (P, 3, 64)
+        f3 = self.conv3(f2, batch)  # (P, 3, 128)
+        ball = self.ball_feature(torch.cat((f1, f2, f3), dim=2), batch)  # (B, 3, 381)
+        named = (batch.approach, batch.points[contact], batch.normals[contact])
+        grasp = torch.cat((torch.stack(named, dim=2), f3[contact]), dim=2)  # (E, 3, 131)
+
+        # Three vectors learned from the grasp turn with it: coordinates along them are invariant.
+        frame = self.frame_3(self.frame_2(self.frame_1(grasp, ball, batch.ball_of_edge)))
+        vectors = torch.cat((grasp, ball[batch.ball_of_edge]), dim=2)  # (E, 3, 512)
+        invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (E, 512, 3) -> (E, 1536)
+        if self.description is not None:
+            invariant = torch.cat((invariant, self.description(batch)), dim=1)
+        logits: Tensor = self.classifier(invariant).squeeze(1)  # (E, 1) -> (E,)
+        return logits
