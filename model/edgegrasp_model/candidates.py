@@ -1,6 +1,6 @@
 """Edge grasps: which contact points around an approach point make a candidate, and its pose."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ Int64 = NDArray[np.int64]
 MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
 MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
+TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand is drawn back
 MIN_APPROACH_UP = -0.1  # the hand does not come from below: cosine of approach and up
 
 
@@ -22,7 +23,7 @@ MIN_APPROACH_UP = -0.1  # the hand does not come from below: cosine of approach 
 class Candidates:
     """Edge grasps of one cloud (paper section III)."""
 
-    ball: Int64  # (E,) which approach point, 0..A-1
+    pair: Int64  # (E,) which of the given pairs of points
     approach_index: Int64  # (E,) p_a, rows of the cloud
     contact_index: Int64  # (E,) p_c, rows of the cloud
     approach: Float32  # (E, 3) unit, outward: from the object back to the hand
@@ -30,12 +31,12 @@ class Candidates:
     T_cloud_hand: Float32  # (E, 4, 4)
 
     def __len__(self) -> int:
-        return len(self.ball)
+        return len(self.pair)
 
     def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Candidates":
         """The candidates of the given rows, in their order."""
         return Candidates(
-            self.ball[rows],
+            self.pair[rows],
             self.approach_index[rows],
             self.contact_index[rows],
             self.approach[rows],
@@ -45,49 +46,36 @@ class Candidates:
 
 
 def edge_grasps(
-    cloud: Cloud,
-    ball: Int64,
-    approach_index: Int64,
-    contact_index: Int64,
-    gripper: Gripper,
-) -> tuple[Candidates, NDArray[np.bool_]]:
-    """Poses of (approach point, contact point) pairs, where the pair defines one.
+    cloud: Cloud, approach_index: Int64, contact_index: Int64, gripper: Gripper
+) -> Candidates:
+    """The candidates among pairs of approach and contact points.
 
     r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
     III-A). The contact ends up at the gripper's contact_z, the approach point on its axis.
 
     Args:
         cloud: The cloud with its normals.
-        ball: (E,) which approach point each pair belongs to.
-        approach_index: (E,) rows of the cloud.
-        contact_index: (E,) rows of the cloud.
-        gripper: Gives the finger depth and the opening.
+        approach_index: (M,) rows of the cloud.
+        contact_index: (M,) rows of the cloud.
+        gripper: Gives the opening and contact_z.
 
     Returns:
-        The candidates that fit the gripper, and which of the E pairs they are (E,).
+        The pairs that define an edge grasp which fits the gripper.
     """
     normal = cloud.normals[contact_index]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    edge = cloud.points[contact_index] - cloud.points[approach_index]  # (E, 3) r
-    ahead = edge - np.einsum("ed,ed->e", edge, normal)[:, None] * normal  # (E, 3) r_perp
+    edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
+    ahead = edge - np.einsum("md,md->m", edge, normal)[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
-    fits = (
-        (length > MIN_EDGE)
-        & (length < gripper.max_opening / 2 - EDGE_MARGIN)
-        & (depth > MIN_DEPTH)
-        & (depth < gripper.max_opening / 2)
+    pair = np.flatnonzero(
+        (length > MIN_EDGE) & (length < gripper.max_opening / 2 - EDGE_MARGIN) & (depth > MIN_DEPTH)
     )
     pose = edge_grasp_poses(
-        cloud.points[approach_index[fits]], ahead[fits], normal[fits], depth[fits], gripper
+        cloud.points[approach_index[pair]], ahead[pair], normal[pair], depth[pair], gripper
     )
     return Candidates(
-        ball[fits],
-        approach_index[fits],
-        contact_index[fits],
-        -pose[:, :3, 2],
-        depth[fits],
-        pose,
-    ), fits
+        pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth[pair], pose
+    )
 
 
 def edge_grasp_poses(
@@ -123,15 +111,41 @@ def from_above(candidates: Candidates, up: Float32) -> NDArray[np.bool_]:
     return candidates.approach @ (up / np.linalg.norm(up)) > MIN_APPROACH_UP
 
 
-def above_support(
-    T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper
-) -> NDArray[np.bool_]:
-    """Which hands, fingers open, have every corner above the support plane.  # (E,)."""
+def drawn_back(candidates: Candidates, support: SupportPlane, gripper: Gripper) -> Candidates:
+    """Draw hands that would cut into the support plane back along their approach, if that helps.
+
+    The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: what
+    lies flat on a table is held by the tips.
+
+    Returns:
+        The candidates whose hands stay above the plane.
+    """
+    clearance = support_clearance(candidates.T_cloud_hand, support, gripper)
+    rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        back = np.where(clearance >= 0, 0.0, -clearance / rise)
+    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
+    pose = candidates.T_cloud_hand[clear]
+    pose[:, :3, 3] += back[clear, None] * candidates.approach[clear]
+    return replace(candidates.take(clear), T_cloud_hand=pose)
+
+
+def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
+    """Height of the lowest corner of each hand, fingers open, over the support plane.
+
+    Args:
+        T_cloud_hand: (E, 4, 4).
+        support: The plane.
+        gripper: Its boxes.
+
+    Returns:
+        (E,) metres; negative below the plane.
+    """
     low, high = np.moveaxis(gripper.boxes(gripper.max_opening), 1, 0)  # (B, 3) each
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
     corners = np.where(picks[None] == 0, low[:, None], high[:, None]).reshape(-1, 3)  # (8B, 3)
     normal = np.asarray(support.normal)
     normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)
     origin_height = T_cloud_hand[:, :3, 3] @ normal - support.offset  # (E,)
-    lowest = (normal_in_hand @ corners.T).min(axis=1)  # (E,)
-    return origin_height + lowest >= 0.0
+    clearance: Float32 = origin_height + (normal_in_hand @ corners.T).min(axis=1)
+    return clearance.astype(np.float32)

@@ -13,8 +13,7 @@ Float32 = NDArray[np.float32]
 MAX_EXTENT = 20.0  # metres; a wider cloud is millimetres taken for metres
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
-NORMAL_RADIUS = 0.012  # metres; about three voxels
-NORMAL_NEIGHBORS = 24
+NORMAL_NEIGHBORS = 20
 
 
 @dataclass(frozen=True)
@@ -95,9 +94,10 @@ def without_outliers(points: Float32) -> Float32:
     """Drop points whose mean distance to their neighbours is far above the cloud's own."""
     if len(points) <= OUTLIER_NEIGHBORS:
         return points
-    distances, _ = cKDTree(points).query(points, k=OUTLIER_NEIGHBORS + 1)
-    mean = distances[:, 1:].mean(axis=1)
-    return points[mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()]
+    distances, _ = cKDTree(points).query(points, k=range(2, OUTLIER_NEIGHBORS + 2))
+    mean = np.mean(distances, axis=1)
+    kept: Float32 = points[mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()]
+    return kept
 
 
 def estimate_normals(points: Float32) -> Float32:
@@ -107,22 +107,14 @@ def estimate_normals(points: Float32) -> Float32:
         points: (N, 3).
 
     Returns:
-        (N, 3): the direction of least variance among at most NORMAL_NEIGHBORS points within
-        NORMAL_RADIUS; z where a point has fewer than two neighbours.
+        (N, 3): the direction of least variance among the NORMAL_NEIGHBORS nearest points.
     """
     k = min(NORMAL_NEIGHBORS, len(points))
-    distances, rows = cKDTree(points).query(points, k=k, distance_upper_bound=NORMAL_RADIUS)
-    distances, rows = distances.reshape(len(points), k), rows.reshape(len(points), k)
-    present = np.isfinite(distances)
-    rows = np.where(present, rows, np.arange(len(points))[:, None])
-    offsets = points[rows].astype(np.float64) - points[:, None]  # (N, k, 3)
-    weight = present / present.sum(axis=1, keepdims=True)  # (N, k)
-    mean = np.einsum("nk,nkd->nd", weight, offsets)
-    second = np.einsum("nk,nkd,nke->nde", weight, offsets, offsets)  # (N, 3, 3)
-    _, vectors = np.linalg.eigh(second - mean[:, :, None] * mean[:, None, :])
-    normals = vectors[:, :, 0]
-    normals[present.sum(axis=1) < 3] = (0.0, 0.0, 1.0)
-    return normals.astype(np.float32)
+    _, rows = cKDTree(points).query(points, k=range(1, k + 1))
+    near = points[rows].astype(np.float64)  # (N, k, 3)
+    near -= near.mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near)  # (N, 3, 3), ascending variance
+    return vectors[:, :, 0].astype(np.float32)
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:

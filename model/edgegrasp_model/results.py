@@ -5,13 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-
 Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """One grasp, ready to execute: move to `T_cloud_hand` along `approach_direction`, then close."""
+    """One grasp to execute: reach `T_cloud_hand` along `approach_direction`, then close."""
 
     score: float  # probability that the grasp holds
     T_cloud_hand: Float32  # (4, 4) hand link frame: z out of the palm, y the closing direction

@@ -1,0 +1,104 @@
+"""The models a process has loaded, by name."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.errors import InvalidCheckpoint, UnknownModel
+from edgegrasp_model.options import DetectOptions
+
+WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
+
+
+class ModelCatalogue:
+    """Named detectors, one of them the default."""
+
+    def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
+        """Collect detectors.
+
+        Args:
+            detectors: By name; at least one.
+            default: Name to use where a request names none; empty: the best that is there.
+
+        Raises:
+            UnknownModel: There is no detector of the default's name.
+            InvalidCheckpoint: There is no detector at all.
+        """
+        if not detectors:
+            raise InvalidCheckpoint("weights: found none. Give a folder with .safetensors files.")
+        self._detectors = dict(detectors)
+        preferred = [name for name in PREFERRED if name in detectors] or sorted(detectors)
+        self.default = default or preferred[0]
+        self.get(self.default)
+
+    @classmethod
+    def load(
+        cls,
+        weights: Sequence[Path] = (),
+        default: str = "",
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Load the weights that ship with the package, then a user's own, which win by name.
+
+        Args:
+            weights: `.safetensors` files, or folders of them; a model is named as its file.
+            default: As for the constructor.
+            device: Where the networks run.
+
+        Raises:
+            InvalidCheckpoint: A file cannot be used, or there is none.
+            UnknownModel: There are no weights of the default's name.
+        """
+        files: dict[str, Path] = {}
+        for source in (WEIGHTS_FOLDER, *weights):
+            found = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
+            files |= {
+                file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
+            }
+        return cls(
+            {name: GraspDetector.load(file, device) for name, file in files.items()}, default
+        )
+
+    def names(self) -> list[str]:
+        """Names of the models, sorted."""
+        return sorted(self._detectors)
+
+    def get(self, name: str = "") -> GraspDetector:
+        """The detector of a name; of the default for an empty one.
+
+        Raises:
+            UnknownModel: There is none.
+        """
+        try:
+            return self._detectors[name or self.default]
+        except KeyError:
+            raise UnknownModel(name or self.default, self._detectors) from None
+
+    def describe(self) -> list[dict[str, Any]]:
+        """What each model is, as plain JSON values."""
+        return [
+            {
+                "name": name,
+                "default": name == self.default,
+                "architecture": detector.metadata.network.architecture,
+                "parameters": sum(p.numel() for p in detector.network.parameters()),
+                "digest": detector.metadata.digest,
+                "crop_radius": detector.metadata.crop_radius,
+                "voxel_size": detector.metadata.voxel_size,
+                "gripper": detector.metadata.gripper,
+                "hand_description": detector.metadata.network.hand_description_size > 0,
+            }
+            for name, detector in sorted(self._detectors.items())
+        ]
+
+    def warm_up(self) -> None:
+        """Run every model once on a small made-up cloud, so that the first request is not slow."""
+        rng = np.random.default_rng(0)
+        box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
+        for detector in self._detectors.values():
+            detector.detect(box, DetectOptions(viewpoint=(0.0, 0.0, 0.5)))

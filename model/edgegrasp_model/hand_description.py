@@ -1,0 +1,240 @@
+"""Describe each candidate by what the cloud looks like from its own hand.
+
+Invariant under rotations and translations of the whole scene by construction, and quick to learn
+from: how many points the hand would hit, what lies between its fingers, how it stands to gravity
+and support. The classifier of `edgegrasp-plus` reads it beside the paper's edge feature.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates import Candidates, support_clearance
+from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.options import SupportPlane
+
+Float32 = NDArray[np.float32]
+
+NEAR = 0.006  # metres around a finger that count as near it
+APPROACH_LENGTH = 0.05  # metres of straight approach before the grasp
+SLAB = 0.004  # metres; thickness of the first layer each finger would meet
+FACING = 0.7  # cosine from which a normal faces a finger
+UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
+CHUNK = 256  # candidates at a time, so that the work stays in cache
+
+
+@dataclass(frozen=True)
+class HandView:
+    """Cloud points in the hand frames of some candidates, those far from the hand left out."""
+
+    candidate: NDArray[np.int64]  # (P,) ascending
+    row: NDArray[np.int64]  # (P,) row of the cloud
+    position: Float32  # (P, 3) in the hand frame
+    num_candidates: int
+
+    def take(self, rows: NDArray[np.int64]) -> "HandView":
+        """The views of the given candidates, which must ascend."""
+        renumbered = np.full(self.num_candidates, -1, dtype=np.int64)
+        renumbered[rows] = np.arange(len(rows))
+        kept = renumbered[self.candidate] >= 0
+        return HandView(
+            renumbered[self.candidate[kept]], self.row[kept], self.position[kept], len(rows)
+        )
+
+
+def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
+    """See the cloud from each hand, within the reach of its boxes and its straight approach.
+
+    Args:
+        cloud: N points.
+        T_cloud_hand: (E, 4, 4).
+        gripper: Its boxes bound what is kept.
+    """
+    boxes = gripper.boxes(gripper.max_opening)
+    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
+    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
+    candidate, row, position = [], [], []
+    for start in range(0, len(T_cloud_hand), CHUNK):
+        pose = T_cloud_hand[start : start + CHUNK]
+        inside = np.ones((len(pose), len(cloud.points)), dtype=bool)
+        along = np.empty((3, *inside.shape), dtype=np.float32)
+        for axis in range(3):
+            direction, origin = pose[:, :3, axis], pose[:, :3, 3]
+            along[axis] = direction @ cloud.points.T
+            along[axis] -= np.einsum("ed,ed->e", direction, origin)[:, None]
+            inside &= (along[axis] > low[axis]) & (along[axis] < high[axis])
+        e, p = np.nonzero(inside)
+        candidate.append(e + start)
+        row.append(p)
+        position.append(along[:, e, p].T)
+    return HandView(
+        np.concatenate(candidate) if candidate else np.empty(0, np.int64),
+        np.concatenate(row) if row else np.empty(0, np.int64),
+        np.concatenate(position) if position else np.empty((0, 3), np.float32),
+        len(T_cloud_hand),
+    )
+
+
+class _Region:
+    """Statistics, per candidate, of the seen points that lie in one region."""
+
+    def __init__(self, view: HandView, mask: NDArray[np.bool_]) -> None:
+        self._mask = mask
+        candidate = view.candidate[mask]
+        self.count = np.bincount(candidate, minlength=view.num_candidates)
+        self._candidate = candidate
+        self._starts = np.cumsum(self.count) - self.count
+        self._present = self.count > 0
+
+    def log_count(self) -> Float32:
+        return np.log1p(self.count).astype(np.float32)
+
+    def mean(self, values: Float32, default: float = 0.0) -> Float32:
+        sums = np.bincount(self._candidate, values[self._mask], minlength=len(self.count))
+        means = sums / np.maximum(self.count, 1)
+        return np.where(self._present, means, default).astype(np.float32)
+
+    def highest(self, values: Float32, default: float = 0.0) -> Float32:
+        result = np.full(len(self.count), default, dtype=np.float32)
+        if self._present.any():
+            starts = self._starts[self._present]
+            result[self._present] = np.maximum.reduceat(values[self._mask], starts)
+        return result
+
+    def lowest(self, values: Float32, default: float = 0.0) -> Float32:
+        return -self.highest(-values, -default)
+
+
+def describe_hands(
+    cloud: Cloud,
+    candidates: Candidates,
+    gripper: Gripper,
+    up: Float32,
+    support: SupportPlane | None,
+    view: HandView | None = None,
+) -> Float32:
+    """The hand-frame description of each candidate.
+
+    Args:
+        cloud: N points with normals.
+        candidates: E candidates.
+        gripper: Fingers open to its maximum.
+        up: (3,) away from gravity.
+        support: Plane that heights are measured from; None where it is unknown.
+        view: `hand_views` of the same candidates, where the caller has it already.
+
+    Returns:
+        (E, HAND_DESCRIPTION_SIZE) counts (logarithm of 1 + n), metres and cosines.
+    """
+    view = view or hand_views(cloud, candidates.T_cloud_hand, gripper)
+    x, y, z = (np.ascontiguousarray(column) for column in view.position.T)
+    turn = candidates.T_cloud_hand[view.candidate, :3, :3]
+    normal = np.einsum("pd,pdk->kp", cloud.normals[view.row], turn)  # (3, P)
+    columns = [
+        *_hits(view, x, y, z, gripper),
+        *_between_fingers(view, x, y, z, normal, gripper),
+        *_stance(cloud, candidates, gripper, up, support),
+    ]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:
+    """Points inside the open hand, near its fingers, on its way in and beyond its tips."""
+    half, inner, outer, base, tip, palm = _finger_box(gripper)
+    hand_x, hand_y, hand_low = _hand_box(gripper)
+    in_line, fingers_z = np.abs(x) < half, (z > base) & (z < tip)
+    beside = (np.abs(x) < half + NEAR) & (z > base) & (z < tip + NEAR)
+    in_hand = (np.abs(x) < hand_x) & (np.abs(y) < hand_y) & (z < palm)
+    swept_finger = in_line & (np.abs(y) > inner) & (np.abs(y) < outer) & (z < tip)
+    regions = [
+        in_line & fingers_z & (y > inner) & (y < outer),
+        in_line & fingers_z & (y < -inner) & (y > -outer),
+        in_hand & (z > hand_low),
+        beside & (y > inner - NEAR) & (y < outer + NEAR),
+        beside & (y < NEAR - inner) & (y > -outer - NEAR),
+        in_hand | (swept_finger & (z > base - APPROACH_LENGTH)),
+        in_line & (np.abs(y) < inner) & (z >= tip),
+    ]
+    return [_Region(view, region).log_count() for region in regions]
+
+
+def _between_fingers(
+    view: HandView, x: Float32, y: Float32, z: Float32, normal: Float32, gripper: Gripper
+) -> list[Float32]:
+    """Extent, middle and normals of what the closing fingers would meet."""
+    half, inner, _, _, tip, palm = _finger_box(gripper)
+    z = z - palm
+    middle = (tip - palm) / 2
+    around = (np.abs(y) < inner) & (z > 0) & (z < tip - palm)
+    inside = around & (np.abs(x) < half)
+    wide = _Region(view, around & (np.abs(x) < 3 * half))
+    between = _Region(view, inside)
+    y_high, y_low = between.highest(y), between.lowest(y)
+    nx, ny, nz = normal
+    columns = [
+        between.log_count(),
+        *(between.highest(x), between.lowest(x), between.mean(x)),
+        *(y_high, y_low, between.mean(y)),
+        *(between.highest(z), between.lowest(z, tip - palm), between.mean(z, middle)),
+        *(wide.log_count(), wide.highest(x), wide.lowest(x), wide.mean(x)),
+        *(between.mean(np.abs(nx)), between.mean(np.abs(ny)), between.mean(nz)),
+        _Region(view, inside & (ny > FACING)).log_count(),
+        _Region(view, inside & (ny < -FACING)).log_count(),
+        _Region(view, inside & (y > 0)).mean(ny),
+        _Region(view, inside & (y < 0)).mean(ny),
+    ]
+    for first in (y > y_high[view.candidate] - SLAB, y < y_low[view.candidate] + SLAB):
+        slab = _Region(view, inside & first)  # what a finger meets first
+        columns += [slab.log_count(), slab.mean(ny), slab.mean(z, middle), slab.mean(x)]
+    return columns
+
+
+def _stance(
+    cloud: Cloud,
+    candidates: Candidates,
+    gripper: Gripper,
+    up: Float32,
+    support: SupportPlane | None,
+) -> list[Float32]:
+    """The edge itself, and how the hand stands to gravity and to the support plane."""
+    up = up / np.linalg.norm(up)
+    pose = candidates.T_cloud_hand
+    contact = cloud.points[candidates.contact_index]  # (E, 3)
+    edge = contact - cloud.points[candidates.approach_index]
+    columns = [
+        candidates.depth,
+        np.linalg.norm(edge, axis=1),
+        np.einsum("ed,ed->e", edge, pose[:, :3, 1]),
+        candidates.approach @ up,
+        np.abs(pose[:, :3, 1] @ up),
+    ]
+    if support is None:
+        return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * 3
+    normal = np.asarray(support.normal)
+    tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
+    heights = [
+        tips @ normal - support.offset,
+        contact @ normal - support.offset,
+        support_clearance(pose, support, gripper),
+    ]
+    return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
+
+
+def _finger_box(gripper: Gripper) -> tuple[float, float, float, float, float, float]:
+    """Half width, inner and outer y, base and tip z of the open fingers, and the palm's z."""
+    fingers = np.asarray(gripper.finger_boxes)  # (F, 2, 3)
+    inner = gripper.max_opening / 2
+    half, thickness = float(fingers[:, 1, 0].max()), float(fingers[:, 1, 1].max())
+    base = float(fingers[:, 0, 2].min())
+    return half, inner, inner + thickness, base, gripper.tip_z, gripper.palm_z
+
+
+def _hand_box(gripper: Gripper) -> tuple[float, float, float]:
+    """Half extents in x and y, and the lowest z, of the hand without its fingers."""
+    hand = np.asarray(gripper.hand_boxes)
+    return float(hand[:, 1, 0].max()), float(hand[:, 1, 1].max()), float(hand[:, 0, 2].min())
+
+
+HAND_DESCRIPTION_SIZE = 44
