@@ -1,0 +1,47 @@
+# EdgeGrasp: `make help` lists what there is.
+#
+# PYTHON names the interpreter that makes .venv: make PYTHON=python3.12 venv
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help venv lint format test demo proto constraints clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+venv: $(INSTALLED) ## make .venv with everything, and the system libraries it needs
+
+$(INSTALLED): pyproject.toml constraints.txt scripts/system_packages.sh
+	scripts/system_packages.sh $(PYTHON)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+lint: $(INSTALLED) ## style, types, import boundaries, generated code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(INSTALLED) ## rewrite the code in the project's style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+test: $(INSTALLED) ## run the tests
+	$(BIN)/pytest -q
+
+demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
+	$(BIN)/python examples/demo.py
+
+proto: $(INSTALLED) ## generate the gRPC code from proto/
+	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/generate_proto.sh
+
+constraints: ## resolve the dependencies afresh into constraints.txt
+	scripts/update_constraints.sh $(PYTHON)
+
+clean: ## remove .venv and everything built or cached
+	rm -rf $(VENV) build dist demo_output .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# Resolve every dependency afresh in a throw-away environment and write the exact versions to
+# constraints.txt. Run it after changing a dependency in pyproject.toml.
+#
+# usage: scripts/update_constraints.sh [python]
+set -euo pipefail
+
+cd "$(dirname "$0")/.."
+python=${1:-python3}
+environment=build/constraints-venv
+
+# The resolver would take the newest torch; this is the one that is tested, and the build without
+# CUDA carries the same version number.
+torch=2.13.0
+
+rm -rf "$environment"
+"$python" -m venv "$environment"
+"$environment/bin/pip" install --quiet --constraint <(echo "torch==$torch") --editable '.[dev]'
+
+# A local version label (+cpu) names one build; CUDA's own packages come with the other build.
+{
+    echo "# Exact versions of everything '.[dev]' installs; written by scripts/update_constraints.sh."
+    "$environment/bin/pip" freeze --exclude-editable --exclude edgegrasp |
+        sed -e 's/+cpu$//' |
+        grep -v -i -E '^(nvidia-|cuda-|triton==)'
+} >build/constraints.txt
+mv build/constraints.txt constraints.txt
+echo "constraints.txt: $(grep -c == constraints.txt) packages"
