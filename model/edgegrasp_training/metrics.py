@@ -1,0 +1,58 @@
+"""How well scores separate grasps that hold from grasps that do not."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.special import expit
+from scipy.stats import rankdata
+
+FloatArray = NDArray[np.floating]
+
+
+def cross_entropy(logit: FloatArray, label: FloatArray) -> float:
+    """Mean binary cross entropy, nats.  # (E,), (E,)."""
+    return float(np.mean(np.logaddexp(0.0, logit) - label * logit))
+
+
+def accuracy(logit: FloatArray, label: FloatArray) -> float:
+    """Share of labels that `logit > 0` predicts.  # (E,), (E,)."""
+    return float(np.mean((logit > 0) == (label > 0.5)))
+
+
+def auroc(logit: FloatArray, label: FloatArray) -> float:
+    """Chance that a success outscores a failure, ties counting half; nan with one class."""
+    positive = label > 0.5
+    successes, failures = int(positive.sum()), int((~positive).sum())
+    if successes == 0 or failures == 0:
+        return float("nan")
+    ranks = rankdata(logit)
+    excess = ranks[positive].sum() - successes * (successes + 1) / 2
+    return float(excess / (successes * failures))
+
+
+def fit_temperature(logit: FloatArray, label: FloatArray) -> float:
+    """The t for which sigmoid(logit / t) is best calibrated: least cross entropy."""
+    logit, label = logit.astype(np.float64), label.astype(np.float64)
+    best = minimize_scalar(
+        lambda log_t: cross_entropy(logit / np.exp(log_t), label),
+        bounds=(-2.0, 2.0),
+        method="bounded",
+    )
+    return float(np.exp(best.x))
+
+
+def reliability(
+    logit: FloatArray, label: FloatArray, bins: int = 10
+) -> list[tuple[float, float, int]]:
+    """Mean predicted probability, observed success rate and count of each occupied bin."""
+    probability = expit(logit)
+    which = np.minimum((probability * bins).astype(int), bins - 1)
+    return [
+        (
+            float(probability[which == b].mean()),
+            float(label[which == b].mean()),
+            int((which == b).sum()),
+        )
+        for b in range(bins)
+        if (which == b).any()
+    ]

@@ -1,0 +1,237 @@
+"""The training loop: resumable to the step, stops by itself, keeps the best network."""
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.layers import HandDescription
+from edgegrasp_model.network import build_network
+from edgegrasp_training.examples import TriedGrasps, pack, rotated, tried_grasps
+from edgegrasp_training.metrics import accuracy, auroc, cross_entropy, fit_temperature
+from edgegrasp_training.views import load_view
+
+VIEWS_IN_MEMORY = 4000
+STATE_FILE, LOG_FILE = "state.pt", "log.csv"
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How to train; the defaults are the recipe for two processor cores."""
+
+    steps: int = 20_000
+    views_per_step: int = 4
+    balls_per_view: int = 8
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    patience: int = 6  # evaluations without a better loss before the learning rate is halved
+    halvings: int = 4  # stop at the next one
+    evaluate_every: int = 250  # steps
+    unknown_support: float = 0.1  # share of training views described without their table
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A network on the validation views."""
+
+    loss: float  # cross entropy, nats
+    accuracy: float
+    auroc: float
+    temperature: float  # that calibrates the logits
+    logit: NDArray[np.float32]  # (E,)
+    label: NDArray[np.float32]  # (E,)
+
+
+class Trainer:
+    """Trains one network; everything it needs to go on is in its run folder."""
+
+    def __init__(
+        self,
+        metadata: CheckpointMetadata,
+        train_paths: list[Path],
+        validation_paths: list[Path],
+        folder: Path,
+        options: TrainingOptions,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Set up, and go on from the folder's last state if there is one.
+
+        Args:
+            metadata: Name, widths and gripper of the network to train.
+            train_paths: View files.
+            validation_paths: View files of other scenes.
+            folder: Gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far.
+            options: The recipe.
+            device: Where the network runs.
+        """
+        self.metadata, self.folder, self.options, self.device = metadata, folder, options, device
+        self.train_paths, self.validation_paths = train_paths, validation_paths
+        self.gripper = load_gripper(metadata.gripper)
+        self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
+        generator = torch.Generator().manual_seed(options.seed)
+        self.network = build_network(metadata.network, generator).to(device)
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
+        )
+        self.step, self.best_loss, self.since_best, self.halved = 0, float("inf"), 0, 0
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / STATE_FILE).is_file():
+            self._resume()
+        else:
+            self._standardise()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are done or the learning rate has been halved often enough."""
+        return self.step >= self.options.steps or self.halved > self.options.halvings
+
+    def run(self, progress: Callable[[int, float], None], until: int | None = None) -> None:
+        """Train until finished, or up to a step.
+
+        Args:
+            progress: Called after each step with its number and training loss.
+            until: Step to stop at, for a run in parts.
+        """
+        while not self.finished and (until is None or self.step < until):
+            loss = self._train_step()
+            self.step += 1
+            progress(self.step, loss)
+            if self.step % self.options.evaluate_every == 0 or self.step == self.options.steps:
+                self._after_evaluation(self.evaluate(balls_per_view=8), loss)
+        self._save_state()
+
+    def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
+        """Score the validation views; of each at most so many balls, or all of them."""
+        self.network.eval()
+        logits, labels = [], []
+        with torch.inference_mode():
+            for number, path in enumerate(self.validation_paths):
+                grasps, _ = self._tried(path)
+                balls = grasps.balls()
+                if balls_per_view is not None and len(balls) > balls_per_view:
+                    rng = np.random.default_rng([self.options.seed, number])
+                    balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
+                batch, label = pack(grasps, balls, self.metadata.network)
+                logits.append(self.network(batch.to(self.device)).float().cpu())
+                labels.append(label)
+        logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
+        return Evaluation(
+            cross_entropy(logit, label_array),
+            accuracy(logit, label_array),
+            auroc(logit, label_array),
+            fit_temperature(logit, label_array),
+            logit,
+            label_array,
+        )
+
+    def _train_step(self) -> float:
+        self.network.train()
+        batch, label = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
+        logit: Tensor = self.network(batch.to(self.device))
+        loss = F.binary_cross_entropy_with_logits(logit, label.to(self.device))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        return float(loss.detach())
+
+    def _training_batch(self, rng: np.random.Generator) -> tuple[BallBatch, Tensor]:
+        """Some balls of some views; the step number alone decides which."""
+        count = min(self.options.views_per_step, len(self.train_paths))
+        batches, labels = [], []
+        for index in rng.choice(len(self.train_paths), count, replace=False):
+            known, unknown = self._tried(self.train_paths[index])
+            grasps = unknown if rng.random() < self.options.unknown_support else known
+            balls = grasps.balls()
+            chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
+            batch, label = pack(grasps, np.sort(chosen), self.metadata.network)
+            # The conventional network must learn invariance; Vector Neurons have it.
+            if self.metadata.network.architecture == "edgegrasp":
+                batch = rotated(batch, rng)
+            batches.append(batch)
+            labels.append(label)
+        return BallBatch.concatenate(batches), torch.cat(labels)
+
+    def _read(self, path: Path) -> tuple[TriedGrasps, TriedGrasps]:
+        """The tried grasps of a view, described with and without its table."""
+        view, network = load_view(path), self.metadata.network
+        return (
+            tried_grasps(view, network, self.gripper),
+            tried_grasps(view, network, self.gripper, support_known=False),
+        )
+
+    def _standardise(self) -> None:
+        """Fit the description's mean and spread to the training views."""
+        if not self.metadata.network.hand_description_size:
+            return
+        described = [self._tried(path)[0].description for path in self.train_paths]
+        values = np.concatenate([d for d in described if d is not None]).astype(np.float32)
+        for module in self.network.modules():
+            if isinstance(module, HandDescription):
+                mean, std = values.mean(axis=0), values.std(axis=0)
+                module.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
+
+    def _after_evaluation(self, evaluation: Evaluation, train_loss: float) -> None:
+        self.since_best += 1
+        if evaluation.loss < self.best_loss:
+            self.best_loss, self.since_best = evaluation.loss, 0
+            save_checkpoint(
+                self.folder / f"{self.metadata.name}.safetensors", self.network, self.metadata
+            )
+        elif self.since_best >= self.options.patience:
+            self.since_best, self.halved = 0, self.halved + 1
+            for group in self.optimizer.param_groups:
+                group["lr"] /= 2
+        self._log(evaluation, train_loss)
+        self._save_state()
+
+    def _log(self, evaluation: Evaluation, train_loss: float) -> None:
+        path = self.folder / LOG_FILE
+        row = {
+            "step": self.step,
+            "learning_rate": self.optimizer.param_groups[0]["lr"],
+            "train_loss": round(train_loss, 5),
+            "validation_loss": round(evaluation.loss, 5),
+            "accuracy": round(evaluation.accuracy, 5),
+            "auroc": round(evaluation.auroc, 5),
+        }
+        new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, row)
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+
+    def _save_state(self) -> None:
+        state = {
+            "step": self.step,
+            "best_loss": self.best_loss,
+            "since_best": self.since_best,
+            "halved": self.halved,
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+        partial = self.folder / (STATE_FILE + ".partial")
+        torch.save(state, partial)
+        partial.replace(self.folder / STATE_FILE)
+
+    def _resume(self) -> None:
+        state: dict[str, Any] = torch.load(
+            self.folder / STATE_FILE, weights_only=True, map_location=self.device
+        )
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.step, self.best_loss = state["step"], state["best_loss"]
+        self.since_best, self.halved = state["since_best"], state["halved"]

@@ -1,0 +1,92 @@
+"""Labelled views: what a data generator writes and a trainer reads."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+UNTRIED = -1  # label of a candidate that no simulated hand has tried
+
+
+@dataclass(frozen=True)
+class LabelledView:
+    """One observed cloud and some of its edge grasps, tried in simulation; world frame, metres."""
+
+    points: Float32  # (N, 3) voxelised
+    normals: Float32  # (N, 3) unit, turned to the camera
+    camera_position: Float32  # (3,)
+    approach_index: NDArray[np.int64]  # (E,) rows of `points`
+    contact_index: NDArray[np.int64]  # (E,) rows of `points`
+    drawn_back: Float32  # (E,) metres the hand was drawn back from the support plane
+    success: NDArray[np.int8]  # (E,) 1 held, 0 not, UNTRIED
+
+    def save(self, path: Path) -> None:
+        """Write the view; a reader sees the whole file or none."""
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez_compressed(
+                file,
+                points=self.points,
+                normals=self.normals.astype(np.float16),
+                camera_position=self.camera_position,
+                approach_index=self.approach_index.astype(np.uint16),
+                contact_index=self.contact_index.astype(np.uint16),
+                drawn_back=self.drawn_back.astype(np.float16),
+                success=self.success,
+            )
+        partial.replace(path)
+
+    def tried(self) -> NDArray[np.int64]:
+        """Rows of the candidates that have a label."""
+        return np.flatnonzero(self.success != UNTRIED)
+
+
+def load_view(path: Path) -> LabelledView:
+    """Read a view; files without `drawn_back` hold hands that were never drawn back."""
+    with np.load(path, allow_pickle=False) as arrays:
+        success = arrays["success"]
+        drawn_back = arrays["drawn_back"] if "drawn_back" in arrays else np.zeros(len(success))
+        return LabelledView(
+            points=arrays["points"].astype(np.float32),
+            normals=arrays["normals"].astype(np.float32),
+            camera_position=arrays["camera_position"].astype(np.float32),
+            approach_index=arrays["approach_index"].astype(np.int64),
+            contact_index=arrays["contact_index"].astype(np.int64),
+            drawn_back=drawn_back.astype(np.float32),
+            success=success.astype(np.int8),
+        )
+
+
+def find_views(folders: list[Path]) -> list[Path]:
+    """All view files of some folders, sorted by name.
+
+    Raises:
+        FileNotFoundError: There is none.
+    """
+    paths = [path for folder in folders for path in folder.glob("*.npz")]
+    if not paths:
+        names = ", ".join(str(folder) for folder in folders)
+        raise FileNotFoundError(f"data: no .npz views in {names}. Run edgegrasp generate-data.")
+    return sorted(paths, key=lambda path: path.name)
+
+
+def scene_of(path: Path) -> str:
+    """The scene a view shows: its file name is scene kind, scene number, view."""
+    return path.stem.rsplit("_", 1)[0]
+
+
+def split_by_scene(
+    paths: list[Path], validation_share: float, seed: int
+) -> tuple[list[Path], list[Path]]:
+    """Training and validation views; all views of one scene fall on the same side."""
+    scenes = sorted({scene_of(path) for path in paths})
+    count = max(1, round(validation_share * len(scenes)))
+    chosen = np.random.default_rng(seed).choice(len(scenes), count, replace=False)
+    held_out = {scenes[i] for i in chosen}
+    return (
+        [path for path in paths if scene_of(path) not in held_out],
+        [path for path in paths if scene_of(path) in held_out],
+    )
