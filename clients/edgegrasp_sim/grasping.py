@@ -1,0 +1,96 @@
+"""Executing a grasp: approach, close, retreat, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edgegrasp_sim.gripper import MAX_OPENING
+from edgegrasp_sim.poses import Matrix, translation
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from edgegrasp_sim.gripper import Gripper
+
+PREGRASP_DISTANCE = 0.05  # metres back along the approach
+RETREAT_DISTANCE = 0.10  # metres
+SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand lifts straight up
+# The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
+STEP_LENGTH = 0.002  # metres in each time step
+MIN_OPENING = 0.1 * MAX_OPENING
+
+
+class GraspOutcome(StrEnum):
+    """What came of a grasp."""
+
+    SUCCESS = "success"
+    PREGRASP = "pregrasp"
+    AFTER = "after"
+
+
+@dataclass(frozen=True, slots=True)
+class GraspResult:
+    """What came of a grasp, and how.
+
+    Attributes:
+        outcome: `SUCCESS`; `PREGRASP`: contact at the start pose (only where that is a failure);
+            `AFTER`: nothing held at the end.
+        opening: metres between the fingers at the end.
+        start_contact: whether the open hand overlapped something at its start pose.
+        held_uid: the body held, None if nothing is.
+    """
+
+    outcome: GraspOutcome
+    opening: float
+    start_contact: bool
+    held_uid: int | None
+
+    @property
+    def success(self) -> bool:
+        """Whether the hand came away holding something."""
+        return self.outcome is GraspOutcome.SUCCESS
+
+
+def run_grasp(
+    gripper: Gripper,
+    T_world_hand: Matrix,
+    object_uids: Collection[int],
+    *,
+    start_contact_fails: bool,
+) -> GraspResult:
+    """Run a grasp from its start pose to the end of the retreat; the hand stays there.
+
+    Args:
+        gripper: the hand to use.
+        T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
+        object_uids: bodies that may be held.
+        start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
+    """
+    gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
+    gripper.world.detect_collisions()
+    start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
+    if start_contact and start_contact_fails:
+        return GraspResult(GraspOutcome.PREGRASP, gripper.opening, start_contact, None)
+
+    gripper.move_to(T_world_hand, step_length=STEP_LENGTH)
+    gripper.close()
+    gripper.move_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
+
+    touched = [contact.other_uid for contact in gripper.body.contacts()]
+    held = next((uid for uid in touched if uid in object_uids), None)
+    opening = gripper.opening
+    if held is not None and opening > MIN_OPENING:
+        return GraspResult(GraspOutcome.SUCCESS, opening, start_contact, held)
+    return GraspResult(GraspOutcome.AFTER, opening, start_contact, None)
+
+
+def retreat_pose(T_world_hand: Matrix) -> Matrix:
+    """Where a hand goes after closing: back along the approach, or up after a side grasp."""
+    approach = T_world_hand[:3, 2]
+    if -approach[2] < np.cos(SIDE_GRASP_ANGLE):
+        return translation(0.0, 0.0, RETREAT_DISTANCE) @ T_world_hand
+    return T_world_hand @ translation(0.0, 0.0, -RETREAT_DISTANCE)

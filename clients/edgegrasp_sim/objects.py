@@ -1,0 +1,117 @@
+"""Object sets: folders of URDF files, and a set made from what ships with PyBullet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pybullet_data
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+class SceneKind(StrEnum):
+    """How a scene is made: objects stood upright one by one, or dropped on a heap."""
+
+    PACKED = "packed"
+    PILE = "pile"
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectModel:
+    """An object that can be put into a scene.
+
+    Attributes:
+        name: unique within its set.
+        urdf: its description.
+        scale: factor that brings it to the size of the hand, before a scene's own scale.
+    """
+
+    name: str
+    urdf: Path
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSet:
+    """Objects to draw scenes from.
+
+    Attributes:
+        name: what to call the set in a report.
+        models: at least one, in an order that is the same on every machine.
+    """
+
+    name: str
+    models: tuple[ObjectModel, ...]
+
+    def __post_init__(self) -> None:
+        if not self.models:
+            raise ValueError(f"object set {self.name!r} is empty; pass at least one object")
+
+    def sample(self, rng: np.random.Generator) -> ObjectModel:
+        """Draw one object, uniformly."""
+        return self.models[int(rng.integers(len(self.models)))]
+
+    @classmethod
+    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> ObjectSet:
+        """The objects `<root>/<scene>/<split>/*.urdf`, sorted by name (VGN's layout).
+
+        Raises:
+            FileNotFoundError: there is no such folder or no URDF file in it.
+        """
+        folder = root / scene / split
+        urdfs = sorted(folder.glob("*.urdf"))
+        if not urdfs:
+            raise FileNotFoundError(
+                f"no *.urdf files in {folder}; an object folder holds <scene>/<split>/<name>.urdf "
+                "with scene packed or pile and split train or test"
+            )
+        return cls(f"{scene}/{split}", tuple(ObjectModel(path.stem, path) for path in urdfs))
+
+    @classmethod
+    def builtin(cls, scene: SceneKind) -> ObjectSet:
+        """Graspable objects that ship with PyBullet, scaled to the hand."""
+        root = Path(pybullet_data.getDataPath())
+        models = tuple(
+            ObjectModel(name, root / file, scale)
+            for name, file, scale, stands in _BUILTIN
+            if stands or scene is SceneKind.PILE
+        )
+        return cls(f"builtin/{scene}", models)
+
+
+def _blob(number: int, scale: float, *, stands: bool) -> tuple[str, str, float, bool]:
+    name = f"{number:03d}"
+    return f"blob_{name}", f"random_urdfs/{name}/{name}.urdf", scale, stands
+
+
+# Name, file under pybullet_data, scale, and whether it stands upright in a packed scene.
+_BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
+    ("cube", "cube_small.urdf", 1.2, True),
+    ("brick", "lego/lego.urdf", 2.0, True),
+    ("mug", "objects/mug.urdf", 0.8, True),
+    ("domino", "domino/domino.urdf", 2.4, True),
+    ("jenga", "jenga/jenga.urdf", 0.9, False),
+    ("block", "block.urdf", 1.5, False),
+    ("duck", "duck_vhacd.urdf", 1.0, False),
+    ("teddy", "teddy_vhacd.urdf", 1.0, False),
+    _blob(3, 1.3, stands=True),
+    _blob(8, 1.0, stands=True),
+    _blob(21, 1.3, stands=True),
+    _blob(36, 1.4, stands=True),
+    _blob(41, 1.0, stands=True),
+    _blob(45, 1.3, stands=True),
+    _blob(51, 1.2, stands=True),
+    _blob(61, 1.2, stands=True),
+    _blob(0, 1.0, stands=False),
+    _blob(2, 1.0, stands=False),
+    _blob(9, 1.2, stands=False),
+    _blob(14, 1.1, stands=False),
+    _blob(16, 1.1, stands=False),
+    _blob(39, 1.0, stands=False),
+    _blob(59, 1.1, stands=False),
+    _blob(66, 1.1, stands=False),
+)

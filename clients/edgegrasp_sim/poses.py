@@ -1,0 +1,55 @@
+"""Rigid transforms as 4 x 4 matrices; a name `T_a_b` maps coordinates of frame b to frame a."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+Matrix: TypeAlias = "NDArray[np.float64]"
+
+
+def quaternion_xyzw(T: Matrix) -> list[float]:
+    """The rotation part of a 4 x 4 transform as a quaternion `xyzw`."""
+    return [float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat()]
+
+
+def translation(x: float, y: float, z: float) -> Matrix:
+    """A 4 x 4 transform that moves by (x, y, z) metres and does not turn."""
+    T = np.eye(4)
+    T[:3, 3] = (x, y, z)
+    return T
+
+
+def yaw_quaternion_xyzw(angle: float) -> list[float]:
+    """A turn about world z by `angle` radians, as a quaternion `xyzw`."""
+    return [0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))]
+
+
+def require_pose(T: ArrayLike, field: str) -> Matrix:
+    """Check that `T` is a finite rigid transform.
+
+    Args:
+        T: (4, 4), metres.
+        field: the name that an error shall carry.
+
+    Raises:
+        ValueError: wrong shape, values that are not finite, or no rotation in the upper left.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{field} has shape {matrix.shape}; pass one 4 x 4 transform")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{field} holds values that are not finite; pass a rigid transform")
+    rotation = matrix[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"{field} is no rigid transform (R Rᵀ is off the identity by {error:.3g}, "
+            f"det {np.linalg.det(rotation):.3g}); pass a right-handed rotation without scale"
+        )
+    return matrix

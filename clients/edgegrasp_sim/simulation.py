@@ -1,0 +1,312 @@
+"""Clutter removal in simulation: make a scene, look at it, grasp in it."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from edgegrasp_sim.camera import EVALUATION_VIEWS, Camera, ViewRange
+from edgegrasp_sim.grasping import GraspResult, run_grasp
+from edgegrasp_sim.gripper import Gripper
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.poses import require_pose
+from edgegrasp_sim.scene import (
+    SIZE,
+    TABLE_HEIGHT,
+    SceneObject,
+    add_table,
+    load_object,
+    make_packed,
+    make_pile,
+    settle,
+)
+from edgegrasp_sim.world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from edgegrasp_sim.poses import Matrix
+
+# Lowest and highest corner of what an observation keeps; the table itself is cut off.
+WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
+NOISE_STD = 0.001  # metres
+_CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one depth image shows of the workspace.
+
+    Attributes:
+        cloud: (N, 3) float32, world frame, metres; no table, order of the pixels.
+        T_world_camera: (4, 4) pose of the camera (z along the line of sight, y down).
+        camera_position: (3,) float32, world frame, metres.
+        workspace: (2, 3) float32, lowest and highest corner of the crop.
+        table_height: metres.
+    """
+
+    cloud: NDArray[np.float32]
+    T_world_camera: Matrix
+    camera_position: NDArray[np.float32]
+    workspace: NDArray[np.float32]
+    table_height: float
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectPlacement:
+    """Where an object is.
+
+    Attributes:
+        urdf: its description.
+        scale: factor on the description's size.
+        position: centre of mass, world frame, metres.
+        quaternion_xyzw: orientation in the world.
+    """
+
+    urdf: Path
+    scale: float
+    position: tuple[float, float, float]
+    quaternion_xyzw: tuple[float, float, float, float]
+
+
+class ClutterSimulation:
+    """A table with objects, a depth camera and a floating hand.
+
+    Equal calls after equal seeds give equal results, whatever was simulated before.
+
+    Args:
+        objects: what to make scenes from, for each kind; the built-in sets by default.
+        gui: show PyBullet's window.
+        start_contact_fails: call a grasp failed (`PREGRASP`) if the open hand overlaps anything
+            at its start pose. The reference simulator asks for contacts there before the engine
+            has looked for any, so that it never fails a grasp for this and lets the engine push
+            hand and objects apart; off by default, to agree with it.
+    """
+
+    def __init__(
+        self,
+        objects: Mapping[SceneKind, ObjectSet] | None = None,
+        *,
+        gui: bool = False,
+        start_contact_fails: bool = False,
+    ) -> None:
+        self.object_sets = (
+            dict(objects)
+            if objects is not None
+            else {kind: ObjectSet.builtin(kind) for kind in SceneKind}
+        )
+        self.start_contact_fails = start_contact_fails
+        self.world = World(gui=gui)
+        self.camera = Camera(self.world)
+        self._objects: list[SceneObject] = []
+        self._gripper: Gripper | None = None
+        self._try_state: int | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the physics server. Safe to call twice."""
+        self.world.close()
+
+    @property
+    def num_objects(self) -> int:
+        """How many objects are left."""
+        return len(self._objects)
+
+    @property
+    def placements(self) -> list[ObjectPlacement]:
+        """Where the objects are; `reset_from_poses` takes them back."""
+        return [
+            ObjectPlacement(
+                item.model.urdf,
+                item.scale * item.model.scale,
+                (float(x), float(y), float(z)),
+                item.body.quaternion_xyzw,
+            )
+            for item in self._objects
+            for x, y, z in [item.body.position]
+        ]
+
+    def reset(self, scene: SceneKind | str, rng: np.random.Generator, num_objects: int = 5) -> int:
+        """Make a new scene at rest.
+
+        Args:
+            scene: `packed` or `pile`.
+            rng: the scene's own stream.
+            num_objects: how many to try to place.
+
+        Returns:
+            How many objects are there.
+
+        Raises:
+            ValueError: unknown scene, no object set for it, or `num_objects` below 1.
+        """
+        kind = _scene_kind(scene)
+        if num_objects < 1:
+            raise ValueError(f"num_objects is {num_objects}; ask for at least 1")
+        objects = self.object_sets.get(kind)
+        if objects is None:
+            raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
+        self._clear()
+        make = make_packed if kind is SceneKind.PACKED else make_pile
+        self._objects = make(self.world, objects, rng, num_objects)
+        self._add_gripper()
+        return self.num_objects
+
+    def reset_from_poses(self, placements: Sequence[ObjectPlacement]) -> None:
+        """Put objects exactly where they are said to be, at rest, without letting time pass.
+
+        Raises:
+            FileNotFoundError: an object's file is missing.
+            ValueError: PyBullet cannot read it.
+        """
+        self._clear()
+        for placement in placements:
+            model = ObjectModel(placement.urdf.stem, placement.urdf)
+            item = load_object(
+                self.world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), placement.scale
+            )
+            item.body.set_pose(placement.position, placement.quaternion_xyzw)
+            self._objects.append(item)
+        self._add_gripper()
+
+    def observe(
+        self,
+        rng_camera: np.random.Generator,
+        rng_noise: np.random.Generator,
+        *,
+        views: ViewRange = EVALUATION_VIEWS,
+        noise_std: float = NOISE_STD,
+    ) -> Observation:
+        """Look at the scene once, from a random viewpoint.
+
+        Args:
+            rng_camera: stream of the viewpoint.
+            rng_noise: stream of the noise.
+            views: where the camera may stand.
+            noise_std: standard deviation of the noise in each coordinate of each point, metres.
+        """
+        return self.observe_from(views.sample(rng_camera), rng_noise, noise_std=noise_std)
+
+    def observe_from(
+        self,
+        T_world_camera: Matrix,
+        rng_noise: np.random.Generator,
+        *,
+        noise_std: float = NOISE_STD,
+    ) -> Observation:
+        """Look at the scene once from `T_world_camera`, (4, 4)."""
+        depth = self.camera.render_depth(T_world_camera)
+        points = _crop(self.camera.points(depth, T_world_camera), _CROP_MARGIN)
+        points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
+        return Observation(
+            cloud=_crop(points, 0.0).astype(np.float32),
+            T_world_camera=T_world_camera,
+            camera_position=T_world_camera[:3, 3].astype(np.float32),
+            workspace=WORKSPACE.astype(np.float32),
+            table_height=TABLE_HEIGHT,
+        )
+
+    def save_state(self) -> int:
+        """Keep the scene's present state; valid until an object or the scene is removed."""
+        return self.world.save_state()
+
+    def restore_state(self, state: int) -> None:
+        """Return to a state of this scene, exactly: what follows depends on nothing else."""
+        # The engine keeps contact caches over a restore; moving all bodies apart empties them.
+        for index, item in enumerate(self._objects):
+            item.body.set_pose((5.0 + 5.0 * index, 0.0, 9.0), (0.0, 0.0, 0.0, 1.0))
+        self._hand.park()
+        self.world.detect_collisions()
+        self.world.restore_state(state)
+
+    def try_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
+        """See what would come of a grasp; the scene stays as it is.
+
+        Args:
+            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+
+        Raises:
+            ValueError: `T_world_hand` is no rigid transform.
+        """
+        T = require_pose(T_world_hand, "T_world_hand")
+        if self._try_state is None:
+            self._try_state = self.save_state()
+        self.restore_state(self._try_state)
+        result = self._run(T)
+        self.restore_state(self._try_state)
+        return result
+
+    def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
+        """Grasp: what is held leaves the scene, the rest comes to rest.
+
+        Args:
+            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+
+        Raises:
+            ValueError: `T_world_hand` is no rigid transform.
+        """
+        result = self._run(require_pose(T_world_hand, "T_world_hand"))
+        self._forget_try_state()
+        self._hand.park()
+        if result.held_uid is not None:
+            held = next(item for item in self._objects if item.body.uid == result.held_uid)
+            held.body.remove()
+            self._objects.remove(held)
+        self._objects = settle(self.world, self._objects)
+        return result
+
+    @property
+    def _hand(self) -> Gripper:
+        if self._gripper is None:
+            raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
+        return self._gripper
+
+    def _run(self, T_world_hand: Matrix) -> GraspResult:
+        uids = {item.body.uid for item in self._objects}
+        return run_grasp(
+            self._hand, T_world_hand, uids, start_contact_fails=self.start_contact_fails
+        )
+
+    def _clear(self) -> None:
+        self.world.reset()
+        self._objects = []
+        self._gripper = None
+        self._try_state = None
+        add_table(self.world)
+
+    def _add_gripper(self) -> None:
+        self._gripper = Gripper(self.world)
+
+    def _forget_try_state(self) -> None:
+        if self._try_state is not None:
+            self.world.remove_state(self._try_state)
+            self._try_state = None
+
+
+def _scene_kind(scene: SceneKind | str) -> SceneKind:
+    with suppress(ValueError):
+        return SceneKind(scene)
+    raise ValueError(f"scene is {scene!r}; choose one of {', '.join(SceneKind)}")
+
+
+def _crop(points: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
+    inside = (points >= WORKSPACE[0] - margin) & (points <= WORKSPACE[1] + margin)
+    kept: NDArray[np.float64] = points[inside.all(axis=1)]
+    return kept

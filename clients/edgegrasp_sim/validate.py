@@ -1,0 +1,122 @@
+"""Compare grasp outcomes with those of the reference simulator.
+
+python -m edgegrasp_sim.validate --shared ../shared
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edgegrasp_sim.gripper import T_HANDCOM_HAND
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How many grasps came out as in the reference.
+
+    Attributes:
+        kind: of the scenes.
+        agreed: for each scene, how many grasps had the reference's success or failure.
+        tried: for each scene, how many grasps there were.
+        start_contacts: grasps whose start pose overlapped something.
+        seconds: wall-clock time of the grasps.
+    """
+
+    kind: SceneKind
+    agreed: tuple[int, ...]
+    tried: tuple[int, ...]
+    start_contacts: int
+    seconds: float
+
+    @property
+    def share(self) -> float:
+        """Agreement over all scenes, 0 to 1."""
+        return sum(self.agreed) / sum(self.tried)
+
+
+def measure_agreement(
+    shared: Path,
+    kind: SceneKind,
+    *,
+    grasps_per_scene: int | None = None,
+    start_contact_fails: bool = False,
+) -> Agreement:
+    """Repeat the grasps of `<shared>/reference/grasp_outcomes/<kind>.json`.
+
+    Args:
+        shared: folder with `objects` and `reference`.
+        kind: of the scenes.
+        grasps_per_scene: only the first so many; all by default.
+        start_contact_fails: see `ClutterSimulation`.
+
+    Raises:
+        FileNotFoundError: the outcomes or an object are missing.
+    """
+    path = shared / "reference" / "grasp_outcomes" / f"{kind}.json"
+    scenes = json.loads(path.read_text())["scenes"]
+    agreed, tried, start_contacts = [], [], 0
+    started = time.perf_counter()
+    with ClutterSimulation(start_contact_fails=start_contact_fails) as simulation:
+        for scene in scenes:
+            simulation.reset_from_poses(
+                [
+                    ObjectPlacement(
+                        shared / "objects" / item["urdf"],
+                        item["scale"],
+                        item["position"],
+                        item["quaternion_xyzw"],
+                    )
+                    for item in scene["objects"]
+                ]
+            )
+            poses = np.asarray(scene["T_world_handcom"])[:grasps_per_scene]
+            results = [simulation.try_grasp(pose @ T_HANDCOM_HAND) for pose in poses]
+            agreed.append(
+                sum(
+                    result.success == bool(success)
+                    for result, success in zip(results, scene["success"], strict=False)
+                )
+            )
+            tried.append(len(results))
+            start_contacts += sum(result.start_contact for result in results)
+    seconds = time.perf_counter() - started
+    return Agreement(kind, tuple(agreed), tuple(tried), start_contacts, seconds)
+
+
+def main() -> None:
+    """Print the agreement for packed and pile scenes."""
+    parser = argparse.ArgumentParser(prog="python -m edgegrasp_sim.validate")
+    parser.add_argument("--shared", type=Path, required=True, help="folder with the shared data")
+    parser.add_argument(
+        "--start-contact-fails",
+        action="store_true",
+        help="fail grasps whose start pose overlaps something, unlike the reference",
+    )
+    arguments = parser.parse_args()
+    for kind in SceneKind:
+        agreement = measure_agreement(
+            arguments.shared, kind, start_contact_fails=arguments.start_contact_fails
+        )
+        scenes = ", ".join(
+            f"{agreed}/{tried}"
+            for agreed, tried in zip(agreement.agreed, agreement.tried, strict=True)
+        )
+        grasps = sum(agreement.tried)
+        sys.stdout.write(
+            f"{kind}: {agreement.share:.1%} of {grasps} grasps agree ({scenes}); "
+            f"{agreement.start_contacts} start in contact; "
+            f"{grasps / agreement.seconds:.0f} grasps/s\n"
+        )
+
+
+if __name__ == "__main__":
+    main()
