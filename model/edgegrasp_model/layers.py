@@ -18,11 +18,12 @@ class SharedLinear(nn.Linear):
 
     def forward(self, own: Tensor, shared: Tensor, shared_of_row: Tensor) -> Tensor:  # type: ignore[override]
         """Applies the layer to own (M, ..., C1) and shared (B, ..., C2)[shared_of_row (M,)]."""
-        own_weight, shared_weight = torch.split(
-            self.weight, [own.shape[-1], shared.shape[-1]], dim=1
-        )
+        widths = [own.shape[-1], shared.shape[-1]]
+        own_weight, shared_weight = torch.split(self.weight, widths, dim=1)
         once_per_ball = F.linear(shared, shared_weight)  # (B, ..., out)
-        return F.linear(own, own_weight, self.bias) + once_per_ball.index_select(0, shared_of_row)
+        rows = F.linear(own, own_weight, self.bias)  # (M, ..., out)
+        rows += once_per_ball.index_select(0, shared_of_row)
+        return rows
 
 
 class HandDescription(nn.Module):
@@ -63,8 +64,22 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+        layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
+
+
+def gather_rows(values: Tensor, index: Tensor) -> Tensor:
+    """values[index] for values (M, ...) and an index (P, k): (P, k, ...)."""
+    # The backward of indexing itself is several times slower.
+    return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
+
+
+def in_pieces(values: Tensor) -> tuple[Tensor, ...]:
+    """Splits values (M, ...) into pieces small enough for a processor's cache.
+
+    While gradients are recorded it leaves them whole: autograd would keep every piece anyway.
+    """
+    return torch.split(values, max(len(values), 1) if torch.is_grad_enabled() else 128)
 
 
 def maximum(values: Tensor, dim: int) -> Tensor:

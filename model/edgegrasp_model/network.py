@@ -13,6 +13,8 @@ from edgegrasp_model.layers import (
     HandDescription,
     SharedLinear,
     ball_maximum,
+    gather_rows,
+    in_pieces,
     maximum,
     mlp,
 )
@@ -33,15 +35,16 @@ class PointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
         # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
-        feature_weight, point_weight = torch.split(
-            self.hidden.weight, [features.shape[1], 3], dim=1
-        )
+        widths = [features.shape[1], 3]
+        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
         v = F.linear(batch.points, point_weight)  # (P, width)
         u = F.linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
-        u_of_neighbor = F.embedding(batch.neighbors, u)  # (P, k, width)
-        messages = F.relu(u_of_neighbor - v.unsqueeze(1))  # (P, k, width)
+        pooled = []
+        for neighbors, v_here in zip(in_pieces(batch.neighbors), in_pieces(v), strict=True):
+            hidden = F.relu(gather_rows(u, neighbors) - v_here.unsqueeze(1))  # (p, k, width)
+            pooled.append(maximum(F.linear(hidden, self.output.weight), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
-        return maximum(F.linear(messages, self.output.weight), dim=1) + self.output.bias
+        return torch.cat(pooled) + self.output.bias
 
 
 class GlobalFeature(nn.Module):

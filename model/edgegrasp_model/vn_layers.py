@@ -29,7 +29,7 @@ def vector_maximum(vectors: Tensor, directions: Tensor, dim: int) -> Tensor:
         dim: The dimension to reduce, one of those before the last two.
     """
     reach = (vectors * directions).sum(dim=-2, keepdim=True)  # (..., 1, C)
-    furthest = reach.argmax(dim, keepdim=True)
+    furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
     return vectors.take_along_dim(furthest, dim).squeeze(dim)
 
 

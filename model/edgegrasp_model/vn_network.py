@@ -9,7 +9,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.layers import HandDescription, mlp
+from edgegrasp_model.layers import HandDescription, gather_rows, in_pieces, mlp
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.vn_layers import (
     VNLinearReLU,
@@ -18,8 +18,6 @@ from edgegrasp_model.vn_layers import (
     vector_maximum,
     vector_relu,
 )
-
-_POINTS_AT_ONCE = 1024  # bounds the memory of the (points, k, 3, C) messages when not training
 
 
 class VNPointNetConv(nn.Module):
@@ -36,18 +34,17 @@ class VNPointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, inputs) to (P, 3, width)."""
         # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
-        feature_weight, point_weight = torch.split(
-            self.hidden.weight, [features.shape[2], 1], dim=1
-        )
+        widths = [features.shape[2], 1]
+        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
         v = F.linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
         u = F.linear(features, feature_weight) + v  # (P, 3, width)
-        v_direction = self.hidden_relu.direction(v)
-        u_direction = self.hidden_relu.direction(u)
+        u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
         pooled = []
-        for rows in torch.split(torch.arange(len(u), device=u.device), _POINTS_AT_ONCE):
-            neighbors = batch.neighbors[rows]  # (p, k)
-            hidden = u[neighbors] - v[rows].unsqueeze(1)  # (p, k, 3, width)
-            direction = u_direction[neighbors] - v_direction[rows].unsqueeze(1)
+        for neighbors, v_here, v_direction_here in zip(
+            in_pieces(batch.neighbors), in_pieces(v), in_pieces(v_direction), strict=True
+        ):
+            hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
+            direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
             messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
             pooled.append(vector_maximum(messages, self.reach(messages), dim=1))
         vectors: Tensor = self.output_relu(torch.cat(pooled))
@@ -65,10 +62,8 @@ class VNBallMaximum(nn.Module):
     def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, width) to ball features (B, 3, width)."""
         sizes = batch.ball_sizes
-        balls = zip(
-            torch.split(vectors, sizes), torch.split(self.reach(vectors), sizes), strict=True
-        )
-        furthest = [vector_maximum(ball, directions, dim=0) for ball, directions in balls]
+        balls, reaches = torch.split(vectors, sizes), torch.split(self.reach(vectors), sizes)
+        furthest = [vector_maximum(*ball, dim=0) for ball in zip(balls, reaches, strict=True)]
         pooled: Tensor = self.relu(torch.stack(furthest))
         return pooled
 
