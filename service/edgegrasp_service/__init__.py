@@ -1,1 +1,1 @@
-"""The grasp-detection server: one core, REST and gRPC transports."""
+"""Grasp detection over HTTP and gRPC: one core, two thin transports."""

@@ -1,0 +1,46 @@
+"""What the service needs of whatever finds grasps: the weights' catalogue, or the dummy."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import Detection
+from edgegrasp_service.settings import Settings
+
+
+class Detector(Protocol):
+    """Finds grasps in a cloud with one set of weights."""
+
+    def detect(self, cloud: NDArray[Any], options: DetectOptions) -> Detection:
+        """Find grasps; raises InvalidRequest for a cloud that does not suit."""
+
+
+class Catalogue(Protocol):
+    """Detectors by the name of their weights."""
+
+    def get(self, name: str = "") -> Detector:
+        """The detector of that name, the default for ""; raises UnknownModel."""
+
+    def describe(self) -> Sequence[Mapping[str, Any]]:
+        """The facts of each set of weights, keyed as the fields of ModelInfo."""
+
+    def warm_up(self) -> None:
+        """Run every detector once, so that the first request is not the slowest."""
+
+
+def load_backend(settings: Settings) -> Catalogue:
+    """Load what `settings.backend` names; takes seconds for weights.
+
+    Raises:
+        EdgeGraspError: Weights cannot be used.
+    """
+    if settings.backend == "dummy":
+        from edgegrasp_service.dummy import DummyCatalogue
+
+        return DummyCatalogue(settings.dummy_seconds)
+    # Torch takes seconds to import, and the ports should answer meanwhile.
+    from edgegrasp_model.catalogue import ModelCatalogue
+
+    return ModelCatalogue.load(settings.weights, default=settings.default_model)

@@ -1,0 +1,103 @@
+"""Errors of the service, and the one table that gives every error its status.
+
+EdgeGraspError                (edgegrasp_model.errors)
+  + ServiceError
+      + PayloadTooLarge       a body or a cloud over the server's limits
+      + UnsupportedMediaType  a body in a format the server does not read
+      + DecoderMissing        a format whose reader is not installed
+      + NotReady              weights are still loading, or the server is stopping
+      + DetectorFailed        the detector failed on a good request
+      + InvalidSettings       start-up: a setting is wrong
+      + AddressInUse          start-up: a port cannot be bound
+"""
+
+import re
+from dataclasses import dataclass
+
+import grpc
+
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
+
+
+class ServiceError(EdgeGraspError):
+    """Base of the service's own errors."""
+
+
+class _FieldError(ServiceError):
+    def __init__(self, field: str, value: str, fix: str) -> None:
+        self.field = field
+        self.value = value
+        self.fix = fix
+        super().__init__(f"{field}: got {value}. {fix}")
+
+
+class PayloadTooLarge(_FieldError):  # noqa: N818
+    """A body or a cloud is over the server's limits."""
+
+
+class UnsupportedMediaType(_FieldError):  # noqa: N818
+    """A body is in a format the server does not read."""
+
+
+class DecoderMissing(_FieldError):  # noqa: N818
+    """A format's reader is not installed on the server."""
+
+
+class NotReady(ServiceError):  # noqa: N818
+    """Weights are still loading, or the server is stopping."""
+
+
+class DetectorFailed(ServiceError):  # noqa: N818
+    """The detector failed on a good request."""
+
+
+class InvalidSettings(ServiceError):  # noqa: N818
+    """A setting is of the wrong type, out of range or unknown."""
+
+
+class AddressInUse(ServiceError):  # noqa: N818
+    """A port cannot be bound."""
+
+
+STATUS: dict[type[Exception], tuple[grpc.StatusCode, int]] = {
+    InvalidRequest: (grpc.StatusCode.INVALID_ARGUMENT, 400),
+    UnknownModel: (grpc.StatusCode.NOT_FOUND, 404),
+    PayloadTooLarge: (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
+    UnsupportedMediaType: (grpc.StatusCode.INVALID_ARGUMENT, 415),
+    DecoderMissing: (grpc.StatusCode.UNIMPLEMENTED, 501),
+    NotReady: (grpc.StatusCode.UNAVAILABLE, 503),
+    DetectorFailed: (grpc.StatusCode.INTERNAL, 500),
+}
+
+
+@dataclass(frozen=True)
+class ErrorReport:
+    """An error as both transports tell it."""
+
+    kind: str  # the class's name in kebab case, e.g. "invalid-request"
+    detail: str
+    field: str
+    value: str
+    fix: str
+    code: grpc.StatusCode
+    status: int
+
+
+def report(error: Exception) -> ErrorReport:
+    """Describe an error for the caller; one the table does not know tells nothing of itself."""
+    if type(error) not in STATUS:
+        error = DetectorFailed("The server failed; its log says why.")
+    code, status = STATUS[type(error)]
+    field, value, fix = "", "", ""
+    if isinstance(error, UnknownModel):
+        field, value = "options.model", repr(error.name)
+        fix = f"Use one of: {', '.join(error.known)}."
+    elif isinstance(error, InvalidRequest | _FieldError):
+        field, value, fix = error.field, error.value, error.fix
+    detail = f"{field}: got {value}. {fix}" if field else str(error)
+    return ErrorReport(kind_of(type(error)), detail, field, value, fix, code, status)
+
+
+def kind_of(error: type[Exception]) -> str:
+    """The name an error has on the wire: InvalidRequest is "invalid-request"."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", error.__name__).lower()

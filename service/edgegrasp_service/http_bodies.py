@@ -1,0 +1,136 @@
+"""Bodies of the HTTP answers: what the OpenAPI document promises, and how they are written."""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_service.core import ModelInfo
+from edgegrasp_service.errors import ErrorReport
+
+KIND_PREFIX = "urn:edgegrasp:error:"
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class GraspBody(_Body):
+    """One grasp: move to T_cloud_hand along approach_direction, then close."""
+
+    score: float = Field(description="probability that the grasp holds")
+    T_cloud_hand: Matrix = Field(
+        description="row-major; hand frame: z out of the palm, y the closing direction"
+    )
+    T_cloud_tcp: Matrix = Field(description="row-major; tool centre point, same axes")
+    width: float = Field(description="opening to command before closing, metres")
+    approach_point: Vector = Field(description="p_a, metres, cloud frame")
+    contact_point: Vector = Field(description="p_c, metres, cloud frame")
+    approach_direction: Vector = Field(description="unit, the direction the hand moves; its +z")
+    collision_free: bool = Field(description="whether the open hand meets no point of the cloud")
+
+
+class DetectionBody(_Body):
+    """Ranked grasps of one cloud, and how they came about."""
+
+    grasps: list[GraspBody] = Field(description="best first")
+    counts: dict[str, int] = Field(description="what passed each stage")
+    seconds: dict[str, float] = Field(description="spent in each stage, and their total")
+    model: str = Field(description="name of the weights used")
+    warnings: list[str]
+
+
+class ModelBody(_Body):
+    """Loaded weights."""
+
+    name: str
+    architecture: str
+    digest: str
+    parameters: int
+    crop_radius: float = Field(description="metres")
+    voxel_size: float = Field(description="metres")
+    gripper: str
+    default: bool = Field(description="whether a request that names no model gets these")
+    hand_description: bool = Field(
+        description="whether the network sees the hand-frame description"
+    )
+
+
+class ModelsBody(_Body):
+    """The weights a request can name."""
+
+    models: list[ModelBody]
+
+
+class HealthBody(_Body):
+    """State of the server."""
+
+    status: str
+
+
+class ProblemBody(_Body):
+    """An error (RFC 9457)."""
+
+    type: str = Field(description=f"{KIND_PREFIX} and the kind, e.g. invalid-request")
+    title: str
+    status: int
+    detail: str
+    field: str = Field(description="request field at fault; empty if none is")
+    value: str = Field(description="what was received")
+    fix: str = Field(description="what to send instead")
+
+
+def detection_body(detection: Detection) -> dict[str, object]:
+    """A detection as DetectionBody; every float is a float32 written out exactly."""
+    return {
+        "grasps": [_grasp_body(grasp) for grasp in detection.grasps],
+        "counts": detection.counts,
+        "seconds": detection.seconds,
+        "model": detection.model,
+        "warnings": detection.warnings,
+    }
+
+
+def models_body(models: list[ModelInfo]) -> dict[str, object]:
+    """Loaded weights as ModelsBody."""
+    return {"models": [vars(model) for model in models]}
+
+
+def problem_body(problem: ErrorReport) -> dict[str, object]:
+    """An error as ProblemBody."""
+    return {
+        "type": KIND_PREFIX + problem.kind,
+        "title": problem.kind.replace("-", " ").capitalize(),
+        "status": problem.status,
+        "detail": problem.detail,
+        "field": problem.field,
+        "value": problem.value,
+        "fix": problem.fix,
+    }
+
+
+def _grasp_body(grasp: Grasp) -> dict[str, object]:
+    return {
+        "score": _float32(grasp.score),
+        "T_cloud_hand": _floats(grasp.T_cloud_hand),
+        "T_cloud_tcp": _floats(grasp.T_cloud_tcp),
+        "width": _float32(grasp.width),
+        "approach_point": _floats(grasp.approach_point),
+        "contact_point": _floats(grasp.contact_point),
+        "approach_direction": _floats(grasp.approach_direction),
+        "collision_free": bool(grasp.collision_free),
+    }
+
+
+def _float32(value: float) -> float:
+    return float(np.float32(value))
+
+
+def _floats(array: NDArray[np.float32]) -> object:
+    return np.asarray(array, dtype=np.float32).tolist()

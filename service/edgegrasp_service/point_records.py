@@ -1,0 +1,52 @@
+"""Rows of point cloud files: fixed records, in binary or as text."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.errors import InvalidRequest
+
+
+def read_binary_records(
+    body: bytes, record: np.dtype[Any], count: int, kind: str
+) -> NDArray[np.void]:
+    """Read `count` records.
+
+    Raises:
+        InvalidRequest: The body is too short for them.
+    """
+    expected = count * record.itemsize
+    if len(body) < expected:
+        value = f"{len(body)} bytes of data where the {kind} header promises {expected}"
+        raise InvalidRequest("cloud", value, "Send the whole file.")
+    return np.frombuffer(body, dtype=record, count=count).astype(record.newbyteorder("="))
+
+
+def read_ascii_records(
+    body: bytes, record: np.dtype[Any], count: int, kind: str
+) -> NDArray[np.void]:
+    """Read `count` records of whitespace-separated numbers.
+
+    Raises:
+        InvalidRequest: There are too few of them, or one is no number.
+    """
+    names = record.names or ()
+    expected = count * len(names)
+    if expected > len(body):  # each number takes a byte at least
+        value = f"{len(body)} bytes of data where the {kind} header promises {count} rows"
+        raise InvalidRequest("cloud", value, "Send the whole file.")
+    words = body.split(None, expected)[:expected]
+    if len(words) < expected:
+        value = f"{len(words)} numbers where the {kind} header promises {expected}"
+        raise InvalidRequest("cloud", value, "Send the whole file.")
+    try:
+        table = np.array(words, dtype="S32").astype(np.float64).reshape(count, len(names))
+    except ValueError:
+        value = f"text among the numbers of a {kind} file"
+        raise InvalidRequest("cloud", value, "Send numbers only.") from None
+    rows = np.empty(count, dtype=record)
+    with np.errstate(all="ignore"):
+        for column, name in enumerate(names):
+            rows[name] = table[:, column]
+    return rows
