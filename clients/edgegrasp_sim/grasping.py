@@ -12,9 +12,10 @@ from edgegrasp_sim.gripper import MAX_OPENING
 from edgegrasp_sim.poses import Matrix, translation
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Mapping
 
     from edgegrasp_sim.gripper import Gripper
+    from edgegrasp_sim.scene import SceneObject
 
 PREGRASP_DISTANCE = 0.05  # metres back along the approach
 RETREAT_DISTANCE = 0.10  # metres
@@ -41,13 +42,13 @@ class GraspResult:
             `AFTER`: nothing held at the end.
         opening: metres between the fingers at the end.
         start_contact: whether the open hand overlapped something at its start pose.
-        held_uid: the body held, None if nothing is.
+        held: the object held, None if nothing is.
     """
 
     outcome: GraspOutcome
     opening: float
     start_contact: bool
-    held_uid: int | None
+    held: SceneObject | None
 
     @property
     def success(self) -> bool:
@@ -58,17 +59,20 @@ class GraspResult:
 def run_grasp(
     gripper: Gripper,
     T_world_hand: Matrix,
-    object_uids: Collection[int],
+    objects: Mapping[int, SceneObject],
     *,
     start_contact_fails: bool,
+    retreat_empty: bool,
 ) -> GraspResult:
     """Run a grasp from its start pose to the end of the retreat; the hand stays there.
 
     Args:
         gripper: the hand to use.
         T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
-        object_uids: bodies that may be held.
+        objects: what may be held, by the id of its body.
         start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
+        retreat_empty: retreat even if the fingers closed on nothing, as what they push aside on
+            the way matters to a scene that goes on.
     """
     gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
     gripper.world.detect_collisions()
@@ -78,10 +82,13 @@ def run_grasp(
 
     gripper.move_to(T_world_hand, step_length=STEP_LENGTH)
     gripper.close()
+    opening = gripper.opening
+    if opening <= MIN_OPENING and not retreat_empty:
+        return GraspResult(GraspOutcome.AFTER, opening, start_contact, None)
     gripper.move_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
 
     touched = [contact.other_uid for contact in gripper.body.contacts()]
-    held = next((uid for uid in touched if uid in object_uids), None)
+    held = next((objects[uid] for uid in touched if uid in objects), None)
     opening = gripper.opening
     if held is not None and opening > MIN_OPENING:
         return GraspResult(GraspOutcome.SUCCESS, opening, start_contact, held)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from edgegrasp_sim.world import World
 
 MAX_OPENING = 0.08  # metres between the fingers
-FINGER_LENGTH = 0.1122 - 0.0584  # metres from finger base to tip
+FINGERTIP = 0.1122  # metres ahead of the link
 # The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
 T_HAND_HANDCOM = translation(0.0, 0.0, 0.04)
 T_HANDCOM_HAND = translation(0.0, 0.0, -0.04)

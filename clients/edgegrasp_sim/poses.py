@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -14,8 +13,18 @@ Matrix: TypeAlias = "NDArray[np.float64]"
 
 
 def quaternion_xyzw(T: Matrix) -> list[float]:
-    """The rotation part of a 4 x 4 transform as a quaternion `xyzw`."""
-    return [float(value) for value in Rotation.from_matrix(T[:3, :3]).as_quat()]
+    """The rotation part of a 4 x 4 rigid transform as a unit quaternion `xyzw`."""
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
+    # Four times the products of the quaternion with itself; its largest column is the sharpest.
+    products = (
+        (1.0 + a - e - i, b + d, c + g, h - f),
+        (b + d, 1.0 - a + e - i, f + h, c - g),
+        (c + g, f + h, 1.0 - a - e + i, d - b),
+        (h - f, c - g, d - b, 1.0 + a + e + i),
+    )
+    column = products[max(range(4), key=lambda k: products[k][k])]
+    length = sum(value * value for value in column) ** 0.5
+    return [value / length for value in column]
 
 
 def translation(x: float, y: float, z: float) -> Matrix:

@@ -107,7 +107,7 @@ class ClutterSimulation:
         self.camera = Camera(self.world)
         self._objects: list[SceneObject] = []
         self._gripper: Gripper | None = None
-        self._try_state: int | None = None
+        self._rest_state: int | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -229,12 +229,8 @@ class ClutterSimulation:
 
     def restore_state(self, state: int) -> None:
         """Return to a state of this scene, exactly: what follows depends on nothing else."""
-        # The engine keeps contact caches over a restore; moving all bodies apart empties them.
-        for index, item in enumerate(self._objects):
-            item.body.set_pose((5.0 + 5.0 * index, 0.0, 9.0), (0.0, 0.0, 0.0, 1.0))
-        self._hand.park()
-        self.world.detect_collisions()
-        self.world.restore_state(state)
+        self._forget_rest_state()
+        self._restore(state)
 
     def try_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
         """See what would come of a grasp; the scene stays as it is.
@@ -245,16 +241,14 @@ class ClutterSimulation:
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
         """
-        T = require_pose(T_world_hand, "T_world_hand")
-        if self._try_state is None:
-            self._try_state = self.save_state()
-        self.restore_state(self._try_state)
-        result = self._run(T)
-        self.restore_state(self._try_state)
+        result = self._run(T_world_hand, retreat_empty=False)
+        self._restore_rest()
         return result
 
     def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
         """Grasp: what is held leaves the scene, the rest comes to rest.
+
+        The outcome is that of `try_grasp`.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
@@ -262,13 +256,12 @@ class ClutterSimulation:
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
         """
-        result = self._run(require_pose(T_world_hand, "T_world_hand"))
-        self._forget_try_state()
+        result = self._run(T_world_hand, retreat_empty=True)
+        self._forget_rest_state()
         self._hand.park()
-        if result.held_uid is not None:
-            held = next(item for item in self._objects if item.body.uid == result.held_uid)
-            held.body.remove()
-            self._objects.remove(held)
+        if result.held is not None:
+            result.held.body.remove()
+            self._objects.remove(result.held)
         self._objects = settle(self.world, self._objects)
         return result
 
@@ -278,26 +271,45 @@ class ClutterSimulation:
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
 
-    def _run(self, T_world_hand: Matrix) -> GraspResult:
-        uids = {item.body.uid for item in self._objects}
+    def _run(self, T_world_hand: ArrayLike, *, retreat_empty: bool) -> GraspResult:
+        T = require_pose(T_world_hand, "T_world_hand")
+        self._restore_rest()
         return run_grasp(
-            self._hand, T_world_hand, uids, start_contact_fails=self.start_contact_fails
+            self._hand,
+            T,
+            {item.body.uid: item for item in self._objects},
+            start_contact_fails=self.start_contact_fails,
+            retreat_empty=retreat_empty,
         )
+
+    def _restore_rest(self) -> None:
+        # Every grasp starts from one saved state, so that earlier tries leave no trace.
+        if self._rest_state is None:
+            self._rest_state = self.save_state()
+        self._restore(self._rest_state)
+
+    def _restore(self, state: int) -> None:
+        # The engine keeps contact caches over a restore; moving all bodies apart empties them.
+        for index, item in enumerate(self._objects):
+            item.body.set_pose((5.0 + 5.0 * index, 0.0, 9.0), (0.0, 0.0, 0.0, 1.0))
+        self._hand.park()
+        self.world.detect_collisions()
+        self.world.restore_state(state)
 
     def _clear(self) -> None:
         self.world.reset()
         self._objects = []
         self._gripper = None
-        self._try_state = None
+        self._rest_state = None
         add_table(self.world)
 
     def _add_gripper(self) -> None:
         self._gripper = Gripper(self.world)
 
-    def _forget_try_state(self) -> None:
-        if self._try_state is not None:
-            self.world.remove_state(self._try_state)
-            self._try_state = None
+    def _forget_rest_state(self) -> None:
+        if self._rest_state is not None:
+            self.world.remove_state(self._rest_state)
+            self._rest_state = None
 
 
 def _scene_kind(scene: SceneKind | str) -> SceneKind:

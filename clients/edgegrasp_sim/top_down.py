@@ -1,0 +1,53 @@
+"""A planner without a network: grasp the highest thing from above, across its narrow side."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from edgegrasp_sim.gripper import FINGERTIP, MAX_OPENING
+from edgegrasp_sim.trials import PlannedGrasp
+
+if TYPE_CHECKING:
+    from edgegrasp_sim.simulation import Observation
+
+REACH = 0.04  # metres around the highest point that count as the thing to grasp
+DEPTH = 0.025  # metres that the fingertips go below its top
+TABLE_CLEARANCE = 0.004  # metres
+MIN_POINTS = 10
+
+
+def plan_top_down(observation: Observation, seed: int) -> PlannedGrasp | None:
+    """Plan one grasp; a `Planner` to compare others with, and to try the simulator with.
+
+    Args:
+        observation: what is seen.
+        seed: not needed, nothing here is random.
+
+    Returns:
+        The grasp, or None if hardly anything is there to grasp.
+    """
+    del seed
+    cloud = observation.cloud.astype(np.float64)
+    if len(cloud) < MIN_POINTS:
+        return None
+    # Not the very highest point, which is the noisiest.
+    top = cloud[np.argsort(cloud[:, 2])[-MIN_POINTS]]
+    near = cloud[
+        (np.linalg.norm(cloud[:, :2] - top[:2], axis=1) < REACH) & (cloud[:, 2] > top[2] - DEPTH)
+    ]
+    if len(near) < MIN_POINTS:
+        return None
+    _, axes = np.linalg.eigh(np.cov(near[:, :2].T))
+    closing = np.array([*axes[:, 0], 0.0])
+    across, along = near @ closing, near[:, :2] @ axes[:, 1]
+    middle = 0.5 * (across.min() + across.max()) * closing[:2] + along.mean() * axes[:, 1]
+    tip = max(top[2] - DEPTH, observation.table_height + TABLE_CLEARANCE)
+
+    approach = np.array([0.0, 0.0, -1.0])
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2] = np.cross(closing, approach), closing, approach
+    T[:3, 3] = (*middle, tip + FINGERTIP)
+    width = float(np.clip(np.ptp(across), 0.0, MAX_OPENING))
+    return PlannedGrasp(T, score=1.0 - width / MAX_OPENING, width=width)
