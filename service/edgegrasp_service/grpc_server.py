@@ -72,7 +72,7 @@ class GrpcServer:
         longest = max_body_bytes + MAX_DROPPED_BYTES
         options = [("grpc.max_receive_message_length", longest), ("grpc.so_reuseport", 0)]
         self._server = aio.server(options=options)
-        self._health = health.aio.HealthServicer()
+        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         servicer = GraspServicer(service, max_body_bytes)
         grasp_pb2_grpc.add_GraspServiceServicer_to_server(servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
@@ -99,6 +99,7 @@ class GrpcServer:
 
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
+        await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_seconds)
 
 

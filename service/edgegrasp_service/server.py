@@ -71,7 +71,6 @@ class Server:
                 await stopped
             finally:
                 self._service.drain()
-                await grpc_server.set_serving(False)
                 http_server.should_exit = True
                 await asyncio.gather(http_task, grpc_server.stop(settings.grace_seconds))
                 self._service.close()

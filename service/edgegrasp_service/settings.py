@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from pydantic import Field, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
 
 from edgegrasp_service.errors import InvalidSettings
 
@@ -53,3 +53,5 @@ def load_settings(**given: object) -> Settings:
         first = error.errors(include_url=False)[0]
         name = ".".join(str(part) for part in first["loc"])
         raise InvalidSettings(f"{name}: got {first['input']!r}. {first['msg']}.") from None
+    except SettingsError as error:
+        raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
