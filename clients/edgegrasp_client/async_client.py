@@ -1,0 +1,180 @@
+"""The client, for asyncio."""
+
+import asyncio
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Protocol, Self, Unpack
+
+import grpc
+import httpx
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import grpc_wire, rest_wire
+from edgegrasp_client.client import DEFAULT_ADDRESS, POLL_SECONDS, is_rest
+from edgegrasp_client.cloud_encoding import Cloud
+from edgegrasp_client.errors import DeadlineError
+from edgegrasp_client.options import DetectOptions, plain_options
+from edgegrasp_client.results import Detection, Model
+
+
+class AsyncGraspClient:
+    """Asks one server for grasps; use as an async context manager, or close it.
+
+    Args:
+        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
+        timeout: Seconds for one call, unless the call says otherwise; over REST for each of
+            connecting, sending and waiting.
+        channel: gRPC channel to use instead of opening one; its owner closes it.
+        http_transport: httpx transport to use instead of the network.
+    """
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        timeout: float = 30.0,
+        channel: aio.Channel | None = None,
+        http_transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self._timeout = timeout
+        self._transport: _Transport
+        if is_rest(address):
+            self._transport = _RestTransport(address, http_transport)
+        else:
+            self._transport = _GrpcTransport(address, channel)
+
+    async def detect(
+        self, cloud: Cloud, *, timeout: float | None = None, **options: Unpack[DetectOptions]
+    ) -> Detection:
+        """Find grasps in a cloud.
+
+        Args:
+            cloud: (N, 3) float32 or float64, metres; or the path of a .npy, .npz, .ply or .pcd
+                file.
+            timeout: Seconds to wait; None: the client's own.
+            options: As in DetectOptions; what is left out takes the server's default.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return await self._transport.detect(cloud, plain_options(options), self._seconds(timeout))
+
+    async def models(self, *, timeout: float | None = None) -> list[Model]:
+        """The weights that `model` can name.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return await self._transport.models(self._seconds(timeout))
+
+    async def ready(self, *, timeout: float | None = None) -> bool:
+        """Whether the server answers requests: False if it is not there or still loading."""
+        return await self._transport.ready(self._seconds(timeout))
+
+    async def wait_until_ready(self, timeout: float = 60.0) -> None:
+        """Return once the server answers requests.
+
+        Raises:
+            DeadlineError: It did not within `timeout` seconds.
+        """
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout
+        while not await self.ready(timeout=max(POLL_SECONDS, end - loop.time())):
+            if loop.time() >= end:
+                raise DeadlineError(f"The server was not ready within {timeout:g} s.")
+            await asyncio.sleep(POLL_SECONDS)
+
+    async def close(self) -> None:
+        """Close the connection."""
+        await self._transport.close()
+
+    async def __aenter__(self) -> Self:
+        """Itself."""
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the connection."""
+        await self.close()
+
+    def _seconds(self, timeout: float | None) -> float:
+        return self._timeout if timeout is None else timeout
+
+
+class _Transport(Protocol):
+    async def detect(
+        self, cloud: Cloud, options: Mapping[str, Any], timeout: float
+    ) -> Detection: ...
+
+    async def models(self, timeout: float) -> list[Model]: ...
+
+    async def ready(self, timeout: float) -> bool: ...
+
+    async def close(self) -> None: ...
+
+
+class _GrpcTransport:
+    def __init__(self, address: str, channel: aio.Channel | None) -> None:
+        self._owned = channel is None
+        self._channel = channel or aio.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
+        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
+
+    async def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
+        request = grpc_wire.request_message(cloud, options)
+        try:
+            answer = await self._stub.DetectGrasps(request, timeout=timeout)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return grpc_wire.detection_from_message(answer)
+
+    async def models(self, timeout: float) -> list[Model]:
+        try:
+            answer = await self._stub.ListModels(grasp_pb2.ListModelsRequest(), timeout=timeout)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return grpc_wire.models_from_message(answer)
+
+    async def ready(self, timeout: float) -> bool:
+        try:
+            return bool(await self._check(b"", timeout=timeout) == grpc_wire.SERVING)
+        except grpc.RpcError:
+            return False
+
+    async def close(self) -> None:
+        if self._owned:
+            await self._channel.close(None)
+
+
+class _RestTransport:
+    def __init__(self, address: str, transport: httpx.AsyncBaseTransport | None) -> None:
+        self._http = httpx.AsyncClient(base_url=address, transport=transport)
+
+    async def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
+        post = rest_wire.detect_post(cloud, options)
+        try:
+            response = await self._http.post(rest_wire.GRASPS, **vars(post), timeout=timeout)
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.detection_from_response(response)
+
+    async def models(self, timeout: float) -> list[Model]:
+        try:
+            response = await self._http.get(rest_wire.MODELS, timeout=timeout)
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.models_from_response(response)
+
+    async def ready(self, timeout: float) -> bool:
+        try:
+            return (await self._http.get(rest_wire.READY, timeout=timeout)).is_success
+        except httpx.HTTPError:
+            return False
+
+    async def close(self) -> None:
+        await self._http.aclose()

@@ -1,0 +1,183 @@
+"""The client, synchronous."""
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Protocol, Self, Unpack
+
+import grpc
+import httpx
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import grpc_wire, rest_wire
+from edgegrasp_client.cloud_encoding import Cloud
+from edgegrasp_client.errors import DeadlineError
+from edgegrasp_client.options import DetectOptions, plain_options
+from edgegrasp_client.results import Detection, Model
+
+DEFAULT_ADDRESS = "127.0.0.1:50051"
+POLL_SECONDS = 0.1
+
+
+class GraspClient:
+    """Asks one server for grasps; use as a context manager, or close it.
+
+    Args:
+        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
+        timeout: Seconds for one call, unless the call says otherwise; over REST for each of
+            connecting, sending and waiting.
+        channel: gRPC channel to use instead of opening one; its owner closes it.
+        http_transport: httpx transport to use instead of the network.
+    """
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        timeout: float = 30.0,
+        channel: grpc.Channel | None = None,
+        http_transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self._timeout = timeout
+        self._transport: _Transport
+        if is_rest(address):
+            self._transport = _RestTransport(address, http_transport)
+        else:
+            self._transport = _GrpcTransport(address, channel)
+
+    def detect(
+        self, cloud: Cloud, *, timeout: float | None = None, **options: Unpack[DetectOptions]
+    ) -> Detection:
+        """Find grasps in a cloud.
+
+        Args:
+            cloud: (N, 3) float32 or float64, metres; or the path of a .npy, .npz, .ply or .pcd
+                file.
+            timeout: Seconds to wait; None: the client's own.
+            options: As in DetectOptions; what is left out takes the server's default.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return self._transport.detect(cloud, plain_options(options), self._seconds(timeout))
+
+    def models(self, *, timeout: float | None = None) -> list[Model]:
+        """The weights that `model` can name.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return self._transport.models(self._seconds(timeout))
+
+    def ready(self, *, timeout: float | None = None) -> bool:
+        """Whether the server answers requests: False if it is not there or still loading."""
+        return self._transport.ready(self._seconds(timeout))
+
+    def wait_until_ready(self, timeout: float = 60.0) -> None:
+        """Return once the server answers requests.
+
+        Raises:
+            DeadlineError: It did not within `timeout` seconds.
+        """
+        end = time.monotonic() + timeout
+        while not self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
+            if time.monotonic() >= end:
+                raise DeadlineError(f"The server was not ready within {timeout:g} s.")
+            time.sleep(POLL_SECONDS)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._transport.close()
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Close the connection."""
+        self.close()
+
+    def _seconds(self, timeout: float | None) -> float:
+        return self._timeout if timeout is None else timeout
+
+
+def is_rest(address: str) -> bool:
+    """Whether an address names the REST transport."""
+    return address.startswith(("http://", "https://"))
+
+
+class _Transport(Protocol):
+    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection: ...
+
+    def models(self, timeout: float) -> list[Model]: ...
+
+    def ready(self, timeout: float) -> bool: ...
+
+    def close(self) -> None: ...
+
+
+class _GrpcTransport:
+    def __init__(self, address: str, channel: grpc.Channel | None) -> None:
+        self._owned = channel is None
+        self._channel = channel or grpc.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
+        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
+
+    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
+        request = grpc_wire.request_message(cloud, options)
+        try:
+            answer = self._stub.DetectGrasps(request, timeout=timeout)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return grpc_wire.detection_from_message(answer)
+
+    def models(self, timeout: float) -> list[Model]:
+        try:
+            answer = self._stub.ListModels(grasp_pb2.ListModelsRequest(), timeout=timeout)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return grpc_wire.models_from_message(answer)
+
+    def ready(self, timeout: float) -> bool:
+        try:
+            return bool(self._check(b"", timeout=timeout) == grpc_wire.SERVING)
+        except grpc.RpcError:
+            return False
+
+    def close(self) -> None:
+        if self._owned:
+            self._channel.close()
+
+
+class _RestTransport:
+    def __init__(self, address: str, transport: httpx.BaseTransport | None) -> None:
+        self._http = httpx.Client(base_url=address, transport=transport)
+
+    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
+        post = rest_wire.detect_post(cloud, options)
+        try:
+            response = self._http.post(rest_wire.GRASPS, **vars(post), timeout=timeout)
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.detection_from_response(response)
+
+    def models(self, timeout: float) -> list[Model]:
+        try:
+            response = self._http.get(rest_wire.MODELS, timeout=timeout)
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.models_from_response(response)
+
+    def ready(self, timeout: float) -> bool:
+        try:
+            return self._http.get(rest_wire.READY, timeout=timeout).is_success
+        except httpx.HTTPError:
+            return False
+
+    def close(self) -> None:
+        self._http.close()

@@ -1,0 +1,80 @@
+"""What can go wrong, the same over either transport.
+
+GraspClientError
+  + InvalidRequestError         the cloud or an option is wrong: field, value, fix
+      + UnknownModelError       the server has no weights of that name
+      + PayloadTooLargeError    the request exceeds the server's limits
+  + ServerUnavailableError      no connection, weights still loading, or the server is stopping
+  + DeadlineError               no answer within the timeout
+  + ServerFailedError           the server failed on a good request
+  + ProtocolError               the answer is none of this service: is the address right?
+"""
+
+
+class GraspClientError(Exception):
+    """Base of every error the client raises on purpose."""
+
+
+class InvalidRequestError(GraspClientError):
+    """The cloud or an option is wrong.
+
+    Args:
+        message: The whole sentence.
+        field: Request field at fault, e.g. "cloud" or "options.seed"; empty if unknown.
+        value: What the server received, in words.
+        fix: What to send instead, in words.
+    """
+
+    def __init__(self, message: str, field: str = "", value: str = "", fix: str = "") -> None:
+        super().__init__(message)
+        self.field = field
+        self.value = value
+        self.fix = fix
+
+
+class UnknownModelError(InvalidRequestError):
+    """The server has no weights of that name."""
+
+
+class PayloadTooLargeError(InvalidRequestError):
+    """The request exceeds the server's limits."""
+
+
+class ServerUnavailableError(GraspClientError):
+    """No connection, weights still loading, or the server is stopping; trying again may help."""
+
+
+class DeadlineError(GraspClientError):
+    """There was no answer within the timeout."""
+
+
+class ServerFailedError(GraspClientError):
+    """The server failed on a good request; its log says why."""
+
+
+class ProtocolError(GraspClientError):
+    """The answer is none of this service; the address may be of another one."""
+
+
+_BY_KIND: dict[str, type[GraspClientError]] = {
+    "invalid-request": InvalidRequestError,
+    "unsupported-media-type": InvalidRequestError,
+    "unknown-model": UnknownModelError,
+    "payload-too-large": PayloadTooLargeError,
+    "decoder-missing": ServerFailedError,
+    "detector-failed": ServerFailedError,
+    "not-ready": ServerUnavailableError,
+}
+
+
+def error_of_kind(kind: str, message: str, field: str, value: str, fix: str) -> GraspClientError:
+    """The exception for an error the server describes."""
+    error = _BY_KIND.get(kind, ProtocolError)
+    if issubclass(error, InvalidRequestError):
+        return error(message, field, value, fix)
+    return error(message)
+
+
+def invalid(field: str, value: str, fix: str) -> InvalidRequestError:
+    """The exception for what need not be sent to be refused."""
+    return InvalidRequestError(f"{field}: got {value}. {fix}", field, value, fix)

@@ -1,0 +1,48 @@
+"""What a server answers, as typed values."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Grasp:
+    """One grasp: move to `T_cloud_hand` along `approach_direction`, then close."""
+
+    score: float  # probability that the grasp holds
+    T_cloud_hand: Float32  # (4, 4) hand link frame: z out of the palm, y the closing direction
+    T_cloud_tcp: Float32  # (4, 4) tool centre point, same axes
+    width: float  # opening to command before closing, metres
+    approach_point: Float32  # (3,) p_a, metres, cloud frame
+    contact_point: Float32  # (3,) p_c, metres, cloud frame
+    approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
+    collision_free: bool  # whether the open hand at the grasp meets no point of the cloud
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Ranked grasps of one cloud, and how they came about."""
+
+    grasps: list[Grasp]
+    counts: dict[str, int]  # points, candidates and grasps that passed each stage
+    seconds: dict[str, float]  # spent in each stage, and their `total`
+    model: str  # name of the weights used
+    warnings: list[str]
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights a server has loaded."""
+
+    name: str
+    architecture: str
+    digest: str
+    parameters: int
+    crop_radius: float  # metres
+    voxel_size: float  # metres
+    gripper: str
+    default: bool  # whether a request that names no model gets these
+    hand_description: bool  # whether the network also sees the hand-frame description
