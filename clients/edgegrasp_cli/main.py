@@ -1,0 +1,88 @@
+"""The program `edgegrasp`: a table of commands, each in a module that is imported when it runs."""
+
+import functools
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+try:
+    import typer
+    from typer.core import TyperCommand, TyperGroup
+except ModuleNotFoundError:
+    sys.exit("edgegrasp: the command line is not installed. pip install 'edgegrasp[cli]'")
+
+# Command: extra it needs, one-line help. `generate-data` is generate_data() in generate_data.py.
+COMMANDS = {
+    "serve": ("service", "Answer requests over HTTP and gRPC."),
+    "detect": ("service", "Find grasps in a point cloud file."),
+    "models": ("service", "List the weights that can be used."),
+    "benchmark": ("sim", "Clear simulated clutter with a server's grasps and count successes."),
+    "generate-data": ("train", "Make labelled edge grasps in simulation."),
+    "train": ("train", "Train weights on generated data."),
+    "import-checkpoint": ("model", "Convert the authors' checkpoints to safetensors."),
+}
+
+
+class LazyGroup(TyperGroup):
+    """Shows commands from the table, and imports the one that is run."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
+        """Put the real command in the place of its table entry."""
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, load_command(str(name)), rest
+
+
+def load_command(name: str) -> Any:
+    """Import a command.
+
+    Raises:
+        SystemExit: It needs packages that are not installed.
+    """
+    module = name.replace("-", "_")
+    try:
+        function = getattr(importlib.import_module(f"edgegrasp_cli.{module}"), module)
+    except ModuleNotFoundError as error:
+        sys.exit(_missing(name, error))
+    single = typer.Typer(add_completion=False)
+    single.command(name)(_naming_missing_packages(name, function))
+    return typer.main.get_command(single)
+
+
+def _naming_missing_packages(name: str, function: Callable[..., None]) -> Callable[..., None]:
+    """The function, but a package missing at run time ends it with a sentence."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            function(*args, **kwargs)
+        except ModuleNotFoundError as error:
+            sys.exit(_missing(name, error))
+
+    return run
+
+
+def _missing(name: str, error: ModuleNotFoundError) -> str:
+    extra, _ = COMMANDS[name]
+    return f"edgegrasp {name}: {error}. pip install 'edgegrasp[{extra}]'"
+
+
+def _program() -> typer.Typer:
+    program = typer.Typer(
+        cls=LazyGroup,
+        help="Grasp detection as a service: point clouds in, scored 6-DoF grasps out.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+    for name, (_, text) in COMMANDS.items():
+        program.command(name, help=text, cls=TyperCommand)(lambda: None)
+    return program
+
+
+app = _program()
+
+
+def main() -> None:
+    """Run the program."""
+    app()
