@@ -1,0 +1,72 @@
+import contextlib
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+READY_LINE = re.compile(r"EdgeGrasp serves HTTP (\S+) gRPC (\S+)\n")
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    folder = Path(__file__).parents[1].parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("the shared data folder is absent")
+    return folder
+
+
+@dataclass
+class RunningServer:
+    http_url: str
+    grpc_address: str
+    process: subprocess.Popen[str]
+
+    def address(self, transport: str) -> str:
+        return self.http_url if transport == "rest" else self.grpc_address
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=20)
+
+
+@contextlib.contextmanager
+def running_server(*flags: str) -> Iterator[RunningServer]:
+    program = "from edgegrasp_cli.main import main; main()"
+    ports = ("--http-port", "0", "--grpc-port", "0")
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "serve", *ports, *flags], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()  # empty once the process is gone
+        match = READY_LINE.fullmatch(line)
+        assert match, f"the server said {line!r}"
+        yield RunningServer(match[1], match[2], process)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            process.wait(timeout=20)
+        process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def start_server() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
+    return running_server
+
+
+@pytest.fixture(scope="session")
+def dummy_server() -> Iterator[RunningServer]:
+    with running_server("--backend", "dummy") as server:
+        yield server
+
+
+@pytest.fixture
+def cloud() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return rng.uniform(-0.1, 0.1, (500, 3)).astype(np.float32)

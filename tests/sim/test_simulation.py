@@ -1,0 +1,207 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pybullet_data
+import pytest
+
+from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.grasping import GraspOutcome, retreat_pose
+from edgegrasp_sim.gripper import FINGERTIP
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.simulation import (
+    WORKSPACE,
+    ClutterSimulation,
+    ObjectPlacement,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+CUBE = Path(pybullet_data.getDataPath()) / "cube_small.urdf"  # 0.05 m
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+def cube_at(x: float, y: float, z: float = 0.075) -> ObjectPlacement:
+    return ObjectPlacement(CUBE, 1.0, (x, y, z), UPRIGHT)
+
+
+def top_down(x: float, y: float, tip: float) -> np.ndarray:
+    """A hand that looks straight down with its fingertips at (x, y, tip), closing along y."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = (x, y, tip + FINGERTIP)
+    return T
+
+
+@pytest.fixture
+def simulation() -> Iterator[ClutterSimulation]:
+    with ClutterSimulation() as simulation:
+        yield simulation
+
+
+def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    result = simulation.try_grasp(top_down(0.15, 0.15, 0.06))
+    assert result.outcome is GraspOutcome.SUCCESS
+    assert result.opening == pytest.approx(0.05, abs=0.003)
+    assert not result.start_contact
+    assert result.held is not None
+    assert result.held.model.name == "cube_small"
+
+
+def test_grasp_in_the_air_holds_nothing(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))
+    assert result.outcome is GraspOutcome.AFTER
+    assert result.opening < 0.008
+    assert result.held is None
+
+
+def test_grasp_beside_the_middle_pushes_or_misses_but_never_moves_the_scene(
+    simulation: ClutterSimulation,
+) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    before = simulation.placements
+    assert not simulation.try_grasp(top_down(0.15, 0.25, 0.06)).success
+    assert simulation.placements == before
+
+
+def test_contact_at_the_start_pose() -> None:
+    # The hand starts 5 cm higher, with a finger inside the taller stack of cubes.
+    stack = [cube_at(0.15, 0.10, 0.075 + 0.05 * level) for level in range(3)]
+    with ClutterSimulation(start_contact_fails=True) as strict:
+        strict.reset_from_poses([cube_at(0.15, 0.15), *stack])
+        result = strict.try_grasp(top_down(0.15, 0.15, 0.06))
+        assert result.outcome is GraspOutcome.PREGRASP
+        assert result.start_contact
+        assert strict.execute_grasp(top_down(0.15, 0.15, 0.06)).outcome is GraspOutcome.PREGRASP
+        assert strict.num_objects == 4
+    with ClutterSimulation() as lenient:
+        lenient.reset_from_poses([cube_at(0.15, 0.15), *stack])
+        result = lenient.try_grasp(top_down(0.15, 0.15, 0.06))
+        assert result.outcome is not GraspOutcome.PREGRASP
+        assert result.start_contact
+
+
+def test_executed_grasp_removes_the_object(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.10, 0.15), cube_at(0.20, 0.15)])
+    grasp = top_down(0.10, 0.15, 0.06)
+    assert simulation.try_grasp(grasp).success
+    assert simulation.num_objects == 2
+    assert simulation.execute_grasp(grasp).success
+    assert simulation.num_objects == 1
+    assert simulation.placements[0].position == pytest.approx((0.20, 0.15, 0.075), abs=2e-3)
+    assert not simulation.execute_grasp(grasp).success
+
+
+def test_what_is_pushed_out_of_the_workspace_is_taken_away(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15), cube_at(0.35, 0.15)])
+    simulation.execute_grasp(top_down(0.05, 0.05, 0.2))
+    assert [round(item.position[0], 2) for item in simulation.placements] == [0.15]
+
+
+def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimulation) -> None:
+    simulation.reset("pile", np.random.default_rng(3))
+    rng = np.random.default_rng(0)
+    positions = [item.position for item in simulation.placements]
+    grasps = [
+        top_down(x + rng.normal(0, 0.01), y + rng.normal(0, 0.01), max(z - 0.01, 0.055))
+        for x, y, z in positions
+        for _ in range(2)
+    ]
+    forward = [simulation.try_grasp(grasp).opening for grasp in grasps]
+    backward = [simulation.try_grasp(grasp).opening for grasp in reversed(grasps)]
+    assert forward == backward[::-1]
+    last = simulation.try_grasp(grasps[0])
+    assert simulation.execute_grasp(grasps[0]).outcome is last.outcome
+
+
+@pytest.mark.parametrize("scene", SceneKind)
+def test_equal_seeds_make_equal_scenes(scene: SceneKind) -> None:
+    def run(simulation: ClutterSimulation, seed: int) -> tuple[object, np.ndarray]:
+        simulation.reset(scene, np.random.default_rng(seed), 3)
+        x, y, z = simulation.placements[0].position
+        simulation.execute_grasp(top_down(x, y, max(z - 0.01, 0.055)))
+        cloud = simulation.observe(np.random.default_rng(1), np.random.default_rng(2)).cloud
+        return simulation.placements, cloud
+
+    with ClutterSimulation() as first, ClutterSimulation() as second:
+        run(first, 8)
+        placements, cloud = run(first, 0)
+        again, cloud_again = run(second, 0)
+    assert placements == again
+    assert np.array_equal(cloud, cloud_again)
+
+
+def test_saved_state_comes_back(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15), cube_at(0.15, 0.25)])
+    state = simulation.save_state()
+    before = simulation.placements
+    missed = top_down(0.15, 0.19, 0.06)  # a finger comes down on the first cube
+    pushed = simulation.execute_grasp(missed)
+    assert simulation.num_objects == 2
+    assert simulation.placements != before
+    simulation.restore_state(state)
+    assert simulation.placements == before
+    assert simulation.execute_grasp(missed).opening == pushed.opening
+
+
+def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
+    seen = simulation.observe_from(T_world_camera, np.random.default_rng(0), noise_std=0.0)
+    assert seen.cloud.dtype == np.float32
+    assert (seen.cloud >= WORKSPACE[0].astype(np.float32)).all()
+    assert seen.cloud.max(axis=0) == pytest.approx((0.175, 0.175, 0.1), abs=2e-3)
+    assert seen.cloud[:, 1].min() == pytest.approx(0.125, abs=2e-3)
+    assert seen.camera_position == pytest.approx((0.6, 0.15, 0.6))
+    assert seen.table_height == 0.05
+    assert seen.workspace.shape == (2, 3)
+
+
+def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
+
+    def top(noise_std: float, seed: int) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        cloud = simulation.observe_from(T_world_camera, rng, noise_std=noise_std).cloud
+        inner = (np.abs(cloud[:, :2] - 0.15) < 0.02).all(axis=1) & (cloud[:, 2] > 0.09)
+        return cloud[inner, 2]
+
+    assert top(0.001, 0).std() == pytest.approx(0.001, rel=0.2)
+    assert top(0.0, 0).std() < 1e-4
+    assert np.array_equal(top(0.001, 5), top(0.001, 5))
+    assert not np.array_equal(top(0.001, 5), top(0.001, 6))
+
+
+def test_retreat_is_straight_up_after_a_side_grasp() -> None:
+    down = top_down(0.1, 0.1, 0.1)
+    assert retreat_pose(down)[:3, 3] == pytest.approx(down[:3, 3] + [0.0, 0.0, 0.1])
+    side = np.eye(4)
+    side[:3, :3] = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    assert retreat_pose(side)[:3, 3] == pytest.approx((0.0, 0.0, 0.1))
+    slanted = np.eye(4)  # 45° from vertical: back along the approach
+    slanted[:3, :3] = np.array([[1, 0, 0], [0, -1, 0], [0, 0, -1]]) @ np.array(
+        [[0.5**0.5, 0, 0.5**0.5], [0, 1, 0], [-(0.5**0.5), 0, 0.5**0.5]]
+    )
+    assert retreat_pose(slanted)[:3, 3] == pytest.approx(-0.1 * slanted[:3, 2])
+
+
+def test_wrong_use_is_told(simulation: ClutterSimulation) -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(RuntimeError, match="call reset"):
+        simulation.try_grasp(np.eye(4))
+    with pytest.raises(ValueError, match="scene is 'heap'; choose one of packed, pile"):
+        simulation.reset("heap", rng)
+    with pytest.raises(ValueError, match="num_objects is 0"):
+        simulation.reset("pile", rng, 0)
+    with pytest.raises(FileNotFoundError, match="no object file"):
+        simulation.reset_from_poses([ObjectPlacement(Path("gone.urdf"), 1.0, (0, 0, 0), UPRIGHT)])
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    with pytest.raises(ValueError, match="T_world_hand is no rigid transform"):
+        simulation.try_grasp(np.zeros((4, 4)))
+    with ClutterSimulation({}) as without, pytest.raises(ValueError, match="no object set"):
+        without.reset("pile", rng)
