@@ -27,6 +27,9 @@ class CheckpointMetadata:
     """What a checkpoint says of itself.
 
     The digest is the file's SHA-256, in hex; empty until the checkpoint was loaded from a file.
+
+    Raises:
+        ValueError: A field is out of range; names the field, the value and the fix.
     """
 
     name: str  # the model's name, such as `edgegrasp-plus`
@@ -36,6 +39,12 @@ class CheckpointMetadata:
     temperature: float = 1.0  # calibration: probability = sigmoid(logit / temperature)
     training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
     digest: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.voxel_size < 1.0:
+            raise ValueError(f"voxel_size: got {self.voxel_size!r}. Give metres, such as 0.0045.")
+        if not 0.0 < self.temperature < float("inf"):
+            raise ValueError(f"temperature: got {self.temperature!r}. Give a positive number.")
 
     @property
     def crop_radius(self) -> float:

@@ -87,9 +87,9 @@ def import_checkpoint(
         if part != "std" or is_vn
         for name, weight in _load_weights(directory / f"{stem}-ckpt-{number}.pt").items()
     }
-    ours = _renamed(theirs, _VN_PARTS) if is_vn else _edgegrasp_weights(theirs, config)
     network = build_network(config)
     try:
+        ours = _renamed(theirs, _VN_PARTS) if is_vn else _edgegrasp_weights(theirs, config)
         network.load_state_dict(ours)
     except RuntimeError as error:
         raise InvalidCheckpoint(

@@ -41,7 +41,7 @@ class PointNetConv(nn.Module):
         u = F.linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
         pooled = []
         for neighbors, v_here in zip(in_pieces(batch.neighbors), in_pieces(v), strict=True):
-            hidden = F.relu(gather_rows(u, neighbors) - v_here.unsqueeze(1))  # (p, k, width)
+            hidden = (gather_rows(u, neighbors) - v_here.unsqueeze(1)).relu_()  # (p, k, width)
             pooled.append(maximum(F.linear(hidden, self.output.weight), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
         return torch.cat(pooled) + self.output.bias
@@ -121,7 +121,9 @@ def build_network(config: NetworkConfig, generator: torch.Generator | None = Non
         generator: Source of the weights; without one, those of seed 0.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    network = (EdgeGraspNet if config.architecture == "edgegrasp" else VNEdgeGraspNet)(config)
+    # The layers first initialise themselves from the global stream: leave it as it was.
+    with torch.random.fork_rng(devices=[]):
+        network = (EdgeGraspNet if config.architecture == "edgegrasp" else VNEdgeGraspNet)(config)
     for module in network.modules():
         if isinstance(module, nn.Linear):
             # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.

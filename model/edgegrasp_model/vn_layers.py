@@ -20,16 +20,18 @@ def vector_relu(vectors: Tensor, directions: Tensor) -> Tensor:
     return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
 
 
-def vector_maximum(vectors: Tensor, directions: Tensor, dim: int) -> Tensor:
-    """For each channel the vector that reaches furthest along its direction.
+def vector_maximum(vectors: Tensor, direction: nn.Linear, dim: int) -> Tensor:
+    """For each channel the vector that reaches furthest along its own direction.
 
     Args:
         vectors: (..., 3, C).
-        directions: The same shape.
+        direction: Maps the vectors to their directions. It gets no gradient, as a choice has none:
+            training leaves it as it was drawn, in the reference too.
         dim: The dimension to reduce, one of those before the last two.
     """
-    reach = (vectors * directions).sum(dim=-2, keepdim=True)  # (..., 1, C)
-    furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
+    with torch.no_grad():
+        reach = (vectors * direction(vectors)).sum(dim=-2, keepdim=True)  # (..., 1, C)
+        furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
     return vectors.take_along_dim(furthest, dim).squeeze(dim)
 
 

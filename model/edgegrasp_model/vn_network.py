@@ -46,7 +46,7 @@ class VNPointNetConv(nn.Module):
             hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
             direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
             messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
-            pooled.append(vector_maximum(messages, self.reach(messages), dim=1))
+            pooled.append(vector_maximum(messages, self.reach, dim=1))
         vectors: Tensor = self.output_relu(torch.cat(pooled))
         return vectors
 
@@ -61,9 +61,8 @@ class VNBallMaximum(nn.Module):
 
     def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, width) to ball features (B, 3, width)."""
-        sizes = batch.ball_sizes
-        balls, reaches = torch.split(vectors, sizes), torch.split(self.reach(vectors), sizes)
-        furthest = [vector_maximum(*ball, dim=0) for ball in zip(balls, reaches, strict=True)]
+        balls = torch.split(vectors, batch.ball_sizes)
+        furthest = [vector_maximum(ball, self.reach, dim=0) for ball in balls]
         pooled: Tensor = self.relu(torch.stack(furthest))
         return pooled
 

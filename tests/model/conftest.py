@@ -1,0 +1,99 @@
+"""Random clouds with candidate edge grasps, as the networks take them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from edgegrasp_model.ball_batch import BallBatch, crop_balls
+from edgegrasp_model.network_config import NetworkConfig
+
+RADIUS = 0.05
+
+
+@dataclass(frozen=True)
+class Scene:
+    points: NDArray[np.float64]  # (N, 3)
+    normals: NDArray[np.float64]  # (N, 3)
+    approach_index: NDArray[np.int64]  # (A,)
+    edges: NDArray[np.int64]  # (E, 2) ball, contact row of the cloud
+
+    def turned(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Scene":
+        return replace(
+            self, points=self.points @ rotation.T + translation, normals=self.normals @ rotation.T
+        )
+
+    def reordered(self, order: NDArray[np.int64]) -> "Scene":
+        """The same scene with its point order[i] at row i."""
+        row_of = np.argsort(order)
+        return Scene(
+            self.points[order],
+            self.normals[order],
+            row_of[self.approach_index],
+            np.column_stack((self.edges[:, 0], row_of[self.edges[:, 1]])),
+        )
+
+    def only_ball(self, ball: int) -> "Scene":
+        edges = self.edges[self.edges[:, 0] == ball]
+        return replace(
+            self,
+            approach_index=self.approach_index[[ball]],
+            edges=np.column_stack((np.zeros(len(edges), dtype=np.int64), edges[:, 1])),
+        )
+
+    def batch(self, dtype: torch.dtype = torch.float64) -> BallBatch:
+        crop = crop_balls(self.points, self.approach_index, RADIUS)
+        row_of = {
+            (int(ball), int(row)): place
+            for place, (ball, row) in enumerate(
+                zip(crop.ball_of_point, crop.ball_rows, strict=True)
+            )
+        }
+        contact = np.array([row_of[int(ball), int(row)] for ball, row in self.edges], dtype=int)
+        edge = self.points[self.edges[:, 1]] - self.points[self.approach_index[self.edges[:, 0]]]
+        normal = self.normals[self.edges[:, 1]]
+        ahead = edge - (edge * normal).sum(axis=1, keepdims=True) * normal
+        depth = np.linalg.norm(ahead, axis=1)
+        centre = self.points[self.approach_index][crop.ball_of_point]
+        return BallBatch(
+            points=torch.from_numpy(self.points[crop.ball_rows] - centre).to(dtype),
+            normals=torch.from_numpy(self.normals[crop.ball_rows]).to(dtype),
+            neighbors=torch.from_numpy(crop.neighbors),
+            ball_of_point=torch.from_numpy(crop.ball_of_point),
+            num_balls=len(self.approach_index),
+            contact=torch.from_numpy(contact),
+            approach=torch.from_numpy(-ahead / depth[:, None]).to(dtype),
+            depth=torch.from_numpy(depth).to(dtype),
+        )
+
+
+def _random_scene(seed: int) -> Scene:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.06, 0.06, (150, 3)) * (1.0, 1.0, 0.4)
+    normals = rng.normal(size=(150, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    approach_index = rng.choice(150, 4, replace=False)
+    distance = np.linalg.norm(points[approach_index][:, None] - points, axis=2)  # (A, N)
+    edges = np.argwhere((distance > 0.003) & (distance < 0.038))
+    return Scene(points, normals, approach_index, edges[:: max(1, len(edges) // 40)])
+
+
+@pytest.fixture(scope="session")
+def random_scene() -> Callable[[int], Scene]:
+    """Makes a random scene from a seed: 4 balls, some 40 edge grasps."""
+    return _random_scene
+
+
+@pytest.fixture(scope="session")
+def tiny_config() -> NetworkConfig:
+    """A network of the paper's shape, narrow enough for many examples."""
+    return NetworkConfig(
+        architecture="edgegrasp",
+        conv_widths=(8, 12, 16),
+        global_widths_1=(16, 20, 24),
+        global_widths_2=(28, 32),
+        classifier_widths=(24, 16),
+    )
