@@ -21,6 +21,7 @@ from edgegrasp_training.views import LabelledView
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM = 0, 1, 2, 3
 VOXEL_SIZE = 0.0045  # metres
 SAMPLED_RADIUS, SAMPLED_K = 0.04, 16  # balls that candidates are drawn from
+APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
 
 
@@ -112,10 +113,11 @@ def generate_scene(
     return tried, held
 
 
-def detect_options(observation: Observation, seed: int) -> DetectOptions:
-    """What the benchmark asks of the pipeline for such an observation."""
+def _request(observation: Observation, seed: int) -> DetectOptions:
+    """What a benchmark asks of the pipeline for such an observation, around fewer points."""
     low, high = observation.workspace.tolist()
     return DetectOptions(
+        num_approach_points=APPROACH_POINTS,
         seed=seed,
         viewpoint=tuple(observation.camera_position.tolist()),
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=observation.table_height),
@@ -132,7 +134,7 @@ def _label(
 ) -> LabelledView:
     """Sample candidates as the detector does and try some of them."""
     gripper = load_gripper()
-    request = detect_options(observation, int(rng.integers(2**32)))
+    request = _request(observation, int(rng.integers(2**32)))
     cloud = clean_cloud(observation.cloud, request, VOXEL_SIZE, {})
     if cloud is None:
         return _empty(observation)
