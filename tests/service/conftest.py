@@ -1,0 +1,96 @@
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+import httpx
+import pytest
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+
+
+@dataclass
+class Answer:
+    code: str  # gRPC status name, or HTTP status
+    kind: str
+    detail: str
+    field: str
+    value: str
+    fix: str
+    body: Any = None
+
+
+class RawGrpc:
+    """Sends what a careless client might, and shows what comes back."""
+
+    name = "grpc"
+
+    def __init__(self, address: str) -> None:
+        self.channel = grpc.insecure_channel(address, (("grpc.max_send_message_length", -1),))
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
+
+    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
+        encoded = grasp_pb2.EncodedCloud(format=file_format, data=data)
+        return self.request(encoded=encoded, options=grasp_pb2.DetectOptions(**options))
+
+    def request(self, **fields: Any) -> Answer:
+        return self.send(grasp_pb2.DetectGraspsRequest(**fields))
+
+    def send(self, message: grasp_pb2.DetectGraspsRequest) -> Answer:
+        try:
+            body = self._stub.DetectGrasps(message, timeout=20)
+        except grpc.RpcError as error:
+            trailers = dict(error.trailing_metadata())
+            detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
+            told = (detail.kind, error.details(), detail.field, detail.value, detail.fix)
+            return Answer(error.code().name, *told)
+        return Answer("OK", "", "", "", "", "", body)
+
+    def close(self) -> None:
+        self.channel.close()
+
+
+class RawRest:
+    name = "rest"
+
+    def __init__(self, address: str) -> None:
+        self.http = httpx.Client(base_url=address, timeout=20)
+
+    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
+        headers = {"content-type": f"application/x-{file_format}"}
+        return self.post(content=data, headers=headers, params=options)
+
+    def post(self, **request: Any) -> Answer:
+        response = self.http.post("/v1/grasps", **request)
+        body = response.json()
+        if response.is_success:
+            return Answer("200", "", "", "", "", "", body)
+        assert response.headers["content-type"] == "application/problem+json"
+        assert body["status"] == response.status_code
+        assert body["title"]
+        kind = body["type"].removeprefix("urn:edgegrasp:error:")
+        told = (kind, body["detail"], body["field"], body["value"], body["fix"])
+        return Answer(str(response.status_code), *told)
+
+    def close(self) -> None:
+        self.http.close()
+
+
+@pytest.fixture
+def raw_grpc(dummy_server) -> Iterator[RawGrpc]:
+    raw = RawGrpc(dummy_server.grpc_address)
+    yield raw
+    raw.close()
+
+
+@pytest.fixture
+def raw_rest(dummy_server) -> Iterator[RawRest]:
+    raw = RawRest(dummy_server.http_url)
+    yield raw
+    raw.close()
+
+
+@pytest.fixture(params=["grpc", "rest"])
+def raw(request: pytest.FixtureRequest) -> RawGrpc | RawRest:
+    found: RawGrpc | RawRest = request.getfixturevalue(f"raw_{request.param}")
+    return found

@@ -1,0 +1,272 @@
+import contextlib
+import io
+import struct
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_service.cloud_decoding import (
+    FILE_FORMATS,
+    decode_file,
+    decode_list,
+    decode_packed,
+)
+from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
+
+POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
+MANY = 1000
+
+
+def npy(array: np.ndarray, **options: object) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return stream.getvalue()
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def ply(points: np.ndarray, encoding: str = "binary_little_endian", promised: int = -1) -> bytes:
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding, "<")
+    record = np.dtype([("x", order + "f4"), ("c", "u1"), ("y", order + "f4"), ("z", order + "f4")])
+    rows = np.zeros(len(points), record)
+    for column, axis in enumerate("xyz"):
+        rows[axis] = points[:, column]
+    count = promised if promised >= 0 else len(points)
+    header = (
+        f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {count}\nproperty float x\n"
+        "property uchar c\nproperty float y\nproperty float z\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    if encoding == "ascii":
+        lines = [" ".join(repr(value.item()) for value in row) for row in rows]
+        return (header + "\n".join(lines) + "\n3 0 1 2\n").encode()
+    return header.encode() + rows.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
+
+
+def pcd(points: np.ndarray, encoding: str = "binary", promised: int = -1) -> bytes:
+    record = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("n", "<f4", 2), ("i", "<u1")])
+    rows = np.zeros(len(points), record)
+    for column, axis in enumerate("xyz"):
+        rows[axis] = points[:, column]
+    count = promised if promised >= 0 else len(points)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z n i\nSIZE 4 4 4 4 1\nTYPE F F F F U\n"
+        f"COUNT 1 1 1 2 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\n"
+        f"DATA {encoding}\n"
+    )
+    if encoding == "ascii":
+        lines = [f"{x!r} {y!r} {z!r} 0 0 0" for x, y, z in points.astype(float).tolist()]
+        return (header + "\n".join(lines) + "\n").encode()
+    return header.encode() + rows.tobytes()
+
+
+GOOD_FILES = {
+    "npy": npy(POINTS),
+    "npy, column order": npy(np.asfortranarray(POINTS)),
+    "npy, big endian": npy(POINTS.astype(">f4")),
+    "npz": npz(points=POINTS, colours=POINTS),
+    "npz, one array": npz(anything=POINTS),
+    "ply": ply(POINTS),
+    "ply, big endian": ply(POINTS, "binary_big_endian"),
+    "ply, text": ply(POINTS, "ascii"),
+    "pcd": pcd(POINTS),
+    "pcd, text": pcd(POINTS, "ascii"),
+}
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+def test_every_format_gives_the_same_points(name: str) -> None:
+    points = decode_file(name[:3], GOOD_FILES[name], MANY)
+    np.testing.assert_array_equal(np.asarray(points, dtype=np.float32), POINTS)
+    assert points.dtype.isnative
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_files_written_by_open3d(suffix: str, text: bool, compressed: bool, tmp_path) -> None:
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    path = tmp_path / f"cloud.{suffix}"
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
+    open3d.io.write_point_cloud(path, cloud, write_ascii=text, compressed=compressed)
+    points = decode_file(suffix, path.read_bytes(), MANY)
+    # Open3D writes few digits of text.
+    np.testing.assert_allclose(points, POINTS, atol=1e-5 if text else 1e-7)
+
+
+def test_packed_and_listed_points_match() -> None:
+    np.testing.assert_array_equal(decode_packed(POINTS.tobytes(), MANY), POINTS)
+    listed = decode_list(POINTS.tolist(), MANY)
+    np.testing.assert_array_equal(listed.astype(np.float32), POINTS)
+    assert decode_packed(b"", MANY).shape == decode_list([], MANY).shape == (0, 3)
+    assert decode_list([[0, 0, 1]], MANY).dtype == np.float64
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+@given(data=st.data())
+def test_truncated_files_are_refused(name: str, data: st.DataObject) -> None:
+    whole = GOOD_FILES[name]
+    # Text may end inside its last number, and faces behind the vertices are not read.
+    needed = len(whole) - {"ply": 14, "ply, big endian": 14, "ply, text": 30, "pcd, text": 12}.get(
+        name, 1
+    )
+    cut = data.draw(st.integers(0, needed))
+    with pytest.raises(InvalidRequest) as caught:
+        decode_file(name[:3], whole[:cut], MANY)
+    assert caught.value.field == "cloud"
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+@given(data=st.data())
+def test_flipped_bytes_give_points_or_a_refusal(name: str, data: st.DataObject) -> None:
+    damaged = bytearray(GOOD_FILES[name])
+    for _ in range(data.draw(st.integers(1, 4))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(InvalidRequest, PayloadTooLarge, DecoderMissing):
+        assert isinstance(decode_file(name[:3], bytes(damaged), MANY), np.ndarray)
+
+
+@pytest.mark.parametrize("file_format", FILE_FORMATS)
+@given(data=st.binary(max_size=200))
+def test_foreign_bytes_are_refused(file_format: str, data: bytes) -> None:
+    with pytest.raises(InvalidRequest):
+        decode_file(file_format, data, MANY)
+
+
+def promise(count: int, file_format: str) -> bytes:
+    if file_format == "ply":
+        return ply(POINTS, promised=count)
+    if file_format == "pcd":
+        return pcd(POINTS, promised=count)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (count, 3)}
+    )
+    return header.getvalue() + POINTS.tobytes()
+
+
+@pytest.mark.parametrize("file_format", ["npy", "ply", "pcd"])
+@pytest.mark.parametrize("count", [42, 10**9, 10**17])
+def test_a_header_cannot_promise_more_than_there_is(file_format: str, count: int) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_file(file_format, promise(count, file_format), max_points=10**18)
+    assert "promises" in caught.value.value
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+def test_too_many_points(name: str) -> None:
+    with pytest.raises(PayloadTooLarge) as caught:
+        decode_file(name[:3], GOOD_FILES[name], max_points=39)
+    assert caught.value.value == "40 points"
+    assert "39" in caught.value.fix
+
+
+def test_a_decompression_bomb_is_not_unpacked() -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(10_000_000))
+    with pytest.raises(PayloadTooLarge) as caught:
+        decode_file("npz", stream.getvalue(), MANY)
+    assert "10000000 bytes" in caught.value.value
+
+
+@pytest.mark.parametrize(
+    ("data", "value"),
+    [
+        (npz(a=POINTS, b=POINTS), "a.npy, b.npy"),
+        (npz(), "nothing"),
+    ],
+)
+def test_an_archive_must_say_which_array(data: bytes, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_file("npz", data, MANY)
+    assert value in caught.value.value
+    assert "points=points" in caught.value.fix
+
+
+def test_nothing_is_unpickled() -> None:
+    pickled = npy(np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for file_format, data in (("npy", pickled),):
+        with pytest.raises(InvalidRequest) as caught:
+            decode_file(file_format, data, MANY)
+        assert caught.value.value == "dtype object"
+
+
+@pytest.mark.parametrize(
+    ("points", "field", "value"),
+    [
+        ("abc", "points", "'abc'"),
+        (None, "points", "None"),
+        ([[0.0, 0.0, 0.0], [1.0, 2.0]], "points", "rows of different lengths"),
+        ([[0.0, 0.0, 0.0], ["a", 0.0, 0.0]], "points", "['a', 0.0, 0.0]"),
+        ([[0.0, 0.0, None]], "points", "[0.0, 0.0, None]"),
+        ([[True, False, True]], "points", "[True, False, True]"),
+        ([[10**400, 0, 0]], "points", "[1000000"),
+        ([{}], "points", "{}"),
+    ],
+)
+def test_lists_that_are_no_numbers(points: object, field: str, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_list(points, MANY)
+    assert caught.value.field == field
+    assert caught.value.value.startswith(value)
+
+
+def test_packed_bytes_must_be_whole_points() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_packed(POINTS.tobytes()[:-5], MANY)
+    assert caught.value.value.startswith("475 bytes")
+
+
+def test_unknown_format_names_the_known_ones() -> None:
+    with pytest.raises(UnsupportedMediaType) as caught:
+        decode_file("xyz", b"0 0 0", MANY)
+    assert caught.value.fix == "Send one of: npy, npz, ply, pcd."
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"element face 3\nproperty float x\n",
+        b"element vertex -3\nproperty float x\nproperty float y\nproperty float z\n",
+        b"element vertex 1\nproperty float x\nproperty float y\n",
+        b"element vertex 1\nproperty list uchar int x\nproperty float y\nproperty float z\n",
+        b"",
+    ],
+)
+def test_ply_headers_without_points(header: bytes) -> None:
+    data = b"ply\nformat binary_little_endian 1.0\n" + header + b"end_header\n" + bytes(100)
+    with pytest.raises(InvalidRequest) as caught:
+        decode_file("ply", data, MANY)
+    assert "vert" in caught.value.value
+
+
+def test_integer_coordinates_keep_their_type() -> None:
+    header = b"ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += b"property int x\nproperty int y\nproperty int z\nend_header\n1 2 3\n"
+    assert decode_file("ply", header, MANY).dtype == np.int32
+
+
+def test_compressed_pcd_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    body = struct.pack("<II", 4, 40 * 21) + bytes(4)
+    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    with pytest.raises(DecoderMissing) as caught:
+        decode_file("pcd", data[0] + data[1] + body, MANY)
+    assert "uncompressed" in caught.value.fix
+
+
+@pytest.mark.parametrize("sizes", [(4, 10**9), (10**9, 840)])
+def test_compressed_pcd_with_false_sizes(sizes: tuple[int, int]) -> None:
+    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    with pytest.raises(InvalidRequest):
+        decode_file("pcd", data[0] + data[1] + struct.pack("<II", *sizes) + bytes(4), MANY)

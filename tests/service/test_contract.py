@@ -1,0 +1,133 @@
+"""The same request gives the same answer, whatever transport and format it comes by."""
+
+import io
+import json
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from google.protobuf import json_format
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.http_bodies import DetectionBody, ModelsBody
+
+OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
+
+
+def files_of(cloud: np.ndarray) -> dict[str, bytes]:
+    npy, npz = io.BytesIO(), io.BytesIO()
+    np.save(npy, cloud)
+    np.savez_compressed(npz, points=cloud)
+    ply = "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\n"
+    ply += "property float y\nproperty float z\nend_header\n"
+    pcd = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
+    pcd += "POINTS {0}\nDATA binary\n"
+    return {
+        "npy": npy.getvalue(),
+        "npz": npz.getvalue(),
+        "ply": ply.format(len(cloud)).encode() + cloud.tobytes(),
+        "pcd": pcd.format(len(cloud)).encode() + cloud.tobytes(),
+    }
+
+
+def grasps_of(answer: Any) -> list[dict[str, Any]]:
+    """The grasps of either transport, as JSON values of which floats compare exactly."""
+    if isinstance(answer.body, dict):
+        return answer.body["grasps"]
+    found = []
+    for grasp in answer.body.grasps:
+        fields = {field.name: getattr(grasp, field.name) for field in grasp.DESCRIPTOR.fields}
+        for name, value in fields.items():
+            if name.startswith("T_"):
+                fields[name] = [list(value[row : row + 4]) for row in range(0, 16, 4)]
+            elif not isinstance(value, float | bool):
+                fields[name] = list(value)
+        found.append(fields)
+    return found
+
+
+def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, raw_grpc, raw_rest) -> None:
+    message = grasp_pb2.DetectOptions(**OPTIONS)
+    answers = [
+        raw_grpc.request(points=cloud.tobytes(), options=message),
+        raw_rest.post(json={"points": cloud.tolist(), "options": OPTIONS}),
+    ]
+    for file_format, data in files_of(cloud).items():
+        upload = {"cloud": (f"cloud.{file_format}", data)}
+        part = {"options": json.dumps(OPTIONS)}
+        typed = {
+            "cloud": ("cloud", data, f"application/x-{file_format}"),
+            "options": (None, json.dumps(OPTIONS), "application/json"),
+        }
+        answers += [
+            raw_grpc.file(file_format, data, **OPTIONS),
+            raw_rest.file(file_format, data, **OPTIONS),
+            raw_rest.post(files=upload, data=part),
+            raw_rest.post(files=typed),
+        ]
+    expected = grasps_of(answers[0])
+    assert len(expected) == 7
+    assert all(grasps_of(answer) == expected for answer in answers)
+
+
+def test_seed_matters_and_zero_is_one(cloud: np.ndarray, raw) -> None:
+    data = files_of(cloud)["npy"]
+    default, zero, one = raw.file("npy", data), raw.file("npy", data, seed=0), None
+    one = raw.file("npy", data, seed=1)
+    assert grasps_of(default) == grasps_of(zero) != grasps_of(one)
+
+
+def test_nothing_found_is_a_success(cloud: np.ndarray, raw) -> None:
+    answer = raw.file("npy", files_of(cloud)["npy"], min_score=1.0)
+    assert answer.code in ("OK", "200")
+    assert grasps_of(answer) == []
+    counts = answer.body["counts"] if raw.name == "rest" else answer.body.counts
+    assert (counts["points"], counts["returned"]) == (500, 0)
+
+
+def test_answers_are_as_documented(cloud: np.ndarray, raw_rest) -> None:
+    answer = raw_rest.file("npy", files_of(cloud)["npy"])
+    DetectionBody.model_validate(answer.body)
+    ModelsBody.model_validate(raw_rest.http.get("/v1/models").json())
+
+
+@pytest.mark.parametrize(
+    "text", ["0.1,0.2,0.3", "[0.1, 0.2, 0.3]", '{"x": 1}', "null", "0.1,b,0.3"]
+)
+def test_options_as_text(text: str, cloud: np.ndarray, raw_rest) -> None:
+    answer = raw_rest.file("npy", files_of(cloud)["npy"], viewpoint=text)
+    assert answer.code == ("400" if "x" in text or "b" in text else "200")
+
+
+def test_nested_options(cloud: np.ndarray, raw) -> None:
+    box = {"min": [0.0, 0.0, 0.0], "max": [-1.0, 1.0, 1.0]}
+    if raw.name == "rest":
+        answer = raw.file("npy", files_of(cloud)["npy"], workspace=json.dumps(box))
+    else:
+        corners = {name: dict(zip("xyz", box[name], strict=True)) for name in box}
+        answer = raw.file(
+            "npy",
+            files_of(cloud)["npy"],
+            workspace=json_format.ParseDict(corners, grasp_pb2.Workspace()),
+        )
+    assert (answer.kind, answer.field) == ("invalid-request", "options.workspace")
+
+
+def test_probes(dummy_server, raw_grpc) -> None:
+    for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
+        assert httpx.get(dummy_server.http_url + path).status_code == 200
+    health = health_pb2_grpc.HealthStub(raw_grpc.channel)
+    for name in ("", "edgegrasp.v1.GraspService"):
+        request = health_pb2.HealthCheckRequest(service=name)
+        assert health.Check(request).status == health_pb2.HealthCheckResponse.SERVING
+
+
+def test_reflection_lists_the_service(raw_grpc) -> None:
+    stub = reflection_pb2_grpc.ServerReflectionStub(raw_grpc.channel)
+    request = reflection_pb2.ServerReflectionRequest(list_services="")
+    answer = next(stub.ServerReflectionInfo(iter([request])))
+    names = {service.name for service in answer.list_services_response.service}
+    assert {"edgegrasp.v1.GraspService", "grpc.health.v1.Health"} <= names
