@@ -6,6 +6,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*)
 
 .DEFAULT_GOAL := help
 .PHONY: help venv lint format test demo proto constraints clean
@@ -26,6 +27,9 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	mkdir -p build/proto
+	PYTHON=$(BIN)/python scripts/generate_proto.sh build/proto
+	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
 
 format: $(INSTALLED) ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
@@ -38,7 +42,7 @@ demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a 
 	$(BIN)/python examples/demo.py
 
 proto: $(INSTALLED) ## generate the gRPC code from proto/
-	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/generate_proto.sh
+	PYTHON=$(BIN)/python scripts/generate_proto.sh
 
 constraints: ## resolve the dependencies afresh into constraints.txt
 	scripts/update_constraints.sh $(PYTHON)

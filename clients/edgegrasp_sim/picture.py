@@ -20,6 +20,10 @@ STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes
 MARGIN = 0.02  # metres around everything drawn
 MAX_CLOUD_POINTS = 12_000  # more only hide each other
 LABELLED = 5  # grasps that carry their rank
+CAPTION = (
+    "grey: the cloud, lighter is higher    forks: palm and opened fingers, "
+    "the stem shows where the hand comes from"
+)
 BEST_EDGE = "#d00000"
 OUTLINE = "black"
 
@@ -74,7 +78,7 @@ def draw_grasps(
     figure = Figure(figsize=(17, 8.4), dpi=110)
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=16)
-    perspective: Any = figure.add_axes((0.01, 0.01, 0.52, 0.88), projection="3d")
+    perspective: Any = figure.add_axes((0.01, 0.03, 0.52, 0.86), projection="3d")
     above: Any = figure.add_axes((0.56, 0.10, 0.35, 0.76))
     _draw_perspective(perspective, points, camera, low, high)
     _draw_above(above, points, low, high)
@@ -82,6 +86,7 @@ def draw_grasps(
         colour = colours.to_rgba(scores[rank])
         for axes, dimensions in ((perspective, 3), (above, 2)):
             _draw_fork(axes, lines[..., :dimensions], colour, rank)
+    figure.text(0.5, 0.015, CAPTION, fontsize=12, ha="center")
     bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.14, 0.014, 0.68)))
     bar.set_label("score: probability that the grasp holds", fontsize=13)
     bar.ax.tick_params(labelsize=12)

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from edgegrasp_cli.main import COMMANDS
+
 HEAVY = {"fastapi", "grpc", "matplotlib", "open3d", "pybullet", "scipy", "torch", "uvicorn"}
 
 
@@ -19,9 +21,7 @@ def heavy_modules_after(code: str) -> set[str]:
     return HEAVY & set(done.stdout.rpartition("\nLOADED")[2].split())
 
 
-@pytest.mark.parametrize(
-    "arguments", [[], ["serve"], ["detect"], ["benchmark"], ["generate-data"], ["train"]], ids=str
-)
+@pytest.mark.parametrize("arguments", [[], *([name] for name in COMMANDS)], ids=str)
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     argv = ["edgegrasp", *arguments, "--help"]
     code = f"import sys; sys.argv = {argv!r}; from edgegrasp_cli.main import main; main()"

@@ -1,0 +1,142 @@
+"""The main job from end to end, as `make demo` runs it.
+
+Makes a cluttered scene in simulation, looks at it with a depth camera, starts a server, posts the
+cloud over gRPC and over REST, executes the best grasp in the simulator, and writes a picture and
+the cloud.
+
+usage: python examples/demo.py [seed]
+"""
+
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_client import Detection, GraspClient, GraspClientError
+from edgegrasp_sim.picture import draw_grasps
+from edgegrasp_sim.simulation import ClutterSimulation, Observation
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTPUT = ROOT / "demo_output"
+FEWEST_GRASPS = 10
+LISTED = 12
+TIMEOUT = 120.0  # seconds; a slow machine is no reason to fail
+
+
+def main(seed: int = 0) -> None:
+    """Run the demo; exits with a message if the server does not start or finds too little."""
+    scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
+    with ClutterSimulation() as simulation:
+        placed = simulation.reset("pile", scene, num_objects=6)
+        seen = simulation.observe(camera, noise)
+        print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
+
+        over_grpc, over_rest = detect_over_both(seen, seed)
+        report("gRPC", over_grpc)
+        report("REST", over_rest)
+        if not same(over_grpc, over_rest):
+            sys.exit("error: gRPC and REST gave different grasps.")
+        print("gRPC and REST gave the same grasps, to the last bit.\n")
+        if len(over_grpc.grasps) < FEWEST_GRASPS:
+            sys.exit(f"error: {len(over_grpc.grasps)} grasps; the counts say where they went.")
+
+        best = over_grpc.grasps[0]
+        result = simulation.execute_grasp(best.T_cloud_hand)  # the cloud is in the world frame
+        verdict = "it held" if result.success else "it did not hold"
+        print(f"Executed the best one in the simulator: {verdict}.")
+
+    OUTPUT.mkdir(exist_ok=True)
+    write_ply(OUTPUT / "scene.ply", seen.cloud)
+    drawn = over_grpc.grasps[:LISTED]
+    draw_grasps(
+        OUTPUT / "grasps.png",
+        seen.cloud,
+        drawn,
+        camera_position=seen.camera_position,
+        title=f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}.",
+    )
+    print("Wrote demo_output/grasps.png, the picture, and demo_output/scene.ply, the cloud.")
+
+
+def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
+    """Grasps of one cloud over gRPC and over REST, from a server of our own."""
+    options = {
+        "seed": seed,
+        "viewpoint": seen.camera_position,
+        "support": {"normal": (0.0, 0.0, 1.0), "offset": seen.table_height},
+        "num_approach_points": 96,
+        "top_k": 20,
+    }
+    with running_server() as (http_url, grpc_address):
+        print(f"Server: {http_url} and gRPC {grpc_address}\n")
+        with GraspClient(grpc_address, timeout=TIMEOUT) as client:
+            over_grpc = client.detect(seen.cloud, **options)
+        with GraspClient(http_url, timeout=TIMEOUT) as client:
+            over_rest = client.detect(seen.cloud, **options)
+    return over_grpc, over_rest
+
+
+@contextmanager
+def running_server() -> Iterator[tuple[str, str]]:
+    """A server on free ports: its HTTP URL and its gRPC address, once it is ready."""
+    program = Path(sysconfig.get_path("scripts")) / "edgegrasp"
+    command = [program, "serve", "--http-port", "0", "--grpc-port", "0", "--log-level", "warning"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            # "EdgeGrasp serves HTTP <url> gRPC <address>", printed when it is ready.
+            words = server.stdout.readline().split()
+            if len(words) != 6:
+                sys.exit("error: the server did not start; it says why above.")
+            yield words[3], words[5]
+        finally:
+            server.terminate()
+
+
+def report(transport: str, detection: Detection) -> None:
+    """Print a detection as a table."""
+    grasps = detection.grasps
+    print(
+        f"{len(grasps)} grasps over {transport} from {detection.model}"
+        f" in {detection.seconds['total']:.2f} s; the best {min(LISTED, len(grasps))}:"
+    )
+    print("rank  score  width (mm)   TCP x, y, z (m)        approach direction")
+    for rank, grasp in enumerate(grasps[:LISTED], start=1):
+        x, y, z = grasp.T_cloud_tcp[:3, 3]
+        u, v, w = grasp.approach_direction
+        print(
+            f"{rank:4}  {grasp.score:.3f}  {1000 * grasp.width:10.1f}   "
+            f"{x:.3f}, {y:.3f}, {z:.3f}    {u:+.2f}, {v:+.2f}, {w:+.2f}"
+        )
+    if len(grasps) < FEWEST_GRASPS:
+        print("counts:", ", ".join(f"{name} {count}" for name, count in detection.counts.items()))
+    print()
+
+
+def write_ply(path: Path, cloud: NDArray[np.float32]) -> None:
+    """Write a cloud, (N, 3) metres, as a binary PLY file."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
+        "property float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    path.write_bytes(header.encode() + cloud.astype("<f4").tobytes())
+
+
+def same(one: Detection, other: Detection) -> bool:
+    """Whether two detections hold the same grasps in the same order."""
+    return len(one.grasps) == len(other.grasps) and all(
+        a.score == b.score and np.array_equal(a.T_cloud_hand, b.T_cloud_hand)
+        for a, b in zip(one.grasps, other.grasps, strict=True)
+    )
+
+
+if __name__ == "__main__":
+    try:
+        main(*map(int, sys.argv[1:2]))
+    except GraspClientError as error:
+        sys.exit(f"error: {error}")
