@@ -1,5 +1,7 @@
 """How well scores separate grasps that hold from grasps that do not."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
@@ -7,6 +9,30 @@ from scipy.special import expit
 from scipy.stats import rankdata
 
 FloatArray = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A network on the validation views."""
+
+    loss: float  # cross entropy, nats
+    accuracy: float
+    auroc: float
+    temperature: float  # that calibrates the logits
+    logit: NDArray[np.float32]  # (E,)
+    label: NDArray[np.float32]  # (E,)
+
+
+def evaluate_scores(logit: NDArray[np.float32], label: NDArray[np.float32]) -> Evaluation:
+    """All figures of some scores.  # (E,), (E,)."""
+    return Evaluation(
+        cross_entropy(logit, label),
+        accuracy(logit, label),
+        auroc(logit, label),
+        fit_temperature(logit, label),
+        logit,
+        label,
+    )
 
 
 def cross_entropy(logit: FloatArray, label: FloatArray) -> float:

@@ -1,8 +1,9 @@
 """The training loop: resumable to the step, stops by itself, keeps the best network."""
 
 import csv
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,16 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
+from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.layers import HandDescription
 from edgegrasp_model.network import build_network
 from edgegrasp_training.examples import TriedGrasps, pack, rotated, tried_grasps
-from edgegrasp_training.metrics import accuracy, auroc, cross_entropy, fit_temperature
+from edgegrasp_training.metrics import Evaluation, evaluate_scores
+from edgegrasp_training.model_card import write_model_card
 from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 4000
@@ -40,18 +41,6 @@ class TrainingOptions:
     evaluate_every: int = 250  # steps
     unknown_support: float = 0.1  # share of training views described without their table
     seed: int = 0
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """A network on the validation views."""
-
-    loss: float  # cross entropy, nats
-    accuracy: float
-    auroc: float
-    temperature: float  # that calibrates the logits
-    logit: NDArray[np.float32]  # (E,)
-    label: NDArray[np.float32]  # (E,)
 
 
 class Trainer:
@@ -86,6 +75,7 @@ class Trainer:
             self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
         self.step, self.best_loss, self.since_best, self.halved = 0, float("inf"), 0, 0
+        self.seconds = 0.0  # spent in training steps
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
             self._resume()
@@ -105,7 +95,9 @@ class Trainer:
             until: Step to stop at, for a run in parts.
         """
         while not self.finished and (until is None or self.step < until):
+            start = time.perf_counter()
             loss = self._train_step()
+            self.seconds += time.perf_counter() - start
             self.step += 1
             progress(self.step, loss)
             if self.step % self.options.evaluate_every == 0 or self.step == self.options.steps:
@@ -127,14 +119,33 @@ class Trainer:
                 logits.append(self.network(batch.to(self.device)).float().cpu())
                 labels.append(label)
         logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
-        return Evaluation(
-            cross_entropy(logit, label_array),
-            accuracy(logit, label_array),
-            auroc(logit, label_array),
-            fit_temperature(logit, label_array),
-            logit,
-            label_array,
-        )
+        return evaluate_scores(logit, label_array)
+
+    def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
+        """Calibrate the best network on all validation views; write it and its card.
+
+        Args:
+            provenance: Further facts for the checkpoint and the card.
+            command: That trained it.
+        """
+        path = self.folder / f"{self.metadata.name}.safetensors"
+        best, _ = load_checkpoint(path, self.device)
+        self.network.load_state_dict(best.state_dict())
+        evaluation = self.evaluate()
+        training = provenance | {
+            "training_views": len(self.train_paths),
+            "training_labels": sum(len(self._tried(p)[0].label) for p in self.train_paths),
+            "validation_views": len(self.validation_paths),
+            "validation_labels": len(evaluation.label),
+            "steps": self.step,
+            "training_seconds": round(self.seconds),
+            "seed": self.options.seed,
+        }
+        metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
+        save_checkpoint(path, self.network, metadata)
+        card = self.folder / f"{self.metadata.name}.md"
+        write_model_card(card, metadata, training, evaluation, command)
+        return evaluation
 
     def _train_step(self) -> float:
         self.network.train()
@@ -220,6 +231,7 @@ class Trainer:
             "best_loss": self.best_loss,
             "since_best": self.since_best,
             "halved": self.halved,
+            "seconds": self.seconds,
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
@@ -235,3 +247,4 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.best_loss = state["step"], state["best_loss"]
         self.since_best, self.halved = state["since_best"], state["halved"]
+        self.seconds = state["seconds"]

@@ -1,5 +1,6 @@
 """Labelled views: what a data generator writes and a trainer reads."""
 
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,12 +82,20 @@ def scene_of(path: Path) -> str:
 def split_by_scene(
     paths: list[Path], validation_share: float, seed: int
 ) -> tuple[list[Path], list[Path]]:
-    """Training and validation views; all views of one scene fall on the same side."""
-    scenes = sorted({scene_of(path) for path in paths})
-    count = max(1, round(validation_share * len(scenes)))
-    chosen = np.random.default_rng(seed).choice(len(scenes), count, replace=False)
-    held_out = {scenes[i] for i in chosen}
+    """Training and validation views; all views of one scene fall on the same side.
+
+    A scene keeps its side when more scenes are added, so that a run may go on with more data.
+
+    Args:
+        paths: View files.
+        validation_share: Share of the scenes to hold out; at least one is.
+        seed: Which ones.
+    """
+    place = {
+        scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
+    }
+    limit = max(validation_share, min(place.values()) + 2**-32)
     return (
-        [path for path in paths if scene_of(path) not in held_out],
-        [path for path in paths if scene_of(path) in held_out],
+        [path for path in paths if place[scene_of(path)] >= limit],
+        [path for path in paths if place[scene_of(path)] < limit],
     )

@@ -1,0 +1,76 @@
+"""`edgegrasp train`."""
+
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Option = typer.Option
+
+
+def train(
+    data: Annotated[list[Path], typer.Argument(help="Folders of views from generate-data.")],
+    model: Annotated[
+        str, Option(help="edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp.")
+    ] = "edgegrasp-plus",
+    run: Annotated[Path, Option(help="Folder of this run: state, log, weights, card.")] = Path(
+        "runs/edgegrasp-plus"
+    ),
+    steps: Annotated[int, Option(min=1, help="Steps at most.")] = 20_000,
+    until: Annotated[
+        int | None, Option(help="Pause at this step; the same command goes on.")
+    ] = None,
+    views_per_step: Annotated[int, Option(min=1, help="Views in a step.")] = 4,
+    balls_per_view: Annotated[int, Option(min=1, help="Balls of each view in a step.")] = 8,
+    learning_rate: Annotated[float, Option(help="At the start; halved on a plateau.")] = 1e-3,
+    validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
+    seed: Annotated[int, Option(min=0, help="Seed of weights, split and batches.")] = 0,
+    device: Annotated[str, Option(help="cpu or cuda.")] = "cpu",
+) -> None:
+    """Train weights on labelled views.
+
+    The run folder gets log.csv, the weights with the least validation loss, and when training is
+    done a model card. Running the same command again goes on from the last state.
+    """
+    from edgegrasp_training.recipes import recipe
+    from edgegrasp_training.training import Trainer, TrainingOptions
+    from edgegrasp_training.views import find_views, split_by_scene
+
+    options = TrainingOptions(
+        steps=steps,
+        views_per_step=views_per_step,
+        balls_per_view=balls_per_view,
+        learning_rate=learning_rate,
+        seed=seed,
+    )
+    try:
+        training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
+        trainer = Trainer(recipe(model), training_views, validation_views, run, options, device)
+    except (ValueError, FileNotFoundError) as error:
+        sys.exit(f"edgegrasp train: {error}")
+    print(f"{len(training_views)} training and {len(validation_views)} validation views")
+    _run(trainer, until)
+    if trainer.finished:
+        evaluation = trainer.finish(_provenance(data), shlex.join(["edgegrasp", *sys.argv[1:]]))
+        print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {run}")
+    else:
+        print(f"paused at step {trainer.step}; the same command goes on")
+
+
+def _run(trainer: Any, until: int | None) -> None:
+    from rich.progress import Progress
+
+    with Progress() as progress:
+        task = progress.add_task("steps", total=trainer.options.steps, completed=trainer.step)
+
+        def on_step(step: int, loss: float) -> None:
+            progress.update(task, completed=step, description=f"loss {loss:.3f}")
+
+        trainer.run(on_step, until)
+
+
+def _provenance(data: list[Path]) -> dict[str, Any]:
+    return {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}

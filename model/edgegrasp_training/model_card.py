@@ -1,0 +1,57 @@
+"""The model card: where weights come from and how well they did on views they never saw."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_training.metrics import Evaluation, reliability
+
+
+def write_model_card(
+    path: Path,
+    metadata: CheckpointMetadata,
+    training: Mapping[str, Any],
+    evaluation: Evaluation,
+    command: str,
+) -> None:
+    """Write a card in Markdown.
+
+    Args:
+        path: File to write.
+        metadata: Of the trained network.
+        training: Provenance: views, labels, steps, seconds and the like.
+        evaluation: On the validation views, before calibration.
+        command: That trained it.
+    """
+    network = metadata.network
+    rows = [
+        ("architecture", network.architecture),
+        ("crop radius", f"{network.crop_radius * 1000:g} mm, k = {network.k}"),
+        ("convolutions", network.conv_widths),
+        ("global MLPs", f"{network.global_widths_1}, {network.global_widths_2}"),
+        ("classifier", network.classifier_widths),
+        ("hand description", f"{network.hand_description_size} numbers per candidate"),
+        ("voxel size", f"{metadata.voxel_size * 1000:g} mm"),
+        ("gripper", metadata.gripper),
+        *((name.replace("_", " "), value) for name, value in training.items()),
+        ("validation loss", f"{evaluation.loss:.4f} nats"),
+        ("validation accuracy", f"{100 * evaluation.accuracy:.1f} %"),
+        ("validation AUROC", f"{evaluation.auroc:.4f}"),
+        ("temperature", f"{metadata.temperature:.3f}"),
+    ]
+    lines = [f"# {metadata.name}", "", "| | |", "| --- | --- |"]
+    lines += [f"| {name} | {_cell(value)} |" for name, value in rows]
+    lines += ["", "Trained by:", "", "```", command, "```", ""]
+    lines += ["Reliability of the score on the validation views:", ""]
+    lines += ["| score | held | grasps |", "| --- | --- | --- |"]
+    calibrated = evaluation.logit / metadata.temperature
+    lines += [
+        f"| {predicted:.3f} | {observed:.3f} | {count} |"
+        for predicted, observed, count in reliability(calibrated, evaluation.label)
+    ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _cell(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)

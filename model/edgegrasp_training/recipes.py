@@ -1,0 +1,36 @@
+"""What each shipped model is: its widths and what it reads."""
+
+from dataclasses import replace
+
+from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+from edgegrasp_model.network_config import (
+    EDGEGRASP,
+    EDGEGRASP_SMALL,
+    VN_EDGEGRASP,
+    NetworkConfig,
+)
+
+CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
+VOXEL_SIZE = 0.0045  # metres; that of the training views
+GRIPPER = "panda"
+
+RECIPES: dict[str, NetworkConfig] = {
+    "edgegrasp": replace(EDGEGRASP, crop_radius=CROP_RADIUS),
+    "edgegrasp-small": replace(EDGEGRASP_SMALL, crop_radius=CROP_RADIUS),
+    "edgegrasp-plus": replace(
+        EDGEGRASP_SMALL, crop_radius=CROP_RADIUS, hand_description_size=HAND_DESCRIPTION_SIZE
+    ),
+    "vn-edgegrasp": replace(VN_EDGEGRASP, crop_radius=CROP_RADIUS),
+}
+
+
+def recipe(name: str) -> CheckpointMetadata:
+    """What a new network of that name says of itself.
+
+    Raises:
+        ValueError: There is no such recipe.
+    """
+    if name not in RECIPES:
+        raise ValueError(f"model: got {name!r}. Use one of: {', '.join(RECIPES)}.")
+    return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, GRIPPER)
