@@ -1,0 +1,50 @@
+import asyncio
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from edgegrasp_client import AsyncGraspClient, GraspClient
+
+
+class FromAsync:
+    """The asynchronous client behind the synchronous one's methods: one suite tests both."""
+
+    def __init__(self, address: str, **arguments: Any) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._client = self._run(self._make(address, arguments))
+
+    async def _make(self, address: str, arguments: dict[str, Any]) -> AsyncGraspClient:
+        return AsyncGraspClient(address, **arguments)
+
+    def _run(self, coroutine: Any) -> Any:
+        return self._loop.run_until_complete(coroutine)
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._client, name)
+        return lambda *args, **kwargs: self._run(method(*args, **kwargs))
+
+    def close(self) -> None:
+        self._run(self._client.close())
+        self._loop.close()
+
+
+KINDS = {"sync": GraspClient, "async": FromAsync}
+
+
+@pytest.fixture(params=["sync", "async"])
+def make_client(request: pytest.FixtureRequest) -> Iterator[Any]:
+    clients = []
+
+    def make(address: str, **arguments: Any) -> Any:
+        clients.append(KINDS[request.param](address, **arguments))
+        return clients[-1]
+
+    yield make
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture(params=["grpc", "rest"])
+def client(request: pytest.FixtureRequest, make_client: Any, dummy_server: Any) -> Any:
+    return make_client(dummy_server.address(request.param))
