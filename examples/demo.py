@@ -3,32 +3,27 @@
 Makes a cluttered scene in simulation, looks at it with a depth camera, starts a server, posts the
 cloud over gRPC and over REST, executes the best grasp in the simulator, and writes a picture and
 the cloud.
-
-usage: python examples/demo.py [seed]
 """
 
-import subprocess
+import argparse
 import sys
-import sysconfig
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, GraspClient, GraspClientError
+from edgegrasp_client.local_server import local_server
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
 
-ROOT = Path(__file__).resolve().parents[1]
-OUTPUT = ROOT / "demo_output"
+OUTPUT = Path(__file__).resolve().parents[1] / "demo_output"
 FEWEST_GRASPS = 10
 LISTED = 12
 TIMEOUT = 120.0  # seconds; a slow machine is no reason to fail
 
 
-def main(seed: int = 0) -> None:
+def main(seed: int, output: Path) -> None:
     """Run the demo; exits with a message if the server does not start or finds too little."""
     scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
     with ClutterSimulation() as simulation:
@@ -50,17 +45,17 @@ def main(seed: int = 0) -> None:
         verdict = "it held" if result.success else "it did not hold"
         print(f"Executed the best one in the simulator: {verdict}.")
 
-    OUTPUT.mkdir(exist_ok=True)
-    write_ply(OUTPUT / "scene.ply", seen.cloud)
+    output.mkdir(parents=True, exist_ok=True)
+    write_ply(output / "scene.ply", seen.cloud)
     drawn = over_grpc.grasps[:LISTED]
     draw_grasps(
-        OUTPUT / "grasps.png",
+        output / "grasps.png",
         seen.cloud,
         drawn,
         camera_position=seen.camera_position,
         title=f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}.",
     )
-    print("Wrote demo_output/grasps.png, the picture, and demo_output/scene.ply, the cloud.")
+    print(f"In {output.name}/: grasps.png, the picture, and scene.ply, the cloud.")
 
 
 def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
@@ -72,30 +67,13 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
         "num_approach_points": 96,
         "top_k": 20,
     }
-    with running_server() as (http_url, grpc_address):
-        print(f"Server: {http_url} and gRPC {grpc_address}\n")
-        with GraspClient(grpc_address, timeout=TIMEOUT) as client:
+    with local_server("--log-level", "warning") as addresses:
+        print(f"Server: {addresses.http_url} and gRPC {addresses.grpc_address}\n")
+        with GraspClient(addresses.grpc_address, timeout=TIMEOUT) as client:
             over_grpc = client.detect(seen.cloud, **options)
-        with GraspClient(http_url, timeout=TIMEOUT) as client:
+        with GraspClient(addresses.http_url, timeout=TIMEOUT) as client:
             over_rest = client.detect(seen.cloud, **options)
     return over_grpc, over_rest
-
-
-@contextmanager
-def running_server() -> Iterator[tuple[str, str]]:
-    """A server on free ports: its HTTP URL and its gRPC address, once it is ready."""
-    program = Path(sysconfig.get_path("scripts")) / "edgegrasp"
-    command = [program, "serve", "--http-port", "0", "--grpc-port", "0", "--log-level", "warning"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout is not None
-            # "EdgeGrasp serves HTTP <url> gRPC <address>", printed when it is ready.
-            words = server.stdout.readline().split()
-            if len(words) != 6:
-                sys.exit("error: the server did not start; it says why above.")
-            yield words[3], words[5]
-        finally:
-            server.terminate()
 
 
 def report(transport: str, detection: Detection) -> None:
@@ -136,7 +114,11 @@ def same(one: Detection, other: Detection) -> bool:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="A scene, its grasps, one executed, a picture.")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=OUTPUT, help="folder to write to")
+    arguments = parser.parse_args()
     try:
-        main(*map(int, sys.argv[1:2]))
+        main(arguments.seed, arguments.output)
     except GraspClientError as error:
         sys.exit(f"error: {error}")

@@ -1,0 +1,91 @@
+"""The examples run as their first lines say."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgegrasp_client.local_server import Addresses, local_server
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Addresses]:
+    with local_server("--backend", "dummy") as addresses:
+        yield addresses
+
+
+@pytest.fixture
+def cloud_file(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(0)
+    path = tmp_path / "cloud.ply"
+    rows = "\n".join(f"{x:.4f} {y:.4f} {z:.4f}" for x, y, z in rng.uniform(0.0, 0.2, (500, 3)))
+    header = "ply\nformat ascii 1.0\nelement vertex 500\n"
+    columns = "property float x\nproperty float y\nproperty float z\nend_header\n"
+    path.write_text(header + columns + rows + "\n")
+    return path
+
+
+def run(*command: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(word) for word in command],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env=os.environ | environment,
+    )
+
+
+def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_path: Path) -> None:
+    done = run(
+        sys.executable, EXAMPLES / "demo.py", "--output", tmp_path, EDGEGRASP_BACKEND="dummy"
+    )
+    assert done.returncode == 0, done.stderr
+    grpc_table, rest_table = re.split(r"\n\d+ grasps over ", done.stdout)[1:]
+    ranked = re.compile(r"^ +(\d+)  (0\.\d+)  ", re.MULTILINE)
+    assert len(ranked.findall(grpc_table)) >= 10
+    assert ranked.findall(grpc_table) == ranked.findall(rest_table)
+    assert "the same grasps" in done.stdout
+    assert re.search(
+        r"Executed the best one in the simulator: it (held|did not hold)\.", rest_table
+    )
+    assert (tmp_path / "grasps.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply\n")
+
+
+def test_demo_says_why_its_server_does_not_start(tmp_path: Path) -> None:
+    done = run(sys.executable, EXAMPLES / "demo.py", "--output", tmp_path, EDGEGRASP_BACKEND="none")
+    assert done.returncode == 1
+    assert "backend: got 'none'" in done.stderr
+
+
+def test_python_example_prints_five_grasps(server: Addresses, cloud_file: Path) -> None:
+    example = EXAMPLES / "01_detect_from_python.py"
+    over_grpc = run(sys.executable, example, cloud_file, server.grpc_address)
+    over_rest = run(sys.executable, example, cloud_file, server.http_url)
+    assert over_grpc.stdout.count("score 0.") == 5, over_grpc.stderr
+    assert over_grpc.stdout.partition("counts")[0] == over_rest.stdout.partition("counts")[0]
+
+
+def test_python_example_names_what_is_wrong(server: Addresses, tmp_path: Path) -> None:
+    empty = tmp_path / "empty.npy"
+    np.save(empty, np.empty((0, 3), np.float32))
+    done = run(sys.executable, EXAMPLES / "01_detect_from_python.py", empty, server.grpc_address)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: cloud: got ")
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+def test_curl_example_prints_five_grasps(server: Addresses, cloud_file: Path) -> None:
+    done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, server.http_url)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["grasps"]) == 5
