@@ -18,7 +18,7 @@ from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.dummy import DummyCatalogue
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.server import Server
+from edgegrasp_service.server import Server, _listen
 from edgegrasp_service.settings import load_settings
 
 SETTINGS = load_settings(http_port=0, grpc_port=0, grace_seconds=5.0)
@@ -131,3 +131,8 @@ def test_bad_settings_end_with_a_sentence() -> None:
     )
     assert done.returncode == 1
     assert done.stderr.startswith("edgegrasp serve: http_port: got 70000.")
+
+
+def test_answers_are_sent_without_delay() -> None:
+    with _listen("127.0.0.1", 0) as listening:
+        assert listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
