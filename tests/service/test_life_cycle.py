@@ -16,7 +16,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_service.core import GraspService
-from edgegrasp_service.dummy import DummyCatalogue
+from edgegrasp_service.dummy import DummyCatalogue, DummyDetector
 from edgegrasp_service.errors import AddressInUse
 from edgegrasp_service.server import Server, _listen
 from edgegrasp_service.settings import load_settings
@@ -73,8 +73,15 @@ async def test_not_ready_until_loaded_and_warm() -> None:
 
 
 async def test_stopping_finishes_what_was_accepted() -> None:
+    class Counting(DummyCatalogue):
+        accepted = 0
+
+        def get(self, name: str = "") -> DummyDetector:
+            Counting.accepted += 1
+            return super().get(name)
+
     ready, stop = asyncio.Event(), asyncio.Event()
-    service = GraspService(lambda: DummyCatalogue(seconds=0.5), SETTINGS.max_points)
+    service = GraspService(lambda: Counting(seconds=0.5), SETTINGS.max_points)
     server = Server(SETTINGS, service)
     serving = asyncio.create_task(server.serve(stop, ready=ready.set))
     await ready.wait()
@@ -87,7 +94,7 @@ async def test_stopping_finishes_what_was_accepted() -> None:
         )
         stub = grasp_pb2_grpc.GraspServiceStub(channel)
         by_grpc = stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes()))
-        while service._worker._work_queue.empty():  # both are in: one runs, one waits
+        while Counting.accepted < 2:
             await asyncio.sleep(0.01)
         stop.set()
         assert (await by_http).status_code == 200
