@@ -20,7 +20,7 @@ rm -rf "$environment"
 # A local version label (+cpu) names one build; CUDA's own packages come with the other build.
 {
     echo "# Exact versions of everything '.[dev]' installs; written by scripts/update_constraints.sh."
-    "$environment/bin/pip" freeze --exclude-editable --exclude edgegrasp |
+    "$environment/bin/pip" freeze --all --exclude-editable --exclude pip --exclude wheel |
         sed -e 's/+cpu$//' |
         grep -v -i -E '^(nvidia-|cuda-|triton==)'
 } >build/constraints.txt
