@@ -8,6 +8,7 @@ and support. The classifier of `edgegrasp-plus` reads it beside the paper's edge
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import Candidates, support_clearance
@@ -19,10 +20,11 @@ Float32 = NDArray[np.float32]
 
 NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach before the grasp
+AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
-CHUNK = 256  # candidates at a time, so that the work stays in cache
+CHUNK = 128  # candidates at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)
@@ -55,26 +57,22 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     boxes = gripper.boxes(gripper.max_opening)
     low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
-    candidate, row, position = [], [], []
-    for start in range(0, len(T_cloud_hand), CHUNK):
-        pose = T_cloud_hand[start : start + CHUNK]
-        inside = np.ones((len(pose), len(cloud.points)), dtype=bool)
-        along = np.empty((3, *inside.shape), dtype=np.float32)
+    points = torch.from_numpy(np.ascontiguousarray(cloud.points.T))  # (3, N)
+    pose = torch.from_numpy(T_cloud_hand)
+    turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
+    shift = -turn @ pose[:, :3, 3:]  # (E, 3, 1)
+    found = [(torch.empty(0, dtype=torch.int64),) * 2 + (torch.empty(0, 3),)]
+    for start in range(0, len(pose), CHUNK):
+        part = slice(start, start + CHUNK)
+        position = torch.baddbmm(shift[part], turn[part], points.expand(len(turn[part]), -1, -1))
+        inside = torch.ones_like(position[:, 0], dtype=torch.bool)  # (chunk, N)
         for axis in range(3):
-            direction, origin = pose[:, :3, axis], pose[:, :3, 3]
-            along[axis] = direction @ cloud.points.T
-            along[axis] -= np.einsum("ed,ed->e", direction, origin)[:, None]
-            inside &= (along[axis] > low[axis]) & (along[axis] < high[axis])
-        e, p = np.nonzero(inside)
-        candidate.append(e + start)
-        row.append(p)
-        position.append(along[:, e, p].T)
-    return HandView(
-        np.concatenate(candidate) if candidate else np.empty(0, np.int64),
-        np.concatenate(row) if row else np.empty(0, np.int64),
-        np.concatenate(position) if position else np.empty((0, 3), np.float32),
-        len(T_cloud_hand),
-    )
+            along = position[:, axis]
+            inside &= (along > float(low[axis])) & (along < float(high[axis]))
+        candidate, row = inside.nonzero(as_tuple=True)
+        found.append((candidate + start, row, position.transpose(1, 2)[candidate, row]))
+    candidates, rows, positions = (torch.cat(parts).numpy() for parts in zip(*found, strict=True))
+    return HandView(candidates, rows, positions, len(T_cloud_hand))
 
 
 class _Region:
@@ -182,8 +180,8 @@ def _between_fingers(
         *(between.mean(np.abs(nx)), between.mean(np.abs(ny)), between.mean(nz)),
         _Region(view, inside & (ny > FACING)).log_count(),
         _Region(view, inside & (ny < -FACING)).log_count(),
-        _Region(view, inside & (y > 0)).mean(ny),
-        _Region(view, inside & (y < 0)).mean(ny),
+        _Region(view, inside & (y > AXIS)).mean(ny),
+        _Region(view, inside & (y < -AXIS)).mean(ny),
     ]
     for first in (y > y_high[view.candidate] - SLAB, y < y_low[view.candidate] + SLAB):
         slab = _Region(view, inside & first)  # what a finger meets first

@@ -1,0 +1,34 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.options import Suppression
+from edgegrasp_model.ranking import ranked, rotation_distance, suppress
+
+
+def test_collision_free_grasps_come_first_then_the_score_decides() -> None:
+    score = np.array([0.9, 0.2, 0.95, 0.5])
+    free = np.array([False, True, False, True])
+    assert ranked(score, free).tolist() == [3, 1, 2, 0]
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_rotation_distance_is_the_angle_or_that_of_the_flipped_hand(seed: int) -> None:
+    one, other = Rotation.random(2, rng=np.random.default_rng(seed))
+    flip = Rotation.from_euler("z", np.pi)
+    expected = min((one.inv() * other).magnitude(), (one.inv() * other * flip).magnitude())
+    found = rotation_distance(other.as_matrix()[None], one.as_matrix())
+    np.testing.assert_allclose(found, [expected], atol=1e-3)
+
+
+def test_near_duplicates_fall_to_the_better_one() -> None:
+    T_cloud_tcp = np.repeat(np.eye(4, dtype=np.float32)[None], 4, axis=0)
+    T_cloud_tcp[1, :3, 3] = 0.005  # near the first
+    T_cloud_tcp[2, 0, 3] = 0.05  # elsewhere
+    T_cloud_tcp[3, :3, :3] = Rotation.from_euler("x", 1.0).as_matrix()  # turned away
+    rule = Suppression(translation=0.01, rotation=0.5)
+    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), rule, 10).tolist() == [1, 2, 3]
+    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), rule, 2).tolist() == [1, 2]
+    none = Suppression(translation=0.0, rotation=0.0)
+    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), none, 10).tolist() == [1, 0, 2, 3]
