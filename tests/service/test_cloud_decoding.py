@@ -2,6 +2,7 @@ import contextlib
 import io
 import struct
 import sys
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -177,6 +178,19 @@ def test_a_decompression_bomb_is_not_unpacked() -> None:
     with pytest.raises(PayloadTooLarge) as caught:
         decode_file("npz", stream.getvalue(), MANY)
     assert "10000000 bytes" in caught.value.value
+
+
+def test_a_bomb_that_lies_about_its_size_is_not_unpacked() -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(50_000_000))
+    lying = stream.getvalue().replace(struct.pack("<I", 50_000_000), struct.pack("<I", 100))
+    tracemalloc.start()
+    with pytest.raises(InvalidRequest, match=r"no whole \.npz file"):
+        decode_file("npz", lying, MANY)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2_000_000
 
 
 @pytest.mark.parametrize(
