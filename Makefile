@@ -26,6 +26,7 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy $(wildcard examples/*.py)
 	$(BIN)/lint-imports
 	mkdir -p build/proto
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build/proto

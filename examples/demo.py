@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_client import Detection, GraspClient, GraspClientError
+from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
@@ -60,9 +60,9 @@ def main(seed: int, output: Path) -> None:
 
 def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
     """Grasps of one cloud over gRPC and over REST, from a server of our own."""
-    options = {
+    options: DetectOptions = {
         "seed": seed,
-        "viewpoint": seen.camera_position,
+        "viewpoint": seen.camera_position.tolist(),
         "support": {"normal": (0.0, 0.0, 1.0), "offset": seen.table_height},
         "num_approach_points": 96,
         "top_k": 20,
