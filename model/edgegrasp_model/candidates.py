@@ -1,6 +1,7 @@
 """Edge grasps: which contact points around an approach point make a candidate, and its pose."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,10 @@ MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
 MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand is drawn back
+LOW = 0.03  # metres over the support plane up to which contacts get a level grasp too
+MIN_LEVEL = 0.3  # horizontal part of a normal from which its heading can be trusted
+MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a level grasp
+MIN_DROP = -0.002  # metres a contact may lie above the approach point of a level grasp
 MIN_APPROACH_UP = -0.1  # the hand does not come from below: cosine of approach and up
 
 
@@ -32,6 +37,14 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.pair)
+
+    @staticmethod
+    def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
+        """All candidates of several sets, in order."""
+        arrays = [
+            np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])
+        ]
+        return Candidates(*arrays)
 
     def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Candidates":
         """The candidates of the given rows, in their order."""
@@ -109,6 +122,54 @@ def edge_grasp_poses(
 def from_above(candidates: Candidates, up: Float32) -> NDArray[np.bool_]:
     """Which candidates do not come from below.  # (E,)."""
     return candidates.approach @ (up / np.linalg.norm(up)) > MIN_APPROACH_UP
+
+
+def level_grasps(
+    cloud: Cloud,
+    approach_index: Int64,
+    contact_index: Int64,
+    support: SupportPlane,
+    gripper: Gripper,
+) -> Candidates:
+    """Candidates straight down onto low contacts, the closing direction level.
+
+    The normals at the sides of a flat object are bent upward by its top, so that a hand which
+    closes along them would cut into the table: here they count by their heading only.
+
+    Args:
+        cloud: The cloud with its normals.
+        approach_index: (M,) rows of the cloud.
+        contact_index: (M,) rows of the cloud.
+        support: The plane that contacts are low over.
+        gripper: Gives the opening and contact_z.
+
+    Returns:
+        The pairs that allow such a grasp.
+    """
+    up = np.asarray(support.normal, dtype=np.float32)
+    normal, contact = cloud.normals[contact_index], cloud.points[contact_index]
+    edge = contact - cloud.points[approach_index]  # (M, 3)
+    level = normal - (normal @ up)[:, None] * up
+    share = np.linalg.norm(level, axis=1)
+    y = level / np.maximum(share, 1e-9)[:, None]
+    along, sideways = np.einsum("md,md->m", edge, y), np.einsum("md,md->m", edge, np.cross(y, -up))
+    pair = np.flatnonzero(
+        (contact @ up - support.offset < LOW)
+        & (share > MIN_LEVEL)
+        & (along > MIN_EDGE)
+        & (along < gripper.max_opening / 2 - EDGE_MARGIN)
+        & (np.abs(sideways) < MAX_SIDEWAYS)
+        & (-edge @ up > MIN_DROP)
+    )
+    y, along = y[pair], along[pair, None]
+    pose = np.zeros((len(pair), 4, 4), dtype=np.float32)
+    pose[:, :3, 0] = np.cross(y, -up)
+    pose[:, :3, 1] = y
+    pose[:, :3, 2] = -up
+    pose[:, :3, 3] = contact[pair] - along * y + gripper.contact_z * up
+    pose[:, 3, 3] = 1.0
+    depth = np.maximum(-edge[pair] @ up, 0.0)
+    return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
 
 
 def drawn_back(candidates: Candidates, support: SupportPlane, gripper: Gripper) -> Candidates:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model import cloud as clouds
 from edgegrasp_model.ball_batch import BallCrop, crop_balls
-from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, from_above
+from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, from_above, level_grasps
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.collision import collides
 from edgegrasp_model.gripper import Gripper
@@ -128,7 +128,11 @@ def _constrained(
     """The edge grasps of some balls that satisfy every constraint but collision."""
     _add(counts, "approach_points", len(approach_index))
     _add(counts, "pairs", len(crop.ball_rows))
-    candidates = edge_grasps(cloud, approach_index[crop.ball_of_point], crop.ball_rows, gripper)
+    pairs = approach_index[crop.ball_of_point], crop.ball_rows
+    candidates = edge_grasps(cloud, *pairs, gripper)
+    if options.support is not None:
+        level = level_grasps(cloud, *pairs, options.support, gripper)
+        candidates = Candidates.concatenate([candidates, level])
     _add(counts, "candidates", len(candidates))
     up = np.asarray(options.up, dtype=np.float32)
     candidates = candidates.take(from_above(candidates, up))

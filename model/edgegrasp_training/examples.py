@@ -48,16 +48,27 @@ def tried_grasps(
     """
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
-    candidates = edge_grasps(cloud, view.approach_index[rows], view.contact_index[rows], gripper)
-    rows = rows[candidates.pair]
-    pose = candidates.T_cloud_hand
-    pose[:, :3, 3] += view.drawn_back[rows, None] * candidates.approach
+    candidates = _candidates(view, cloud, rows, gripper)
+    label = view.success[rows[candidates.pair]].astype(np.float32)
     description = None
     if config.hand_description_size:
         support = SUPPORT if support_known else None
         description = describe_hands(cloud, candidates, gripper, UP, support).astype(np.float16)
-    label = view.success[rows].astype(np.float32)
-    return TriedGrasps(cloud, replace(candidates, T_cloud_hand=pose), description, label)
+    return TriedGrasps(cloud, candidates, description, label)
+
+
+def _candidates(
+    view: LabelledView, cloud: Cloud, rows: NDArray[np.int64], gripper: Gripper
+) -> Candidates:
+    """The tried candidates; `pair` counts in `rows`."""
+    approach_index, contact_index = view.approach_index[rows], view.contact_index[rows]
+    if view.T_world_hand is None:
+        return edge_grasps(cloud, approach_index, contact_index, gripper)
+    pose = view.T_world_hand[rows]
+    edge = view.points[contact_index] - view.points[approach_index]  # (E, 3)
+    depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
+    pair = np.arange(len(rows), dtype=np.int64)
+    return Candidates(pair, approach_index, contact_index, -pose[:, :3, 2], depth, pose)
 
 
 def pack(

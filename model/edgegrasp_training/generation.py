@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates import edge_grasps
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.preparation import Sample, clean_cloud, sample_candidates
@@ -142,15 +141,13 @@ def _label(
     rows = _chosen(sample, options, rng)
     candidates = sample.candidates.take(rows)
     outcomes = [simulation.try_grasp(pose).success for pose in candidates.T_cloud_hand]
-    paper = edge_grasps(cloud, candidates.approach_index, candidates.contact_index, gripper)
-    shift = candidates.T_cloud_hand[:, :3, 3] - paper.T_cloud_hand[:, :3, 3]
     return LabelledView(
         points=cloud.points,
         normals=cloud.normals,
         camera_position=observation.camera_position,
         approach_index=candidates.approach_index,
         contact_index=candidates.contact_index,
-        drawn_back=np.einsum("ed,ed->e", shift, candidates.approach),
+        T_world_hand=candidates.T_cloud_hand,
         success=np.asarray(outcomes, dtype=np.int8),
     )
 
@@ -175,6 +172,6 @@ def _empty(observation: Observation) -> LabelledView:
         observation.camera_position,
         rows,
         rows,
-        nothing[:, 0],
+        None,
         rows.astype(np.int8),
     )

@@ -112,6 +112,8 @@ class Trainer:
             for number, path in enumerate(self.validation_paths):
                 grasps, _ = self._tried(path)
                 balls = grasps.balls()
+                if len(balls) == 0:
+                    continue
                 if balls_per_view is not None and len(balls) > balls_per_view:
                     rng = np.random.default_rng([self.options.seed, number])
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
@@ -166,6 +168,8 @@ class Trainer:
             known, unknown = self._tried(self.train_paths[index])
             grasps = unknown if rng.random() < self.options.unknown_support else known
             balls = grasps.balls()
+            if len(balls) == 0:
+                continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
             batch, label = pack(grasps, np.sort(chosen), self.metadata.network)
             # The conventional network must learn invariance; Vector Neurons have it.

@@ -21,23 +21,24 @@ class LabelledView:
     camera_position: Float32  # (3,)
     approach_index: NDArray[np.int64]  # (E,) rows of `points`
     contact_index: NDArray[np.int64]  # (E,) rows of `points`
-    drawn_back: Float32  # (E,) metres the hand was drawn back from the support plane
+    T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: those of the paper's definition
     success: NDArray[np.int8]  # (E,) 1 held, 0 not, UNTRIED
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
+        arrays = {
+            "points": self.points,
+            "normals": self.normals.astype(np.float16),
+            "camera_position": self.camera_position,
+            "approach_index": self.approach_index.astype(np.uint16),
+            "contact_index": self.contact_index.astype(np.uint16),
+            "success": self.success,
+        }
+        if self.T_world_hand is not None:
+            arrays["T_world_hand"] = self.T_world_hand
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                points=self.points,
-                normals=self.normals.astype(np.float16),
-                camera_position=self.camera_position,
-                approach_index=self.approach_index.astype(np.uint16),
-                contact_index=self.contact_index.astype(np.uint16),
-                drawn_back=self.drawn_back.astype(np.float16),
-                success=self.success,
-            )
+            np.savez_compressed(file, allow_pickle=False, **arrays)
         partial.replace(path)
 
     def tried(self) -> NDArray[np.int64]:
@@ -46,18 +47,16 @@ class LabelledView:
 
 
 def load_view(path: Path) -> LabelledView:
-    """Read a view; files without `drawn_back` hold hands that were never drawn back."""
+    """Read a view."""
     with np.load(path, allow_pickle=False) as arrays:
-        success = arrays["success"]
-        drawn_back = arrays["drawn_back"] if "drawn_back" in arrays else np.zeros(len(success))
         return LabelledView(
             points=arrays["points"].astype(np.float32),
             normals=arrays["normals"].astype(np.float32),
             camera_position=arrays["camera_position"].astype(np.float32),
             approach_index=arrays["approach_index"].astype(np.int64),
             contact_index=arrays["contact_index"].astype(np.int64),
-            drawn_back=drawn_back.astype(np.float32),
-            success=success.astype(np.int8),
+            T_world_hand=arrays.get("T_world_hand"),
+            success=arrays["success"].astype(np.int8),
         )
 
 

@@ -1,0 +1,178 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.errors import InvalidCheckpoint, InvalidRequest, UnknownModel
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+from edgegrasp_model.network import build_network
+from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.results import Detection
+
+TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (8, 8), crop_radius=0.04)
+PLUS = replace(TINY, hand_description_size=HAND_DESCRIPTION_SIZE)
+VN = NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 6, 6), (6, 6), (6, 6), crop_radius=0.04)
+TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
+VIEW = (0.3, 0.0, 0.5)
+
+
+def detector(config: NetworkConfig = PLUS) -> GraspDetector:
+    metadata = CheckpointMetadata("tiny", config, voxel_size=0.0045, gripper="panda")
+    network = build_network(config, torch.Generator().manual_seed(3))
+    return GraspDetector(network, metadata, load_gripper("panda"))
+
+
+def box_on_table(seed: int = 0, count: int = 4000) -> np.ndarray:
+    """The top and two sides of a 40 x 60 x 80 mm box that stands on z = 0."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.5, 0.5, (2, count))
+    size = np.array([0.04, 0.06, 0.08])
+    top = np.stack([u, v, np.full(count, 0.5)], axis=1)
+    front = np.stack([np.full(count, 0.5), u, v], axis=1)
+    side = np.stack([u, np.full(count, 0.5), v], axis=1)
+    points = np.concatenate([top, front, side]) * size + (0, 0, 0.04)
+    return (points + rng.normal(0, 0.0003, points.shape)).astype(np.float32)
+
+
+def ask(**fields: object) -> DetectOptions:
+    return DetectOptions.model_validate({"viewpoint": VIEW, "support": TABLE, **fields})
+
+
+def same(one: Detection, other: Detection) -> bool:
+    return len(one.grasps) == len(other.grasps) and all(
+        a.score == b.score and np.array_equal(a.T_cloud_hand, b.T_cloud_hand)
+        for a, b in zip(one.grasps, other.grasps, strict=True)
+    )
+
+
+@pytest.mark.parametrize("config", [TINY, PLUS, VN], ids=["plain", "plus", "vn"])
+def test_grasps_are_executable_poses_ranked_by_score(config: NetworkConfig) -> None:
+    found = detector(config).detect(box_on_table(), ask())
+    assert len(found.grasps) >= 5
+    scores = [grasp.score for grasp in found.grasps]
+    assert scores == sorted(scores, reverse=True)
+    panda = load_gripper()
+    for grasp in found.grasps:
+        assert 0.0 <= grasp.score <= 1.0
+        turn = grasp.T_cloud_hand[:3, :3]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+        np.testing.assert_allclose(
+            grasp.T_cloud_tcp, grasp.T_cloud_hand @ panda.T_hand_tcp, atol=1e-6
+        )
+        np.testing.assert_array_equal(grasp.approach_direction, turn[:, 2])
+        assert grasp.approach_direction[2] < 0.1  # not from below
+        assert grasp.collision_free
+        assert 0.0 < grasp.width <= np.float32(panda.max_opening)
+        tips = grasp.T_cloud_hand @ [0, 0, panda.tip_z, 1]
+        assert tips[2] > 0.0
+
+
+def test_seed_decides_and_zero_is_a_seed() -> None:
+    tiny, cloud = detector(), box_on_table()
+    assert same(tiny.detect(cloud, ask(seed=0)), tiny.detect(cloud, ask(seed=0)))
+    assert not same(tiny.detect(cloud, ask(seed=0)), tiny.detect(cloud, ask(seed=1)))
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    tiny, cloud = detector(), box_on_table()
+    shuffled = np.random.default_rng(5).permutation(cloud)
+    one, other = tiny.detect(cloud, ask()), tiny.detect(shuffled, ask())
+    assert one.counts == other.counts
+    for a, b in zip(one.grasps, other.grasps, strict=True):
+        np.testing.assert_allclose(a.T_cloud_hand, b.T_cloud_hand, atol=1e-4)
+
+
+def test_counts_never_grow_from_stage_to_stage() -> None:
+    counts = detector().detect(box_on_table(), ask(min_score=0.4, top_k=7)).counts
+    cloud = ["points", "in_workspace", "above_support", "voxels", "kept"]
+    hands = ["pairs", "candidates", "from_above", "clear_of_support", "collision_free"]
+    ranking = ["scored", "above_min_score", "returned"]
+    for stages in (cloud, hands, ranking):
+        numbers = [counts[name] for name in stages]
+        assert numbers == sorted(numbers, reverse=True)
+    assert counts["returned"] <= 7
+
+
+def test_no_grasp_is_an_answer_that_says_why() -> None:
+    nothing = detector().detect(
+        box_on_table(), ask(workspace=Workspace(min=(1, 1, 1), max=(2, 2, 2)))
+    )
+    assert nothing.grasps == []
+    assert nothing.counts["in_workspace"] == 0
+    assert nothing.counts["returned"] == 0
+    assert any("0 points are left" in warning for warning in nothing.warnings)
+
+    high = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.07)
+    blocked = detector().detect(box_on_table(), ask(support=high))
+    assert blocked.grasps == []
+    assert blocked.counts["clear_of_support"] == 0
+    assert any("see counts" in warning for warning in blocked.warnings)
+
+    assert detector().detect(box_on_table(), ask(min_score=1.0)).grasps == []
+
+
+def test_collision_modes_leave_out_rank_last_or_ignore() -> None:
+    tiny, cloud = detector(), box_on_table()
+    avoid = tiny.detect(cloud, ask(collision="avoid", suppression=None, top_k=2000))
+    penalise = tiny.detect(cloud, ask(collision="penalise", suppression=None, top_k=2000))
+    ignore = tiny.detect(cloud, ask(collision="ignore", suppression=None, top_k=2000))
+    assert all(grasp.collision_free for grasp in avoid.grasps)
+    free = [grasp.collision_free for grasp in penalise.grasps]
+    assert free == sorted(free, reverse=True)
+    assert not all(free)
+    assert sum(free) == len(avoid.grasps)
+    scores = [grasp.score for grasp in ignore.grasps]
+    assert scores == sorted(scores, reverse=True) or not all(
+        grasp.collision_free for grasp in ignore.grasps
+    )
+    assert not all(grasp.collision_free for grasp in ignore.grasps)
+
+
+def test_an_unknown_viewpoint_and_table_still_give_grasps_and_a_warning() -> None:
+    found = detector().detect(box_on_table(), DetectOptions())
+    assert found.grasps
+    assert any("viewpoint" in warning for warning in found.warnings)
+
+
+def test_candidates_are_bounded_by_the_request() -> None:
+    found = detector().detect(box_on_table(), ask(num_candidates=10, collision="penalise"))
+    assert found.counts["scored"] == 10
+
+
+def test_a_bad_cloud_is_refused() -> None:
+    with pytest.raises(InvalidRequest, match="NaN"):
+        detector().detect(np.full((100, 3), np.nan, np.float32), ask())
+
+
+def write_weights(folder: Path, name: str) -> None:
+    tiny = detector()
+    save_checkpoint(folder / f"{name}.safetensors", tiny.network, replace(tiny.metadata, name=name))
+
+
+def test_a_catalogue_finds_weights_by_their_file_name(tmp_path: Path) -> None:
+    write_weights(tmp_path, "mine")
+    catalogue = ModelCatalogue.load([tmp_path], default="mine")
+    assert "mine" in catalogue.names()
+    assert catalogue.get("").metadata.name == "mine"
+    assert catalogue.get("mine") is catalogue.get()
+    facts = next(facts for facts in catalogue.describe() if facts["name"] == "mine")
+    assert facts["default"] is True
+    assert len(facts["digest"]) == 64
+    catalogue.warm_up()
+    with pytest.raises(UnknownModel, match=r"got 'nobody'.*mine"):
+        catalogue.get("nobody")
+
+
+def test_a_catalogue_needs_weights_and_a_default_that_exists(tmp_path: Path) -> None:
+    write_weights(tmp_path, "mine")
+    with pytest.raises(UnknownModel):
+        ModelCatalogue.load([tmp_path], default="other")
+    with pytest.raises(InvalidCheckpoint):
+        ModelCatalogue({})
