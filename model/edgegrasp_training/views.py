@@ -3,6 +3,7 @@
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ class LabelledView:
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
-        arrays = {
+        arrays: dict[str, NDArray[Any]] = {
             "points": self.points,
             "normals": self.normals.astype(np.float16),
             "camera_position": self.camera_position,
