@@ -66,6 +66,7 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
         "support": {"normal": (0.0, 0.0, 1.0), "offset": seen.table_height},
         "num_approach_points": 96,
         "top_k": 20,
+        "suppression": {"translation": 0.02, "rotation": 3.2},  # one grasp every 2 cm
     }
     with local_server("--log-level", "warning") as addresses:
         print(f"Server: {addresses.http_url} and gRPC {addresses.grpc_address}\n")

@@ -70,7 +70,7 @@ def draw_grasps(
     forks = [fork(grasp.T_cloud_hand, grasp.width) for grasp in grasps]
     scores = np.array([grasp.score for grasp in grasps] or [0.0])
     colours = ScalarMappable(
-        Normalize(scores.min(), max(scores.max(), scores.min() + 0.01)), colormaps["plasma"]
+        Normalize(min(scores.min(), scores.max() - 0.01), scores.max()), colormaps["plasma"]
     )
     low = np.min([points.min(0), *(f.min((0, 1)) for f in forks)], axis=0) - MARGIN
     high = np.max([points.max(0), *(f.max((0, 1)) for f in forks)], axis=0) + MARGIN
