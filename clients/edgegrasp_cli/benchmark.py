@@ -36,7 +36,7 @@ def benchmark(
     Each round sets up 5 objects and looks once before every grasp; it ends when the table is
     empty or after two failures in a row. GSR: successes / attempts. DR: objects removed / present.
     """
-    from edgegrasp_cli.planners import ServerPlannerFactory
+    from edgegrasp_cli.planners import REQUEST_SECONDS, ServerPlanner, ServerPlannerFactory
     from edgegrasp_client import GraspClient, GraspClientError
     from edgegrasp_client.local_server import Addresses, local_server
     from edgegrasp_sim.benchmark import BenchmarkConfig
@@ -51,20 +51,23 @@ def benchmark(
     flags = [text for path in weights or [] for text in ("--weights", str(path))]
     try:
         config = BenchmarkConfig(SceneKind(scene), rounds, seed, objects, split)
+        config.object_set()  # a wrong folder shall fail before a server is started
         own = nullcontext(Addresses("", server)) if server else local_server(*flags)
-        with own as addresses:
-            with GraspClient(addresses.grpc_address) as client:
-                client.wait_until_ready()
-                used = next(
-                    m for m in client.models() if m.name == model or (m.default and not model)
-                )
-            factory = ServerPlannerFactory(addresses.grpc_address, options)
-            report = _with_progress(config, factory, workers)
+        with (
+            own as addresses,
+            GraspClient(addresses.grpc_address, timeout=REQUEST_SECONDS) as client,
+        ):
+            used = next(m for m in client.models() if m.name == model or (m.default and not model))
+            if workers == 1:
+                planner = ServerPlanner(client, options)
+                report = _with_progress(config, lambda: planner, workers)
+            else:
+                factory = ServerPlannerFactory(addresses.grpc_address, options)
+                report = _with_progress(config, factory, workers)
     except (GraspClientError, ValueError, FileNotFoundError) as error:
         sys.exit(f"edgegrasp benchmark: {error}")
-    planner = options | {"model": used.name, "digest": used.digest}
     if output is not None:
-        report.write_json(output, planner)
+        report.write_json(output, options | {"model": used.name, "digest": used.digest})
     _print_summary(report.summary(), used.name)
 
 

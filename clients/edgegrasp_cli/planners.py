@@ -7,6 +7,8 @@ from edgegrasp_client import GraspClient
 from edgegrasp_sim.simulation import Observation
 from edgegrasp_sim.trials import PlannedGrasp
 
+REQUEST_SECONDS = 120.0
+
 
 @dataclass(frozen=True)
 class ServerPlanner:
@@ -42,8 +44,7 @@ class ServerPlannerFactory:
 
     address: str
     options: dict[str, Any]
-    timeout: float = 120.0  # seconds for one request
 
     def __call__(self) -> ServerPlanner:
         """A planner connected to the server."""
-        return ServerPlanner(GraspClient(self.address, timeout=self.timeout), self.options)
+        return ServerPlanner(GraspClient(self.address, timeout=REQUEST_SECONDS), self.options)

@@ -1,0 +1,109 @@
+"""The commands that need the simulator or the trainer, end to end and small."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from edgegrasp_cli.main import app
+from edgegrasp_model.checkpoint import load_checkpoint
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def refused(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 1
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    output = run(
+        "generate-data",
+        folder,
+        "--scenes",
+        4,
+        "--views-per-scene",
+        1,
+        "--grasps-per-view",
+        10,
+        "--seed",
+        3,
+    )
+    assert "4 scenes made, 0 kept" in output
+    return folder
+
+
+def test_generate_train_serve_and_benchmark_one_after_the_other(data: Path, tmp_path: Path) -> None:
+    assert "0 scenes made, 4 kept" in run(
+        "generate-data", data, "--scenes", 4, "--views-per-scene", 1, "--seed", 3
+    )
+    training = (
+        "train",
+        data,
+        "--run",
+        tmp_path,
+        "--steps",
+        4,
+        "--views-per-step",
+        2,
+        "--validation-share",
+        0.3,
+    )
+    assert "paused at step 2" in run(*training, "--until", 2)
+    assert "AUROC" in run(*training)
+    weights = tmp_path / "edgegrasp-plus.safetensors"
+    assert load_checkpoint(weights)[1].training["steps"] == 4
+    assert (tmp_path / "edgegrasp-plus.md").is_file()
+
+    result = tmp_path / "result.json"
+    output = run(
+        "benchmark",
+        "--scene",
+        "packed",
+        "--rounds",
+        1,
+        "--weights",
+        weights,
+        "--model",
+        "edgegrasp-plus",
+        "--output",
+        result,
+    )
+    assert "GSR" in output
+    report = json.loads(result.read_text())
+    assert report["manifest"]["planner"]["digest"] == load_checkpoint(weights)[1].digest
+    assert len(report["rounds"]) == 1
+    attempts = sum(len(one["attempts"]) for one in report["rounds"])
+    assert report["summary"]["attempts"] == attempts
+
+
+def test_benchmark_over_an_address_uses_that_server(dummy_server) -> None:
+    for address in (dummy_server.http_url, dummy_server.grpc_address):
+        assert "dummy: GSR" in run(
+            "benchmark", "--scene", "packed", "--rounds", 1, "--server", address
+        )
+
+
+def test_the_authors_checkpoint_becomes_one_file(shared_dir: Path, tmp_path: Path) -> None:
+    weights = tmp_path / "vn-edgegrasp.safetensors"
+    run("import-checkpoint", shared_dir / "reference" / "vn_edge_grasp", weights)
+    _, metadata = load_checkpoint(weights)
+    assert metadata.name == metadata.network.architecture == "vn-edgegrasp"
+
+
+def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None:
+    assert "no .npz views" in refused("train", tmp_path)
+    assert "edgegrasp-plus" in refused("train", data, "--model", "huge")
+    assert "local_emd_model" in refused("import-checkpoint", tmp_path)
+    assert "shelf" in refused("benchmark", "--scene", "shelf")
+    assert "urdf" in refused("benchmark", "--scene", "pile", "--objects", tmp_path)
+    assert "rounds is 0" in refused("benchmark", "--rounds", 0)
+    assert "could not be reached" in refused("benchmark", "--server", "127.0.0.1:1")

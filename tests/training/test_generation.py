@@ -1,0 +1,49 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+from edgegrasp_training.views import find_views, load_view
+
+SMALL = GenerationOptions(scenes=2, views_per_scene=1, grasps_per_view=12, seed=5)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    results = list(generate(folder, None, SMALL))
+    assert sorted(index for index, _, _ in results) == [0, 1]
+    assert sum(tried for _, tried, _ in results) > 0
+    return folder
+
+
+def test_views_hold_tried_grasps_of_both_kinds_of_scene(data: Path) -> None:
+    paths = find_views([data])
+    assert [path.name.split("_")[0] for path in paths] == ["packed", "pile"]
+    held = []
+    for path in paths:
+        view = load_view(path)
+        assert 0 < len(view.tried()) <= 12
+        assert view.T_world_hand is not None
+        assert (view.T_world_hand[:, 2, 3] > 0.05).all()
+        held += view.success.tolist()
+    assert 0 < np.mean(held) < 1
+
+
+def test_nothing_is_made_twice_and_a_lost_view_is_made_again_the_same(data: Path) -> None:
+    assert missing_scenes(data, SMALL) == []
+    lost = find_views([data])[0]
+    before = lost.read_bytes()
+    lost.unlink()
+    assert missing_scenes(data, SMALL) == [0]
+    assert [index for index, _, _ in generate(data, None, SMALL)] == [0]
+    assert lost.read_bytes() == before
+
+
+def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
+    list(generate(tmp_path, None, SMALL, workers=2))
+    for path in find_views([data]):
+        again = load_view(tmp_path / path.name)
+        np.testing.assert_array_equal(again.success, load_view(path).success)
+        np.testing.assert_array_equal(again.points, load_view(path).points)
