@@ -106,4 +106,4 @@ def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None
     assert "shelf" in refused("benchmark", "--scene", "shelf")
     assert "urdf" in refused("benchmark", "--scene", "pile", "--objects", tmp_path)
     assert "rounds is 0" in refused("benchmark", "--rounds", 0)
-    assert "could not be reached" in refused("benchmark", "--server", "127.0.0.1:1")
+    assert "UNAVAILABLE" in refused("benchmark", "--server", "127.0.0.1:1")
