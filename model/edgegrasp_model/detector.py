@@ -182,6 +182,7 @@ class GraspDetector:
                 contact_point=cloud.points[candidates.contact_index[row]],
                 approach_direction=T_cloud_hand[row, :3, 2],
                 collision_free=bool(sample.collision_free[row]),
+                clearance=0.0,
             )
             for row in order
         ]

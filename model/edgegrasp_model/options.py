@@ -1,30 +1,48 @@
 """What a caller may ask of one detection; the same names on every transport."""
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, Self
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
+from edgegrasp_model.directions import ApproachDirection, Cone
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.option_types import Direction, Strict, Vector, ordered
+from edgegrasp_model.regions import Box, OrientedBox, Region
+from edgegrasp_model.support import RansacPlane, SupportPlane
 
-Vector = Annotated[
-    tuple[
-        Annotated[float, Field(allow_inf_nan=False)],
-        Annotated[float, Field(allow_inf_nan=False)],
-        Annotated[float, Field(allow_inf_nan=False)],
-    ],
-    Field(description="x, y, z in the cloud's frame"),
+__all__ = [
+    "ApproachDirection",
+    "Box",
+    "Collision",
+    "Cone",
+    "DetectOptions",
+    "GripperGeometry",
+    "OrientedBox",
+    "RansacPlane",
+    "Region",
+    "SupportPlane",
+    "Suppression",
+    "Workspace",
+    "parse_options",
 ]
 
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
+MAX_VIEWS = 64
+
+CollisionMode = Literal["avoid", "penalise", "ignore"]
+Length = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Workspace(_Strict):
+class Workspace(Strict):
     """An axis-aligned box in the cloud's frame; points outside are dropped first."""
 
     min: Vector = Field(description="lower corner, metres")
@@ -32,25 +50,11 @@ class Workspace(_Strict):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        if not all(low < high for low, high in zip(self.min, self.max, strict=True)):
-            raise ValueError("every coordinate of min must be below that of max")
+        ordered(self.min, self.max)
         return self
 
 
-class SupportPlane(_Strict):
-    """The plane objects rest on: the points x with normal . x = offset; the normal points up."""
-
-    normal: Vector = Field(description="unit normal, away from the table")
-    offset: float = Field(allow_inf_nan=False, description="normal . x of its points, metres")
-
-    @model_validator(mode="after")
-    def _unit(self) -> Self:
-        if abs(float(np.linalg.norm(self.normal)) - 1.0) > 1e-3:
-            raise ValueError("normal must have length 1")
-        return self
-
-
-class Suppression(_Strict):
+class Suppression(Strict):
     """Drop a grasp near a better one: nearer than both distances."""
 
     translation: float = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
@@ -62,10 +66,115 @@ class Suppression(_Strict):
     )
 
 
-class DetectOptions(_Strict):
+class Collision(Strict):
+    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
+
+    mode: CollisionMode = Field(
+        default="avoid",
+        description="grasps whose hand collides: left out, ranked last, or not looked for",
+    )
+    margin: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=0.1,
+        description="metres kept free around the hand: its boxes are grown by this on every side",
+    )
+    opening: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
+        default=None,
+        description="metres between the fingers on the way in; null: the gripper's maximum",
+    )
+    approach_length: float = Field(
+        default=0.05, ge=0.0, le=1.0, description="metres of straight way in along the approach"
+    )
+    retreat_length: float = Field(
+        default=0.0, ge=0.0, le=1.0, description="metres of straight way out"
+    )
+    retreat_direction: Literal["back", "up"] = Field(
+        default="back", description="way out: back along the approach, or along up"
+    )
+    obstacles: tuple[Annotated[Box | OrientedBox, Field(discriminator="kind")], ...] = Field(
+        default=(), max_length=64, description="solid boxes beside the cloud"
+    )
+
+
+Corner = Annotated[
+    tuple[
+        Annotated[float, Field(ge=-1.0, le=1.0)],
+        Annotated[float, Field(ge=-1.0, le=1.0)],
+        Annotated[float, Field(ge=-1.0, le=1.0)],
+    ],
+    Field(description="x, y, z in the hand frame, metres"),
+]
+
+
+class HandPart(Strict):
+    """Boxes of the hand or of one finger, hand frame."""
+
+    boxes: tuple[tuple[Corner, Corner], ...] = Field(
+        min_length=1, max_length=16, description="[min corner, max corner] each"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for low, high in self.boxes:
+            ordered(low, high)
+        return self
+
+
+class GripperGeometry(Strict):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    name: str = Field(default="custom", max_length=100, description="shown in results")
+    max_opening: Length = Field(description="metres between the open fingers' inner faces")
+    tip_z: Length = Field(description="fingertips, metres along z")
+    contact_z: Length = Field(description="where contacts are put, metres along z")
+    tcp_z: float = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
+    hand: HandPart = Field(description="the hand without its fingers")
+    finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
+
+
+def _mode_as_object(value: object) -> object:
+    return {"mode": value} if isinstance(value, str) else value
+
+
+def _one_of_one(value: object) -> object:
+    """A list of one vector is that vector, so that both are the same request."""
+    if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], (list, tuple)):
+        return value[0]
+    return value
+
+
+def _viewpoints(value: object) -> str:
+    several = isinstance(value, (list, tuple)) and value and isinstance(value[0], (list, tuple))
+    return "several" if several else "one"
+
+
+def _support_kind(value: object) -> str | None:
+    """`plane` where no kind is named."""
+    if isinstance(value, Mapping):
+        kind = value.get("kind", "plane")
+        return kind if isinstance(kind, str) else None
+    return getattr(value, "kind", None)
+
+
+def _gripper_form(value: object) -> str:
+    return "name" if isinstance(value, str) else "inline"
+
+
+class DetectOptions(Strict):
     """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
     model: str = Field(default="", description="weights to use; empty: the server's default")
+    gripper: (
+        Annotated[
+            Annotated[str, Tag("name")] | Annotated[GripperGeometry, Tag("inline")],
+            Discriminator(_gripper_form),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="name of a gripper, or a gripper; null: the one the weights were trained for",
+    )
     num_approach_points: int = Field(
         default=32, ge=1, le=MAX_APPROACH_POINTS, description="approach points sampled"
     )
@@ -75,30 +184,61 @@ class DetectOptions(_Strict):
     sampling: Literal["farthest", "uniform"] = Field(
         default="farthest", description="how approach points are sampled"
     )
-    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of the sampling")
-    viewpoint: Vector | None = Field(
-        default=None, description="camera position, metres; orients the normals"
+    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
+    viewpoint: (
+        Annotated[
+            Annotated[Vector, Tag("one")]
+            | Annotated[
+                tuple[Vector, ...], Field(min_length=2, max_length=MAX_VIEWS), Tag("several")
+            ],
+            Discriminator(_viewpoints),
+            BeforeValidator(_one_of_one),
+        ]
+        | None
+    ) = Field(
+        default=None,
+        description="camera position, metres; orients the normals. Several positions: "
+        "`view_ids` beside the cloud says which one saw each point",
     )
-    up: Vector = Field(default=(0.0, 0.0, 1.0), description="direction away from gravity")
-    support: SupportPlane | None = Field(
+    up: Direction = Field(
+        default=(0.0, 0.0, 1.0), description="direction away from gravity; any length but zero"
+    )
+    support: (
+        Annotated[
+            Annotated[SupportPlane, Tag("plane")] | Annotated[RansacPlane, Tag("ransac")],
+            Discriminator(_support_kind),
+        ]
+        | None
+    ) = Field(
         default=None, description="plane the objects rest on; no part of the hand goes below it"
     )
     workspace: Workspace | None = Field(default=None, description="points outside are dropped")
-    collision: Literal["avoid", "penalise", "ignore"] = Field(
-        default="avoid",
-        description="grasps whose hand meets the cloud: left out, ranked last, or not looked for",
+    approach_region: Region | None = Field(
+        default=None, description="where approach points may lie; null: everywhere"
     )
+    contact_region: Region | None = Field(
+        default=None, description="where contact points may lie; null: everywhere"
+    )
+    approach_direction: ApproachDirection | None = Field(
+        default=None, description="ways the hand may move; null: not from below"
+    )
+    collision: Annotated[
+        Collision,
+        BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
+    ] = Field(default=Collision(), description="what the hand must not meet; a bare mode will do")
     min_score: float = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
     top_k: int = Field(default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most")
     suppression: Suppression | None = Field(
         default=Suppression(), description="non-maximum suppression; null: none"
     )
-
-    @model_validator(mode="after")
-    def _up_is_a_direction(self) -> Self:
-        if float(np.linalg.norm(self.up)) < 1e-6:
-            raise ValueError("up must not be the zero vector")
-        return self
+    order: Literal["score", "highest", "clearance"] = Field(
+        default="score",
+        description="what comes first: the score; the highest TCP along up among scores of 0.9 "
+        "and more, then the others by score; or the clearance",
+    )
+    debug: bool = Field(
+        default=False, description="whether to return the processed cloud and every candidate"
+    )
 
 
 def parse_options(fields: object) -> DetectOptions:
@@ -110,16 +250,46 @@ def parse_options(fields: object) -> DetectOptions:
     try:
         return DetectOptions.model_validate(fields)
     except ValidationError as error:
-        raise invalid_options(error) from None
+        raise invalid_options(error, fields) from None
 
 
-def invalid_options(error: ValidationError, prefix: str = "options") -> InvalidRequest:
+def invalid_options(
+    error: ValidationError, fields: object, prefix: str = "options"
+) -> InvalidRequest:
     """Say the first thing wrong in a validation error as field, value and fix."""
     first = error.errors(include_url=False)[0]
-    field = ".".join([prefix, *(str(part) for part in first["loc"])])
+    named = first["type"] in ("missing", "extra_forbidden")
+    field = ".".join([prefix, *_path(first["loc"], fields, named)])
     if first["type"] == "extra_forbidden":
-        known = ", ".join(DetectOptions.model_fields)
-        return InvalidRequest(field, "an unknown field", f"Remove it; the options are: {known}.")
-    value = repr(first["input"])
+        known = "" if "." in field.removeprefix(prefix + ".") else _known_options()
+        return InvalidRequest(field, "an unknown field", f"Remove it{known}.")
+    value = "nothing" if first["type"] == "missing" else repr(first["input"])
     value = value if len(value) <= 80 else value[:77] + "..."
-    return InvalidRequest(field, value, f"{first['msg']}.")
+    fix = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "union_tag_invalid":
+        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
+    if first["type"] == "union_tag_not_found":
+        fix = "Send an object that names its kind"
+    return InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
+
+
+def _known_options() -> str:
+    return f"; the options are: {', '.join(DetectOptions.model_fields)}"
+
+
+def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
+    """A location in the request, without the names that pydantic gives to members of unions.
+
+    Where `named`, the last part is a field that the request lacks or should not have.
+    """
+    path: list[str] = []
+    here: Any = fields
+    for place, part in enumerate(location):
+        if isinstance(part, int):
+            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
+        elif isinstance(here, Mapping) and part in here:
+            here = here[part]
+        elif not (named and place == len(location) - 1):
+            continue
+        path.append(str(part))
+    return path

@@ -110,7 +110,7 @@ def sample_candidates(
         view = hand_views(cloud, candidates.T_cloud_hand, gripper)
         free = ~collides(view, gripper)
         _add(counts, "collision_free", int(free.sum()))
-        if free.any() or options.collision == "ignore":
+        if free.any() or options.collision.mode == "ignore":
             break
     rows = _preferred(free, options, rng_candidates)
     counts["scored"] = len(rows)
@@ -147,11 +147,11 @@ def _preferred(
     free: NDArray[np.bool_], options: DetectOptions, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Ascending rows of at most num_candidates candidates, those free of collision first."""
-    if options.collision == "ignore":
+    if options.collision.mode == "ignore":
         return _subset(len(free), options.num_candidates, rng)
     clear, hit = np.flatnonzero(free), np.flatnonzero(~free)
     rows = clear[_subset(len(clear), options.num_candidates, rng)]
-    if options.collision == "penalise":
+    if options.collision.mode == "penalise":
         rest = _subset(len(hit), options.num_candidates - len(rows), rng)
         rows = np.sort(np.concatenate([rows, hit[rest]]))
     return rows

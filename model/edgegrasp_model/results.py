@@ -1,11 +1,38 @@
-"""What one detection returns."""
+"""What one request returns."""
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+
+class Outcome(StrEnum):
+    """What became of a candidate."""
+
+    RETURNED = "returned"
+    DIRECTION = "direction"  # the hand would move in a way that is not allowed
+    SUPPORT = "support"  # it would go below the support plane
+    NOT_CHECKED = "not-checked"  # left out at random before the collision check
+    COLLISION = "collision"  # the hand would meet the cloud, the support or an obstacle
+    NOT_SCORED = "not-scored"  # left out at random, beyond num_candidates
+    LOW_SCORE = "low-score"  # below min_score
+    SUPPRESSED = "suppressed"  # near a better one
+    BEYOND_TOP_K = "beyond-top-k"
+
+
+class NoGrasp(StrEnum):
+    """Why an edge or a hand pose that a caller gave defines no edge grasp."""
+
+    NO_POINT = "no-point"  # a point of it was removed: workspace, support plane or outlier
+    TOO_SHORT = "too-short"  # approach and contact point fall together
+    TOO_LONG = "too-long"  # the contact lies beyond half the opening
+    NO_DIRECTION = "no-direction"  # the edge runs along the normal
+    TOO_DEEP = "too-deep"  # the contact lies deeper than the fingers are long
+    NOTHING_BETWEEN = "nothing-between"  # the hand pose has no point between its fingers
 
 
 @dataclass(frozen=True)
@@ -19,7 +46,22 @@ class Grasp:
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
-    collision_free: bool  # whether the open hand at the grasp meets no point of the cloud
+    collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
+    clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
+
+
+@dataclass(frozen=True)
+class DebugInfo:
+    """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
+
+    points: Float32  # (V, 3) metres, cloud frame
+    normals: Float32  # (V, 3) unit
+    approach_index: Int64  # (E,) p_a, rows of `points`
+    contact_index: Int64  # (E,) p_c, rows of `points`
+    T_cloud_hand: Float32  # (E, 4, 4)
+    score: Float32  # (E,) NaN where it was not scored
+    outcome: list[Outcome]  # E of them
+    support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
 
 
 @dataclass(frozen=True)
@@ -30,4 +72,24 @@ class Detection:
     counts: dict[str, int]  # points, candidates and grasps that passed each stage, in order
     seconds: dict[str, float]  # spent in each stage, and their `total`
     model: str  # name of the weights used
+    warnings: list[str] = field(default_factory=list)
+    debug: DebugInfo | None = None  # where it was asked for
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What the network says of one edge or hand pose that a caller gave."""
+
+    grasp: Grasp | None  # None where it defines none
+    reason: NoGrasp | None  # why it defines none
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """Evaluations in the order in which the caller gave edges or hand poses."""
+
+    evaluations: list[Evaluation]
+    counts: dict[str, int]
+    seconds: dict[str, float]
+    model: str
     warnings: list[str] = field(default_factory=list)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.preparation import Sample, clean_cloud, sample_candidates
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
@@ -121,7 +121,7 @@ def _request(observation: Observation, seed: int) -> DetectOptions:
         viewpoint=tuple(observation.camera_position.tolist()),
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=observation.table_height),
         workspace=Workspace(min=tuple(low), max=tuple(high)),
-        collision="penalise",
+        collision=Collision(mode="penalise"),
     )
 
 

@@ -1,0 +1,42 @@
+"""Directions in which the hand may move toward the object."""
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from edgegrasp_model.option_types import Direction, Strict
+
+TOP_DOWN_ANGLE = math.radians(30)  # between the hand's way and straight down
+SIDE_ANGLE = math.radians(30)  # between the hand's way and the horizontal
+
+
+class Cone(Strict):
+    """Directions within an angle of one."""
+
+    direction: Direction = Field(
+        description="the way the hand moves toward the object, +z of the hand; any length but zero"
+    )
+    max_angle: Annotated[float, Field(ge=0.0, le=math.pi)] = Field(
+        description="radians between it and the hand's way"
+    )
+
+
+class ApproachDirection(Strict):
+    """Directions in which the hand may move: those in any cone or in the preset.
+
+    `top-down` is within 30 degrees of straight down, `side` within 30 degrees of the horizontal,
+    both by `up`. Where no approach direction is asked for, every hand is allowed that does not
+    come from more than 6 degrees below the horizontal.
+    """
+
+    cones: tuple[Cone, ...] = Field(default=(), max_length=64, description="any of these")
+    preset: Literal["top-down", "side"] | None = Field(
+        default=None, description="or this, relative to up"
+    )
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if not self.cones and self.preset is None:
+            raise ValueError("give at least one cone or a preset, or leave approach_direction out")
+        return self
