@@ -64,13 +64,13 @@ def edge_grasps(
     """The candidates among pairs of approach and contact points.
 
     r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
-    III-A). The contact ends up at the gripper's contact_z, the approach point on its axis.
+    III-A). The contact ends up at the gripper's contact_z, the approach point on the hand's axis.
 
     Args:
         cloud: The cloud with its normals.
         approach_index: (M,) rows of the cloud.
         contact_index: (M,) rows of the cloud.
-        gripper: Gives the opening and contact_z.
+        gripper: Gives the opening, the fingers' depth and where the contact lies in the hand.
 
     Returns:
         The pairs that define an edge grasp which fits the gripper.
@@ -78,13 +78,18 @@ def edge_grasps(
     normal = cloud.normals[contact_index]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
-    ahead = edge - np.einsum("md,md->m", edge, normal)[:, None] * normal  # (M, 3) r_perp
+    along = np.einsum("md,md->m", edge, normal)
+    ahead = edge - along[:, None] * normal  # (M, 3) r_perp
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
     pair = np.flatnonzero(
-        (length > MIN_EDGE) & (length < gripper.max_opening / 2 - EDGE_MARGIN) & (depth > MIN_DEPTH)
+        (length > MIN_EDGE)
+        & (length < gripper.max_opening / 2 - EDGE_MARGIN)
+        & (depth > MIN_DEPTH)
+        & (depth < gripper.finger_depth)
     )
+    contact_z = gripper.contact_z_at(2 * np.abs(along[pair]))
     pose = edge_grasp_poses(
-        cloud.points[approach_index[pair]], ahead[pair], normal[pair], depth[pair], gripper
+        cloud.points[approach_index[pair]], ahead[pair], normal[pair], depth[pair], contact_z
     )
     return Candidates(
         pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth[pair], pose
@@ -92,7 +97,7 @@ def edge_grasps(
 
 
 def edge_grasp_poses(
-    approach_point: Float32, ahead: Float32, normal: Float32, depth: Float32, gripper: Gripper
+    approach_point: Float32, ahead: Float32, normal: Float32, depth: Float32, contact_z: Float32
 ) -> Float32:
     """Hand poses of edge grasps.
 
@@ -101,7 +106,7 @@ def edge_grasp_poses(
         ahead: (E, 3) r_perp, the part of p_c - p_a orthogonal to n_c.
         normal: (E, 3) unit n_c.
         depth: (E,) |r_perp|.
-        gripper: Gives contact_z.
+        contact_z: (E,) where the contact lies along the hand's z.
 
     Returns:
         (E, 4, 4) T_cloud_hand: z = r_perp / d, y = n_c, x = y x z; the contact point lies at
@@ -114,7 +119,7 @@ def edge_grasp_poses(
     pose[:, :3, 0] = np.cross(y, z)
     pose[:, :3, 1] = y
     pose[:, :3, 2] = z
-    pose[:, :3, 3] = approach_point + (depth - gripper.contact_z)[:, None] * z
+    pose[:, :3, 3] = approach_point + (depth - contact_z)[:, None] * z
     pose[:, 3, 3] = 1.0
     return pose
 
@@ -166,7 +171,8 @@ def level_grasps(
     pose[:, :3, 0] = np.cross(y, -up)
     pose[:, :3, 1] = y
     pose[:, :3, 2] = -up
-    pose[:, :3, 3] = contact[pair] - along * y + gripper.contact_z * up
+    contact_z = gripper.contact_z_at(2 * along)
+    pose[:, :3, 3] = contact[pair] - along * y + contact_z * up
     pose[:, 3, 3] = 1.0
     depth = np.maximum(-edge[pair] @ up, 0.0)
     return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
@@ -194,6 +200,8 @@ def drawn_back(candidates: Candidates, support: SupportPlane, gripper: Gripper) 
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
     """Height of the lowest corner of each hand, fingers open, over the support plane.
 
+    Fingers that swing count as far ahead as they come when they close.
+
     Args:
         T_cloud_hand: (E, 4, 4).
         support: The plane.
@@ -202,7 +210,8 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
     Returns:
         (E,) metres; negative below the plane.
     """
-    low, high = np.moveaxis(gripper.boxes(gripper.max_opening), 1, 0)  # (B, 3) each
+    boxes = gripper.boxes(gripper.max_opening, gripper.foremost_z - gripper.tip_z)
+    low, high = np.moveaxis(boxes, 1, 0)  # (B, 3) each
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
     corners = np.where(picks[None] == 0, low[:, None], high[:, None]).reshape(-1, 3)  # (8B, 3)
     normal = np.asarray(support.normal)

@@ -34,10 +34,11 @@ def widths_needed(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
     Returns:
         (E,) metres, at most the gripper's maximum.
     """
-    half = float(np.asarray(gripper.finger_boxes)[:, 1, 0].max())
+    half = gripper.pad_half_width
     x, y, z = view.position.T
     inner = gripper.max_opening / 2
-    between = (np.abs(x) < half) & (np.abs(y) < inner) & (z > gripper.palm_z) & (z < gripper.tip_z)
+    ahead = (z > gripper.palm_z) & (z < gripper.foremost_z)
+    between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
     reach = np.zeros(view.num_candidates, dtype=np.float32)
     np.maximum.at(reach, view.candidate[between], np.abs(y[between]))
     width: NDArray[np.float32] = np.minimum(2 * (reach + FINGER_CLEARANCE), gripper.max_opening)

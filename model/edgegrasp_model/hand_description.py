@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import Candidates, support_clearance
 from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.gripper import Boxes, Gripper
 from edgegrasp_model.options import SupportPlane
 
 Float32 = NDArray[np.float32]
@@ -57,6 +57,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandVie
     boxes = gripper.boxes(gripper.max_opening)
     low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
     high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
+    high[2] += gripper.foremost_z - gripper.tip_z
     points = torch.from_numpy(np.ascontiguousarray(cloud.points.T))  # (3, N)
     pose = torch.from_numpy(T_cloud_hand)
     turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
@@ -140,29 +141,47 @@ def describe_hands(
 
 def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:
     """Points inside the open hand, near its fingers, on its way in and beyond its tips."""
-    half, inner, outer, base, tip, palm = _finger_box(gripper)
-    hand_x, hand_y, hand_low = _hand_box(gripper)
-    in_line, fingers_z = np.abs(x) < half, (z > base) & (z < tip)
-    beside = (np.abs(x) < half + NEAR) & (z > base) & (z < tip + NEAR)
-    in_hand = (np.abs(x) < hand_x) & (np.abs(y) < hand_y) & (z < palm)
-    swept_finger = in_line & (np.abs(y) > inner) & (np.abs(y) < outer) & (z < tip)
+    hand, fingers = gripper.hand_boxes, gripper.finger_boxes
+    inner = gripper.max_opening / 2
+    in_line = (np.abs(x) < gripper.pad_half_width) & (np.abs(y) < inner)
+    right, left = (x, y - inner, z), (x, -y - inner, z)  # from each finger's inner face
     regions = [
-        in_line & fingers_z & (y > inner) & (y < outer),
-        in_line & fingers_z & (y < -inner) & (y > -outer),
-        in_hand & (z > hand_low),
-        beside & (y > inner - NEAR) & (y < outer + NEAR),
-        beside & (y < NEAR - inner) & (y > -outer - NEAR),
-        in_hand | (swept_finger & (z > base - APPROACH_LENGTH)),
-        in_line & (np.abs(y) < inner) & (z >= tip),
+        _in_any(fingers, *right),
+        _in_any(fingers, *left),
+        _in_any(hand, x, y, z),
+        _in_any(fingers, *right, around=NEAR),
+        _in_any(fingers, *left, around=NEAR),
+        _in_any(hand, x, y, z, behind=np.inf)
+        | _in_any(fingers, *right, behind=APPROACH_LENGTH)
+        | _in_any(fingers, *left, behind=APPROACH_LENGTH),
+        in_line & (z >= gripper.tip_z),
     ]
     return [_Region(view, region).log_count() for region in regions]
+
+
+def _in_any(
+    boxes: Boxes, x: Float32, y: Float32, z: Float32, around: float = 0.0, behind: float = 0.0
+) -> NDArray[np.bool_]:
+    """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
+    inside = np.zeros(len(x), dtype=bool)
+    for low, high in boxes:
+        inside |= (
+            (x > low[0] - around)
+            & (x < high[0] + around)
+            & (y > low[1] - around)
+            & (y < high[1] + around)
+            & (z > low[2] - behind)
+            & (z < high[2] + around)
+        )
+    return inside
 
 
 def _between_fingers(
     view: HandView, x: Float32, y: Float32, z: Float32, normal: Float32, gripper: Gripper
 ) -> list[Float32]:
     """Extent, middle and normals of what the closing fingers would meet."""
-    half, inner, _, _, tip, palm = _finger_box(gripper)
+    half, inner = gripper.pad_half_width, gripper.max_opening / 2
+    tip, palm = gripper.foremost_z, gripper.palm_z
     z = z - palm
     middle = (tip - palm) / 2
     around = (np.abs(y) < inner) & (z > 0) & (z < tip - palm)
@@ -218,21 +237,6 @@ def _stance(
         support_clearance(pose, support, gripper),
     ]
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
-
-
-def _finger_box(gripper: Gripper) -> tuple[float, float, float, float, float, float]:
-    """Half width, inner and outer y, base and tip z of the open fingers, and the palm's z."""
-    fingers = np.asarray(gripper.finger_boxes)  # (F, 2, 3)
-    inner = gripper.max_opening / 2
-    half, thickness = float(fingers[:, 1, 0].max()), float(fingers[:, 1, 1].max())
-    base = float(fingers[:, 0, 2].min())
-    return half, inner, inner + thickness, base, gripper.tip_z, gripper.palm_z
-
-
-def _hand_box(gripper: Gripper) -> tuple[float, float, float]:
-    """Half extents in x and y, and the lowest z, of the hand without its fingers."""
-    hand = np.asarray(gripper.hand_boxes)
-    return float(hand[:, 1, 0].max()), float(hand[:, 1, 1].max()), float(hand[:, 0, 2].min())
 
 
 HAND_DESCRIPTION_SIZE = 44

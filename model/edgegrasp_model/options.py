@@ -14,6 +14,7 @@ from pydantic import (
 
 from edgegrasp_model.directions import ApproachDirection, Cone
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import GripperGeometry
 from edgegrasp_model.option_types import Direction, Strict, Vector, ordered
 from edgegrasp_model.regions import Box, OrientedBox, Region
 from edgegrasp_model.support import RansacPlane, SupportPlane
@@ -39,7 +40,6 @@ MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
 
 CollisionMode = Literal["avoid", "penalise", "ignore"]
-Length = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class Workspace(Strict):
@@ -95,42 +95,6 @@ class Collision(Strict):
     obstacles: tuple[Annotated[Box | OrientedBox, Field(discriminator="kind")], ...] = Field(
         default=(), max_length=64, description="solid boxes beside the cloud"
     )
-
-
-Corner = Annotated[
-    tuple[
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-    ],
-    Field(description="x, y, z in the hand frame, metres"),
-]
-
-
-class HandPart(Strict):
-    """Boxes of the hand or of one finger, hand frame."""
-
-    boxes: tuple[tuple[Corner, Corner], ...] = Field(
-        min_length=1, max_length=16, description="[min corner, max corner] each"
-    )
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        for low, high in self.boxes:
-            ordered(low, high)
-        return self
-
-
-class GripperGeometry(Strict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
-
-    name: str = Field(default="custom", max_length=100, description="shown in results")
-    max_opening: Length = Field(description="metres between the open fingers' inner faces")
-    tip_z: Length = Field(description="fingertips, metres along z")
-    contact_z: Length = Field(description="where contacts are put, metres along z")
-    tcp_z: float = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
-    hand: HandPart = Field(description="the hand without its fingers")
-    finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
 
 
 def _mode_as_object(value: object) -> object:
