@@ -36,7 +36,7 @@ class TrainingOptions:
     balls_per_view: int = 8
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
-    patience: int = 6  # evaluations without a better loss before the learning rate is halved
+    patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
     unknown_support: float = 0.1  # share of training views described without their table

@@ -109,11 +109,15 @@ def test_no_grasp_is_an_answer_that_says_why() -> None:
     assert nothing.counts["returned"] == 0
     assert any("0 points are left" in warning for warning in nothing.warnings)
 
-    high = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.07)
-    blocked = detector().detect(box_on_table(), ask(support=high))
-    assert blocked.grasps == []
-    assert blocked.counts["clear_of_support"] == 0
-    assert any("see counts" in warning for warning in blocked.warnings)
+    apart = np.float32(
+        [[0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1], [0.1, 0.1, 0.2]]
+    )
+    alone = detector().detect(apart, ask(num_approach_points=5))
+    assert alone.grasps == []
+    assert alone.counts["kept"] == 5
+    assert alone.counts["pairs"] == alone.counts["approach_points"]  # each alone in its ball
+    assert alone.counts["candidates"] == 0
+    assert any("see counts" in warning for warning in alone.warnings)
 
     assert detector().detect(box_on_table(), ask(min_score=1.0)).grasps == []
 
