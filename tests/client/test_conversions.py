@@ -1,0 +1,316 @@
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_client import Grasp
+from edgegrasp_client.conversions import (
+    CONTACT_GRASPNET,
+    PANDA_JOINTS,
+    VGN,
+    FingerJoints,
+    HandFrame,
+    from_frame,
+    graspnet_frame,
+    isaac_grasps,
+    matrix_from_quaternion,
+    moveit_grasp,
+    pose_from_moveit_grasp,
+    quaternion_from_matrix,
+    read_isaac_grasps,
+    to_frame,
+)
+
+AXES = ["x", "-x", "y", "-y", "z", "-z"]
+FRAMES = [
+    CONTACT_GRASPNET,
+    VGN,
+    graspnet_frame(0.1122),
+    *(HandFrame(a, c, 0.03) for a in AXES for c in AXES if a[-1] != c[-1]),
+]
+THUMB = FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,))
+
+# The hand above the point (0.5, -0.1, 0), looking down, its fingers closing along the cloud's x.
+DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1.0]])
+
+finite = st.floats(-2.0, 2.0)
+quaternions = st.tuples(finite, finite, finite, finite).filter(lambda q: np.linalg.norm(q) > 1e-3)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(draw(quaternions)).as_matrix()
+    pose[:3, 3] = draw(st.tuples(finite, finite, finite))
+    return pose
+
+
+def grasp(pose: np.ndarray, score: float = 0.9, width: float = 0.06) -> Grasp:
+    """A grasp as the server answers it; fields that conversions do not read are left out."""
+    pose = np.asarray(pose, dtype=np.float32)
+    fields: dict[str, Any] = dict.fromkeys(Grasp.__dataclass_fields__)
+    fields |= {"score": score, "width": width, "T_cloud_hand": pose}
+    return Grasp(**fields | {"approach_direction": pose[:3, 2]})
+
+
+@settings(max_examples=100, deadline=None)
+@given(quaternion=quaternions)
+def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ...]) -> None:
+    rotation = Rotation.from_quat(quaternion)
+    np.testing.assert_allclose(matrix_from_quaternion(quaternion), rotation.as_matrix(), atol=1e-12)
+    found = quaternion_from_matrix(rotation.as_matrix())
+    np.testing.assert_allclose(matrix_from_quaternion(found), rotation.as_matrix(), atol=1e-12)
+    assert found[3] >= 0
+    assert np.linalg.norm(found) == pytest.approx(1.0)
+
+
+def test_a_quaternion_is_xyzw() -> None:
+    quarter_about_z = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(
+        quaternion_from_matrix(quarter_about_z), [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
+    )
+    with pytest.raises(ValueError, match="not all zero"):
+        matrix_from_quaternion([0, 0, 0, 0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(pose=poses(), frame=st.sampled_from(FRAMES))
+def test_frames_round_trip(pose: np.ndarray, frame: HandFrame) -> None:
+    np.testing.assert_allclose(from_frame(to_frame(pose, frame), frame), pose, atol=1e-12)
+    turn = frame.T_hand_frame[:3, :3]
+    assert np.linalg.det(turn) == pytest.approx(1.0)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: f"{frame.approach}{frame.closing}")
+def test_the_named_axes_point_where_they_say(frame: HandFrame) -> None:
+    unit = {axis: (-1 if "-" in axis else 1) * np.eye(3)["xyz".index(axis[-1])] for axis in AXES}
+    turn = to_frame(DOWN, frame)[:3, :3]
+    np.testing.assert_allclose(turn @ unit[frame.approach], [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(turn @ unit[frame.closing], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(to_frame(DOWN, frame)[:3, 3], [0.5, -0.1, 0.3 - frame.origin_z])
+
+
+def test_contact_graspnet_closes_along_its_x() -> None:
+    expected = [[1, 0, 0, 0.5], [0, -1, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(to_frame(DOWN, CONTACT_GRASPNET), expected, atol=1e-12)
+
+
+def test_graspnet_approaches_along_its_x_from_depth_behind_the_fingertips() -> None:
+    # Tips at height 0.3 - 0.1122; the origin 0.02 above them.
+    expected = [[0, 1, 0, 0.5], [0, 0, -1, -0.1], [-1, 0, 0, 0.2078], [0, 0, 0, 1]]
+    np.testing.assert_allclose(to_frame(DOWN, graspnet_frame(0.1122, 0.02)), expected, atol=1e-12)
+
+
+def test_the_tcp_of_vgn_lies_62_mm_ahead_with_the_same_axes() -> None:
+    expected = DOWN.copy()
+    expected[2, 3] = 0.238
+    np.testing.assert_allclose(to_frame(DOWN, VGN), expected, atol=1e-12)
+
+
+def test_many_poses_are_converted_at_once() -> None:
+    many = np.stack([DOWN, np.eye(4)]).astype(np.float32)
+    each = [to_frame(pose, VGN) for pose in many]
+    np.testing.assert_array_equal(to_frame(many, VGN), each)
+
+
+@pytest.mark.parametrize("axes", [("x", "-x"), ("up", "x"), ("x", "")])
+def test_axes_that_make_no_frame_are_refused(axes: tuple[str, str]) -> None:
+    with pytest.raises(ValueError, match=r"both along x|Use one of"):
+        HandFrame(*axes)
+
+
+@settings(max_examples=50, deadline=None)
+@given(pose=poses(), T_hand_link=poses())
+def test_moveit_grasps_round_trip(pose: np.ndarray, T_hand_link: np.ndarray) -> None:
+    message = moveit_grasp(grasp(pose), "camera", T_hand_link=T_hand_link)
+    np.testing.assert_allclose(pose_from_moveit_grasp(message, T_hand_link), pose, atol=1e-5)
+    np.testing.assert_allclose(
+        pose_from_moveit_grasp(moveit_grasp(grasp(pose), "camera")), pose, atol=1e-6
+    )
+
+
+def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "table"}
+
+    def posture(*positions: float) -> dict[str, Any]:
+        point = {"positions": list(positions), "velocities": [], "accelerations": []}
+        point |= {"effort": [], "time_from_start": {"sec": 0, "nanosec": 0}}
+        names = ["panda_finger_joint1", "panda_finger_joint2"]
+        return {"header": header, "joint_names": names, "points": [point]}
+
+    def along(z: float, distance: float) -> dict[str, Any]:
+        vector = {"x": 0.0, "y": 0.0, "z": z}
+        direction = {"header": header, "vector": vector}
+        return {
+            "direction": direction,
+            "desired_distance": distance,
+            "min_distance": distance,
+        }
+
+    half = float(np.sqrt(0.5))  # a half turn about the cloud's x = y
+    message = moveit_grasp(
+        grasp(DOWN), "table", name="best", approach_distance=0.08, retreat_direction=(0, 0, 2)
+    )
+    pose = message["grasp_pose"]["pose"]
+    assert pose["position"] == pytest.approx({"x": 0.5, "y": -0.1, "z": 0.3})
+    assert pose["orientation"] == pytest.approx({"x": half, "y": half, "z": 0.0, "w": 0.0})
+    assert message == {
+        "id": "best",
+        "pre_grasp_posture": posture(0.03, 0.03),
+        "grasp_posture": posture(0.0, 0.0),
+        "grasp_pose": {"header": header, "pose": pose},
+        "grasp_quality": 0.9,
+        "pre_grasp_approach": along(-1.0, 0.08),
+        "post_grasp_retreat": along(1.0, 0.1),
+        "post_place_retreat": along(1.0, 0.1),
+        "max_contact_force": 0.0,
+        "allowed_touch_objects": [],
+    }
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    cases=st.lists(st.tuples(poses(), st.floats(0, 1), st.floats(0, 0.1)), max_size=3),
+    T_object_cloud=poses(),
+    T_hand_gripper=poses(),
+)
+def test_isaac_grasps_round_trip(
+    cases: list[Any], T_object_cloud: np.ndarray, T_hand_gripper: np.ndarray
+) -> None:
+    grasps = [grasp(*case) for case in cases]
+    text = isaac_grasps(
+        grasps,
+        object_frame="/World/mug #1",
+        gripper_frame='/World/"hand"',
+        T_object_cloud=T_object_cloud,
+        T_hand_gripper=T_hand_gripper,
+        joints=THUMB,
+    )
+    read = read_isaac_grasps(text)
+    assert [each.name for each in read] == [f"grasp_{i}" for i in range(len(cases))]
+    for each, (pose, score, width) in zip(read, cases, strict=True):
+        back = np.linalg.inv(T_object_cloud) @ each.T_object_gripper @ np.linalg.inv(T_hand_gripper)
+        np.testing.assert_allclose(back, pose, atol=1e-5)
+        assert each.confidence == score
+        assert each.cspace_position == {"thumb": 0.8}
+        assert each.pregrasp_cspace_position == {"thumb": 0.8 - 9.0 * width}
+
+
+def test_an_isaac_file_says_what_the_format_asks_for() -> None:
+    up = np.eye(4)  # looking up: no turn at all
+    up[:3, 3] = [0.25, -0.5, 1.0]
+    text = isaac_grasps(
+        [grasp(up, 0.5, 0.06)], object_frame="/World/mug", gripper_frame="/World/panda_hand"
+    )
+    assert text == (
+        "format: isaac_grasp\n"
+        "format_version: 1.0\n"
+        'object_frame_link: "/World/mug"\n'
+        'gripper_frame_link: "/World/panda_hand"\n'
+        "grasps:\n"
+        "  grasp_0:\n"
+        "    confidence: 0.5\n"
+        "    position: [0.25, -0.5, 1.0]\n"
+        "    orientation: {w: 1.0, xyz: [0.0, 0.0, 0.0]}\n"
+        "    cspace_position:\n"
+        "      panda_finger_joint1: 0.0\n"
+        "      panda_finger_joint2: 0.0\n"
+        "    pregrasp_cspace_position:\n"
+        "      panda_finger_joint1: 0.03\n"
+        "      panda_finger_joint2: 0.03\n"
+    )
+
+
+@pytest.mark.parametrize("scores", [[], [1e-5], [1e-300, 0.25]])
+def test_an_isaac_file_is_yaml_to_others(scores: list[float]) -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+    grasps = [grasp(DOWN, score) for score in scores]
+    text = isaac_grasps(grasps, object_frame="/World/mug #1", gripper_frame='"hand"')
+    read = yaml.safe_load(text)
+    assert read["object_frame_link"] == "/World/mug #1"
+    assert read["gripper_frame_link"] == '"hand"'
+    assert [each["confidence"] for each in read["grasps"].values()] == scores
+    for each in read["grasps"].values():
+        assert all(type(number) is float for number in each["position"])
+
+
+def test_a_file_of_the_grasp_editor_is_read() -> None:
+    text = """
+# Made by hand.
+format: isaac_grasp
+format_version: 1.0
+
+object_frame: /World/mug # the mug
+gripper_frame: '/World/panda_hand'
+
+grasps:
+  "grasp_0":
+    confidence: 1
+    position: [-0.04346, 0.06759, 0.19895]
+    orientation: {w: 0.0, xyz: [2.0, 0.0, 0.0]}
+    cspace_position:
+      panda_finger_joint1: 0.00943
+    pregrasp_cspace_position:
+      panda_finger_joint1: 0.04
+  other:
+    confidence: 0.5
+    position:
+    - 1
+    - 2.5
+    - -3e-1
+    orientation:
+      w: 1.0
+      xyz:
+        - 0.0
+        - 0.0
+        - 0.0
+"""
+    first, second = read_isaac_grasps(text)
+    assert (first.name, first.confidence) == ("grasp_0", 1.0)
+    np.testing.assert_allclose(first.T_object_gripper[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
+    np.testing.assert_allclose(first.T_object_gripper[:3, 3], [-0.04346, 0.06759, 0.19895])
+    assert first.cspace_position == {"panda_finger_joint1": 0.00943}
+    assert first.pregrasp_cspace_position == {"panda_finger_joint1": 0.04}
+    np.testing.assert_allclose(second.T_object_gripper[:3, 3], [1, 2.5, -0.3])
+    assert second.cspace_position == {}
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (("format: isaac_grasp", "format: other"), "Give isaac_grasp, 1.0"),
+        (("format_version: 1.0", "format_version: 2.0"), "Give isaac_grasp, 1.0"),
+        (("    confidence: 0.5", "    confidence 0.5"), "line 7: got '    confidence 0.5'"),
+        (("    confidence: 0.5\n", ""), "grasps.grasp_0: KeyError"),
+        (("    confidence: 0.5", "    confidence: high"), "grasps.grasp_0: ValueError"),
+        (("[0.0, 0.0, 0.0]}", "[0.0, 0.0, 0.0}"), "line 9"),
+        (("[0.0, 0.0, 0.0]}", "[0.0, 0.0, 0.0]"), "line 9"),
+        (("xyz: [0.0, 0.0, 0.0]", "xyz: [0.0, 0.0]"), "grasps.grasp_0: ValueError"),
+        (("{w: 1.0", "{w 1.0"), "line 9"),
+        (("{w: 1.0", "{w: 0.0"), "not all zero"),
+        (("[0.25, -0.5, 1.0]", "[0.25, -0.5]"), "grasps.grasp_0: ValueError"),
+        (("    cspace_position:", "    - cspace_position"), "line 10"),
+    ],
+)
+def test_what_is_no_isaac_file_is_refused(edit: tuple[str, str], message: str) -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = [0.25, -0.5, 1.0]
+    text = isaac_grasps([grasp(pose, 0.5)], object_frame="a", gripper_frame="b")
+    assert len(read_isaac_grasps(text)) == 1
+    assert edit[0] in text
+    with pytest.raises(ValueError, match=message.replace("[", r"\[")):
+        read_isaac_grasps(text.replace(*edit, 1))
+
+
+def test_the_panda_has_a_joint_for_each_finger() -> None:
+    assert PANDA_JOINTS.at(0.08) == {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04}
+
+
+def test_conversions_name_everything_they_offer() -> None:
+    module = importlib.import_module("edgegrasp_client.conversions")
+    assert all(hasattr(module, name) for name in module.__all__)
