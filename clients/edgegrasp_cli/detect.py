@@ -10,11 +10,11 @@ import typer
 from edgegrasp_cli.detection_output import as_json, print_table
 
 Option = typer.Option
-Vector = tuple[float, float, float]
+NOT_OPTIONS = ("file", "server", "timeout", "weights", "grippers", "as_document", "options")
 
 
 def detect(
-    file: Annotated[Path, typer.Argument(help="Cloud in metres: .npy, .npz, .ply or .pcd.")],
+    file: Annotated[Path, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")],
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else in this process.")
     ] = None,
@@ -22,58 +22,82 @@ def detect(
     weights: Annotated[
         list[Path] | None, Option(help="Weights file or folder, where there is no server.")
     ] = None,
+    grippers: Annotated[
+        list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
+    ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
+    options: Annotated[
+        Path | None, Option(help="JSON file with options; those given beside it win.")
+    ] = None,
     model: Annotated[str | None, Option(help="Weights to use.")] = None,
+    gripper: Annotated[str | None, Option(help="Name of a gripper, or one as JSON.")] = None,
     num_approach_points: Annotated[int | None, Option(help="Approach points sampled.")] = None,
     num_candidates: Annotated[int | None, Option(help="Candidates scored at most.")] = None,
     sampling: Annotated[str | None, Option(help="farthest or uniform.")] = None,
-    seed: Annotated[int | None, Option(help="Seed of the sampling.")] = None,
-    viewpoint: Annotated[Vector | None, Option(help="Camera position, m.")] = None,
-    up: Annotated[Vector | None, Option(help="Direction away from gravity.")] = None,
+    seed: Annotated[int | None, Option(help="Seed of every random choice.")] = None,
+    viewpoint: Annotated[
+        str | None, Option(help="Camera position, m: x,y,z; several as JSON.")
+    ] = None,
+    up: Annotated[str | None, Option(help="Direction away from gravity: x,y,z.")] = None,
     support: Annotated[
-        tuple[float, float, float, float] | None,
-        Option(help="Plane objects rest on: unit normal, and normal . x of its points in m."),
+        str | None,
+        Option(help='JSON: {"normal":[0,0,1],"offset":0} or {"kind":"ransac"}.'),
     ] = None,
-    workspace: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        Option(help="Box: lower corner, upper corner, m; points outside are dropped."),
+    workspace: Annotated[str | None, Option(help='JSON: {"min":[0,0,0],"max":[1,1,1]}, m.')] = None,
+    approach_region: Annotated[
+        str | None,
+        Option(help='JSON: {"include":[{"kind":"sphere","center":[0,0,0],"radius":0.1}]}.'),
     ] = None,
-    collision: Annotated[str | None, Option(help="avoid, penalise or ignore.")] = None,
+    contact_region: Annotated[str | None, Option(help="JSON, as --approach-region.")] = None,
+    approach_direction: Annotated[
+        str | None,
+        Option(help='JSON: {"preset":"top-down"} or {"cones":[...]}, the way the hand moves.'),
+    ] = None,
+    collision: Annotated[
+        str | None, Option(help='avoid, penalise, ignore, or JSON: {"margin":0.005}.')
+    ] = None,
     min_score: Annotated[float | None, Option(help="Lowest score returned.")] = None,
     top_k: Annotated[int | None, Option(help="Grasps returned at most.")] = None,
     suppression: Annotated[
-        tuple[float, float] | None,
-        Option(help="Drop a grasp nearer than this to a better one: m and rad; 0 0: none."),
+        str | None, Option(help='JSON: {"translation":0.01,"rotation":0.5}, m and rad; or null.')
+    ] = None,
+    order: Annotated[str | None, Option(help="score, highest or clearance.")] = None,
+    debug: Annotated[
+        bool | None, Option("--debug", help="Return every candidate; with --json.")
     ] = None,
 ) -> None:
-    """Find grasps in a point cloud file, by a server or in this process."""
-    scalars = {
-        "model": model,
-        "num_approach_points": num_approach_points,
-        "num_candidates": num_candidates,
-        "sampling": sampling,
-        "seed": seed,
-        "viewpoint": viewpoint,
-        "up": up,
-        "collision": collision,
-        "min_score": min_score,
-        "top_k": top_k,
+    """Find grasps in a point cloud file, by a server or in this process.
+
+    Options are written as in query parameters of the HTTP API.
+    """
+    given = {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in locals().items()
+        if name not in NOT_OPTIONS and value is not None
     }
-    options: dict[str, Any] = {name: value for name, value in scalars.items() if value is not None}
-    if support is not None:
-        options["support"] = {"normal": support[:3], "offset": support[3]}
-    if workspace is not None:
-        options["workspace"] = {"min": workspace[:3], "max": workspace[3:]}
-    if suppression is not None:
-        options["suppression"] = {"translation": suppression[0], "rotation": suppression[1]}
+    fields = _options(options, given)
     if server:
-        detection = _by_server(server, file, timeout, options)
+        detection = _by_server(server, file, timeout, fields)
     else:
-        detection = _in_this_process(file, weights or [], options)
+        detection = _in_this_process(file, weights or [], grippers or [], fields)
     if as_document:
         print(json.dumps(as_json(detection)))
     else:
         print_table(detection)
+
+
+def _options(file: Path | None, given: dict[str, str]) -> dict[str, Any]:
+    """What the flags say, and the file where they do not."""
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_service.options_text import options_from_query
+
+    try:
+        fields = json.loads(file.read_text()) if file else {}
+        if not isinstance(fields, dict):
+            raise ValueError("a JSON object is needed")
+        return fields | options_from_query(given.items())
+    except (EdgeGraspError, OSError, ValueError) as error:
+        sys.exit(f"edgegrasp detect: {file or 'options'}: {error}")
 
 
 def _by_server(address: str, file: Path, timeout: float, options: dict[str, Any]) -> Any:
@@ -86,7 +110,9 @@ def _by_server(address: str, file: Path, timeout: float, options: dict[str, Any]
         sys.exit(f"edgegrasp detect: {error}")
 
 
-def _in_this_process(file: Path, weights: list[Path], options: dict[str, Any]) -> Any:
+def _in_this_process(
+    file: Path, weights: list[Path], grippers: list[Path], options: dict[str, Any]
+) -> Any:
     from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.options import parse_options
     from edgegrasp_service.cloud_decoding import decode_file
@@ -98,7 +124,7 @@ def _in_this_process(file: Path, weights: list[Path], options: dict[str, Any]) -
 
         from edgegrasp_model.catalogue import ModelCatalogue  # after what fails fast
 
-        catalogue = ModelCatalogue.load(weights)
+        catalogue = ModelCatalogue.load(weights, grippers=grippers)
         return catalogue.get(parsed.model).detect(cloud, parsed)
     except (EdgeGraspError, OSError) as error:
         sys.exit(f"edgegrasp detect: {error}")

@@ -11,16 +11,27 @@ def as_json(detection: Any) -> dict[str, Any]:
     Args:
         detection: From the detector or from the client; their fields have the same names.
     """
-    return dict(vars(detection)) | {"grasps": [_plain(vars(grasp)) for grasp in detection.grasps]}
+    grasps = [_plain(vars(grasp)) for grasp in detection.grasps]
+    debug = None if detection.debug is None else _plain(vars(detection.debug))
+    return dict(vars(detection)) | {"grasps": grasps, "debug": debug}
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    floats = {
-        name: np.asarray(value, dtype=np.float32).tolist()
-        for name, value in fields.items()
-        if not isinstance(value, bool)
-    }
-    return fields | floats
+    """Arrays as lists, floats as float32, NaN as None."""
+    return {name: _value(value) for name, value in fields.items()}
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(np.float32(value))
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.kind in "iu":
+        return value.tolist()
+    floats = value.astype(np.float32)
+    if np.isnan(floats).any():  # of scores, which are flat
+        return [None if np.isnan(number) else number for number in floats.tolist()]
+    return floats.tolist()
 
 
 def print_table(detection: Any) -> None:

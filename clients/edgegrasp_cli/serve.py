@@ -16,6 +16,9 @@ def serve(
     weights: Annotated[
         list[Path] | None, Option(help="Weights file or folder, besides those that ship.")
     ] = None,
+    grippers: Annotated[
+        list[Path] | None, Option(help="Gripper file (.toml), besides those that ship.")
+    ] = None,
     default_model: Annotated[
         str | None, Option(help="Weights used when a request names none.")
     ] = None,

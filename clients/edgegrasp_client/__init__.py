@@ -9,6 +9,7 @@ best = detection.grasps[0]
 
 from edgegrasp_client.async_client import AsyncGraspClient
 from edgegrasp_client.client import GraspClient
+from edgegrasp_client.depth_image import DepthImage, Intrinsics
 from edgegrasp_client.errors import (
     DeadlineError,
     GraspClientError,
@@ -19,25 +20,68 @@ from edgegrasp_client.errors import (
     ServerUnavailableError,
     UnknownModelError,
 )
-from edgegrasp_client.options import DetectOptions, SupportPlane, Suppression, Workspace
-from edgegrasp_client.results import Detection, Grasp, Model
+from edgegrasp_client.options import (
+    ApproachDirection,
+    Box,
+    Collision,
+    Cone,
+    DetectOptions,
+    GripperGeometry,
+    HalfSpace,
+    HandPart,
+    Indices,
+    Mask,
+    OrientedBox,
+    RansacPlane,
+    Region,
+    Segments,
+    Sphere,
+    SupportPlane,
+    Suppression,
+    Swing,
+    Workspace,
+)
+from edgegrasp_client.point_cloud2 import PointCloud2, PointField
+from edgegrasp_client.results import DebugInfo, Detection, Evaluation, Grasp, Model, Scoring
 
 __all__ = [
+    "ApproachDirection",
     "AsyncGraspClient",
+    "Box",
+    "Collision",
+    "Cone",
     "DeadlineError",
+    "DebugInfo",
+    "DepthImage",
     "DetectOptions",
     "Detection",
+    "Evaluation",
     "Grasp",
     "GraspClient",
     "GraspClientError",
+    "GripperGeometry",
+    "HalfSpace",
+    "HandPart",
+    "Indices",
+    "Intrinsics",
     "InvalidRequestError",
+    "Mask",
     "Model",
+    "OrientedBox",
     "PayloadTooLargeError",
+    "PointCloud2",
+    "PointField",
     "ProtocolError",
+    "RansacPlane",
+    "Region",
+    "Scoring",
+    "Segments",
     "ServerFailedError",
     "ServerUnavailableError",
+    "Sphere",
     "SupportPlane",
     "Suppression",
+    "Swing",
     "UnknownModelError",
     "Workspace",
 ]

@@ -1,19 +1,22 @@
 """The client, synchronous."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Protocol, Self, Unpack
 
 import grpc
 import httpx
+from numpy.typing import NDArray
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import grpc_wire, rest_wire
 from edgegrasp_client.cloud_encoding import Cloud
+from edgegrasp_client.depth_image import DepthImage
 from edgegrasp_client.errors import DeadlineError
+from edgegrasp_client.inputs import Given, Inputs
 from edgegrasp_client.options import DetectOptions, plain_options
-from edgegrasp_client.results import Detection, Model
+from edgegrasp_client.results import Detection, Model, Scoring
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
@@ -46,20 +49,76 @@ class GraspClient:
             self._transport = _GrpcTransport(address, channel)
 
     def detect(
-        self, cloud: Cloud, *, timeout: float | None = None, **options: Unpack[DetectOptions]
+        self,
+        cloud: Cloud | None = None,
+        *,
+        depth_images: Sequence[DepthImage] | None = None,
+        normals: NDArray[Any] | None = None,
+        colors: NDArray[Any] | None = None,
+        segment_ids: NDArray[Any] | None = None,
+        view_ids: NDArray[Any] | None = None,
+        timeout: float | None = None,
+        **options: Unpack[DetectOptions],
     ) -> Detection:
         """Find grasps in a cloud.
 
         Args:
-            cloud: (N, 3) float32 or float64, metres; or the path of a .npy, .npz, .ply or .pcd
-                file.
+            cloud: (N, 3) float32 or float64, metres; (H, W, 3) with NaN for holes; the path of a
+                .npy, .npz, .ply, .pcd or .xyz file; or an object with the attributes of
+                sensor_msgs/PointCloud2.
+            depth_images: Views to fuse in place of a cloud; their cameras are the viewpoints, and
+                the rows of the cloud their pixels, one image after the other.
+            normals: (N, 3), one for each row of the cloud, outward, of any length.
+            colors: (N, 3), one for each row.
+            segment_ids: (N,) integers, which `segments` of a region name.
+            view_ids: (N,) integers: which of several positions of `viewpoint` saw each row.
             timeout: Seconds to wait; None: the client's own.
             options: As in DetectOptions; what is left out takes the server's default.
 
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        return self._transport.detect(cloud, plain_options(options), self._seconds(timeout))
+        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
+        return self._transport.detect(inputs, plain_options(options), self._seconds(timeout))
+
+    def score(
+        self,
+        cloud: Cloud | None = None,
+        *,
+        edges: NDArray[Any] | None = None,
+        hand_poses: NDArray[Any] | None = None,
+        depth_images: Sequence[DepthImage] | None = None,
+        normals: NDArray[Any] | None = None,
+        colors: NDArray[Any] | None = None,
+        segment_ids: NDArray[Any] | None = None,
+        view_ids: NDArray[Any] | None = None,
+        timeout: float | None = None,
+        **options: Unpack[DetectOptions],
+    ) -> Scoring:
+        """Score edges or hand poses of one's own: the paper's grasp evaluation function.
+
+        Args:
+            cloud: As for `detect`, like all that is not said here.
+            edges: (M, 2) integers: approach and contact point, rows of the cloud as sent.
+            hand_poses: (M, 4, 4) T_cloud_hand, in the place of edges.
+            depth_images: As for `detect`.
+            normals: As for `detect`.
+            colors: As for `detect`.
+            segment_ids: As for `detect`.
+            view_ids: As for `detect`.
+            timeout: As for `detect`.
+            options: As for `detect`.
+
+        Returns:
+            An evaluation for each edge or pose, in their order.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
+        given = Given(edges, hand_poses)
+        plain = plain_options(options)
+        return self._transport.score(inputs, given, plain, self._seconds(timeout))
 
     def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name.
@@ -112,7 +171,11 @@ def is_rest(address: str) -> bool:
 
 
 class _Transport(Protocol):
-    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection: ...
+    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection: ...
+
+    def score(
+        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
+    ) -> Scoring: ...
 
     def models(self, timeout: float) -> list[Model]: ...
 
@@ -128,13 +191,23 @@ class _GrpcTransport:
         self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
 
-    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
-        request = grpc_wire.request_message(cloud, options)
+    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
+        request = grpc_wire.request_message(inputs, options)
         try:
             answer = self._stub.DetectGrasps(request, timeout=timeout)
         except grpc.RpcError as error:
             raise grpc_wire.error_from_call(error) from None
         return grpc_wire.detection_from_message(answer)
+
+    def score(
+        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
+    ) -> Scoring:
+        request = grpc_wire.score_message(inputs, given, options)
+        try:
+            answer = self._stub.ScoreGrasps(request, timeout=timeout)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return grpc_wire.scoring_from_message(answer)
 
     def models(self, timeout: float) -> list[Model]:
         try:
@@ -158,13 +231,23 @@ class _RestTransport:
     def __init__(self, address: str, transport: httpx.BaseTransport | None) -> None:
         self._http = httpx.Client(base_url=address, transport=transport)
 
-    def detect(self, cloud: Cloud, options: Mapping[str, Any], timeout: float) -> Detection:
-        post = rest_wire.detect_post(cloud, options)
+    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
+        post = rest_wire.detect_post(inputs, options)
+        response = self._post(rest_wire.GRASPS, post, timeout)
+        return rest_wire.detection_from_response(response)
+
+    def score(
+        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
+    ) -> Scoring:
+        post = rest_wire.score_post(inputs, given, options)
+        response = self._post(rest_wire.SCORE, post, timeout)
+        return rest_wire.scoring_from_response(response)
+
+    def _post(self, path: str, post: dict[str, Any], timeout: float) -> httpx.Response:
         try:
-            response = self._http.post(rest_wire.GRASPS, **vars(post), timeout=timeout)
+            return self._http.post(path, **post, timeout=timeout)
         except httpx.HTTPError as error:
             raise rest_wire.error_from_transport(error) from None
-        return rest_wire.detection_from_response(response)
 
     def models(self, timeout: float) -> list[Model]:
         try:

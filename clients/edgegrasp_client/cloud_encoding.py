@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_client.errors import invalid
+from edgegrasp_client.point_cloud2 import PointCloud2
 
-FILE_FORMATS = ("npy", "npz", "ply", "pcd")
+FILE_FORMATS = ("npy", "npz", "ply", "pcd", "xyz")
 
-Cloud = NDArray[Any] | str | PathLike[str]
+Cloud = NDArray[Any] | str | PathLike[str] | PointCloud2
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ def cloud_file(cloud: Cloud) -> CloudFile:
         return _npy(cloud if points is None else points)
     if not isinstance(cloud, str | PathLike):
         kind = type(cloud).__name__
-        raise invalid("cloud", f"a {kind}", "Give an (N, 3) array in metres, or a file's path.")
+        fix = "Give an (N, 3) array in metres, a file's path, or a PointCloud2."
+        raise invalid("cloud", f"a {kind}", fix)
     path = Path(cloud)
     file_format = path.suffix[1:].lower()
     if file_format not in FILE_FORMATS:
@@ -58,9 +60,14 @@ def cloud_file(cloud: Cloud) -> CloudFile:
 
 
 def _npy(array: NDArray[Any]) -> CloudFile:
-    stream = io.BytesIO()
     try:
-        np.save(stream, array, allow_pickle=False)
+        return CloudFile("npy", npy_bytes(array))
     except ValueError:
         raise invalid("cloud", f"dtype {array.dtype}", "Send float32 or float64 metres.") from None
-    return CloudFile("npy", stream.getvalue())
+
+
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array as an .npy file; raises ValueError for one of objects."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()

@@ -5,10 +5,11 @@ from typing import Any
 
 import grpc
 import numpy as np
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import DecodeError
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.cloud_encoding import Cloud, cloud_file, packable
+from edgegrasp_client.cloud_encoding import cloud_file, packable
+from edgegrasp_client.depth_image import depth_image_fields
 from edgegrasp_client.errors import (
     DeadlineError,
     GraspClientError,
@@ -18,9 +19,19 @@ from edgegrasp_client.errors import (
     ServerFailedError,
     ServerUnavailableError,
     error_of_kind,
-    invalid,
 )
-from edgegrasp_client.results import Detection, Float32, Grasp, Model
+from edgegrasp_client.inputs import Given, Inputs
+from edgegrasp_client.option_messages import fill
+from edgegrasp_client.point_cloud2 import is_point_cloud2, point_cloud2_fields
+from edgegrasp_client.results import (
+    DebugInfo,
+    Detection,
+    Evaluation,
+    Float32,
+    Grasp,
+    Model,
+    Scoring,
+)
 
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
@@ -46,68 +57,69 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
 }
 
 
-def request_message(cloud: Cloud, options: Mapping[str, Any]) -> grasp_pb2.DetectGraspsRequest:
+def request_message(inputs: Inputs, options: Mapping[str, Any]) -> grasp_pb2.DetectGraspsRequest:
     """A request; raises InvalidRequestError for what no message can hold."""
     message = grasp_pb2.DetectGraspsRequest()
-    points = packable(cloud)
-    if points is not None:
+    _set_cloud(message, inputs)
+    fill(message.options, options, "options")
+    return message
+
+
+def score_message(
+    inputs: Inputs, given: Given, options: Mapping[str, Any]
+) -> grasp_pb2.ScoreGraspsRequest:
+    """A request to score; raises InvalidRequestError for what no message can hold."""
+    message = grasp_pb2.ScoreGraspsRequest()
+    _set_cloud(message, inputs)
+    fill(message.options, options, "options")
+    if given.edges is not None:
+        for approach, contact in given.edges.tolist():
+            edge = {"approach_index": approach, "contact_index": contact}
+            fill(message.edges.add(), edge, "edges")
+    if given.hand_poses is not None:
+        for pose in given.hand_poses:
+            message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
+    return message
+
+
+def _set_cloud(message: Any, inputs: Inputs) -> None:
+    cloud = inputs.cloud
+    if cloud is None:
+        for row, image in enumerate(inputs.depth_images or ()):
+            fields = depth_image_fields(image, row)
+            fill(message.depth_images.add(), fields, f"depth_images.{row}")
+    elif is_point_cloud2(cloud):
+        fill(message.point_cloud2, point_cloud2_fields(cloud), "point_cloud2")
+    elif (points := packable(cloud)) is not None:
         message.points = points.astype("<f4", copy=False).tobytes()
     else:
         file = cloud_file(cloud)
         message.encoded.format, message.encoded.data = file.format, file.data
-    _fill(message.options, options, "options")
-    return message
-
-
-def _fill(message: Message, fields: object, path: str) -> None:
-    """Set a message's fields to plain values."""
-    if not isinstance(fields, Mapping):
-        raise invalid(path, repr(fields)[:80], f"Give a mapping with {_known(message)}.")
-    message.SetInParent()
-    for name, value in fields.items():
-        field = message.DESCRIPTOR.fields_by_name.get(name)
-        here = f"{path}.{name}"
-        if field is None:
-            raise invalid(here, "an unknown field", f"Give {_known(message)} only.")
-        part = getattr(message, name) if field.message_type is not None else None
-        if value is None and isinstance(part, grasp_pb2.Suppression):
-            part.disabled = True
-        elif isinstance(part, grasp_pb2.Vector):
-            if not isinstance(value, list) or len(value) != 3:
-                raise invalid(here, repr(value)[:80], "Give three numbers: x, y, z.")
-            _fill(part, dict(zip("xyz", value, strict=True)), here)
-        elif part is not None:
-            _fill(part, value, here)
-        else:
-            _set(message, name, value, here)
-
-
-def _set(message: Message, name: str, value: object, path: str) -> None:
-    try:
-        setattr(message, name, value)
-    except (TypeError, ValueError) as error:
-        raise invalid(path, repr(value)[:80], f"{error}.") from None
-
-
-def _known(message: Message) -> str:
-    return ", ".join(field.name for field in message.DESCRIPTOR.fields)
+    for name, array in inputs.beside().items():
+        setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
 
 
 def detection_from_message(message: grasp_pb2.DetectGraspsResponse) -> Detection:
     """The answer to a detection."""
     return Detection(
-        grasps=[
-            Grasp(
-                score=grasp.score,
-                T_cloud_hand=_floats(grasp.T_cloud_hand).reshape(4, 4),
-                T_cloud_tcp=_floats(grasp.T_cloud_tcp).reshape(4, 4),
-                width=grasp.width,
-                approach_point=_floats(grasp.approach_point),
-                contact_point=_floats(grasp.contact_point),
-                approach_direction=_floats(grasp.approach_direction),
-                collision_free=grasp.collision_free,
+        grasps=[_grasp(grasp) for grasp in message.grasps],
+        counts=dict(message.counts),
+        seconds=dict(message.seconds),
+        model=message.model,
+        warnings=list(message.warnings),
+        debug=_debug(message.debug) if message.HasField("debug") else None,
+    )
+
+
+def scoring_from_message(message: grasp_pb2.ScoreGraspsResponse) -> Scoring:
+    """The answer to a request to score."""
+    return Scoring(
+        evaluations=[
+            Evaluation(
+                _grasp(evaluation.grasp) if evaluation.HasField("grasp") else None,
+                evaluation.reason if evaluation.HasField("reason") else None,
             )
-            for grasp in message.grasps
+            for evaluation in message.evaluations
         ],
         counts=dict(message.counts),
         seconds=dict(message.seconds),
@@ -137,3 +149,30 @@ def error_from_call(error: Any) -> GraspClientError:
 
 def _floats(values: Any) -> Float32:
     return np.array(values, dtype=np.float32)
+
+
+def _grasp(message: grasp_pb2.Grasp) -> Grasp:
+    return Grasp(
+        score=message.score,
+        T_cloud_hand=_floats(message.T_cloud_hand).reshape(4, 4),
+        T_cloud_tcp=_floats(message.T_cloud_tcp).reshape(4, 4),
+        width=message.width,
+        approach_point=_floats(message.approach_point),
+        contact_point=_floats(message.contact_point),
+        approach_direction=_floats(message.approach_direction),
+        collision_free=message.collision_free,
+        clearance=message.clearance,
+    )
+
+
+def _debug(message: grasp_pb2.DebugInfo) -> DebugInfo:
+    return DebugInfo(
+        points=_floats(message.points).reshape(-1, 3),
+        normals=_floats(message.normals).reshape(-1, 3),
+        approach_index=np.array(message.approach_index, dtype=np.int32),
+        contact_index=np.array(message.contact_index, dtype=np.int32),
+        T_cloud_hand=_floats(message.T_cloud_hand).reshape(-1, 4, 4),
+        score=_floats(message.score),
+        outcome=list(message.outcome),
+        support_plane=_floats(message.support_plane) if message.support_plane else None,
+    )

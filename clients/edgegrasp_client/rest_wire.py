@@ -1,14 +1,15 @@
 """Requests, answers and errors as HTTP carries them."""
 
+import base64
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import httpx
 import numpy as np
 
-from edgegrasp_client.cloud_encoding import Cloud, cloud_file
+from edgegrasp_client.cloud_encoding import cloud_file, npy_bytes
+from edgegrasp_client.depth_image import DepthImage, depth_image_fields
 from edgegrasp_client.errors import (
     DeadlineError,
     GraspClientError,
@@ -18,41 +19,94 @@ from edgegrasp_client.errors import (
     error_of_kind,
     invalid,
 )
-from edgegrasp_client.results import Detection, Float32, Grasp, Model
+from edgegrasp_client.inputs import Given, Inputs
+from edgegrasp_client.point_cloud2 import is_point_cloud2, point_cloud2_fields
+from edgegrasp_client.results import (
+    DebugInfo,
+    Detection,
+    Evaluation,
+    Float32,
+    Grasp,
+    Model,
+    Scoring,
+)
 
 GRASPS = "/v1/grasps"
+SCORE = "/v1/grasps:score"
 MODELS = "/v1/models"
 READY = "/health/ready"
+
+MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
+
+Part = tuple[str | None, bytes, str]  # file name, content, media type
 
 _KIND_PREFIX = "urn:edgegrasp:error:"
 
 
-@dataclass(frozen=True)
-class Post:
-    """A point cloud file as body, options as query parameters."""
+def detect_post(inputs: Inputs, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an httpx post; raises InvalidRequestError for what no request can hold.
 
-    content: bytes
-    headers: dict[str, str]
-    params: dict[str, str]
-
-
-def detect_post(cloud: Cloud, options: Mapping[str, Any]) -> Post:
-    """A request; raises InvalidRequestError for what no request can hold."""
+    A point cloud file as body and options as query parameters, or a form where there is more.
+    """
+    cloud = inputs.cloud
+    query = {name: _text(f"options.{name}", value) for name, value in options.items()}
+    short = sum(map(len, query.values())) < MAX_QUERY
+    if cloud is None or is_point_cloud2(cloud) or inputs.beside() or not short:
+        return _form(inputs, options, {})
     file = cloud_file(cloud)
-    return Post(
-        content=file.data,
-        headers={"content-type": f"application/x-{file.format}"},
-        params={name: _text(name, value) for name, value in options.items()},
-    )
+    headers = {"content-type": f"application/x-{file.format}"}
+    return {"content": file.data, "headers": headers, "params": query}
+
+
+def score_post(inputs: Inputs, given: Given, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an httpx post; raises InvalidRequestError for what no request can hold."""
+    arrays = {name: array for name, array in vars(given).items() if array is not None}
+    return _form(inputs, options, arrays)
+
+
+def _form(
+    inputs: Inputs, options: Mapping[str, Any], arrays: Mapping[str, Any]
+) -> dict[str, dict[str, Part]]:
+    parts: dict[str, Part] = {"options": _json_part("options", options)}
+    cloud = inputs.cloud
+    if cloud is None:
+        images = [depth_image_fields(image, row) for row, image in enumerate(_images(inputs))]
+        for image in images:
+            pose = image["T_cloud_camera"]
+            image["T_cloud_camera"] = [pose[start : start + 4] for start in range(0, 16, 4)]
+        parts["depth_images"] = _json_part("depth_images", images)
+    elif is_point_cloud2(cloud):
+        parts["point_cloud2"] = _json_part("point_cloud2", point_cloud2_fields(cloud))
+    else:
+        file = cloud_file(cloud)
+        name, media_type = f"cloud.{file.format}", f"application/x-{file.format}"
+        parts["cloud"] = (name, file.data, media_type)
+    for name, array in {**inputs.beside(), **arrays}.items():
+        parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
+    return {"files": parts}
+
+
+def _images(inputs: Inputs) -> Sequence[DepthImage]:
+    return inputs.depth_images or ()
+
+
+def _json_part(name: str, value: object) -> Part:
+    return None, _text(name, value).encode(), "application/json"
 
 
 def _text(name: str, value: object) -> str:
     if isinstance(value, str):
         return value
     try:
-        return json.dumps(value)
+        return json.dumps(value, default=_base64)
     except (TypeError, ValueError) as error:
-        raise invalid(f"options.{name}", repr(value)[:80], f"{error}.") from None
+        raise invalid(name, repr(value)[:80], f"{error}.") from None
+
+
+def _base64(value: object) -> str:
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    raise TypeError(f"a {type(value).__name__} is no JSON value")
 
 
 def detection_from_response(response: httpx.Response) -> Detection:
@@ -60,18 +114,28 @@ def detection_from_response(response: httpx.Response) -> Detection:
     body = _body(response)
     try:
         return Detection(
-            grasps=[
-                Grasp(
-                    score=grasp["score"],
-                    T_cloud_hand=_floats(grasp["T_cloud_hand"]),
-                    T_cloud_tcp=_floats(grasp["T_cloud_tcp"]),
-                    width=grasp["width"],
-                    approach_point=_floats(grasp["approach_point"]),
-                    contact_point=_floats(grasp["contact_point"]),
-                    approach_direction=_floats(grasp["approach_direction"]),
-                    collision_free=grasp["collision_free"],
+            grasps=[_grasp(grasp) for grasp in body["grasps"]],
+            counts=body["counts"],
+            seconds=body["seconds"],
+            model=body["model"],
+            warnings=body["warnings"],
+            debug=None if body["debug"] is None else _debug(body["debug"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise _foreign(response) from error
+
+
+def scoring_from_response(response: httpx.Response) -> Scoring:
+    """The answer to a request to score; raises a GraspClientError if it is an error."""
+    body = _body(response)
+    try:
+        return Scoring(
+            evaluations=[
+                Evaluation(
+                    None if evaluation["grasp"] is None else _grasp(evaluation["grasp"]),
+                    evaluation["reason"],
                 )
-                for grasp in body["grasps"]
+                for evaluation in body["evaluations"]
             ],
             counts=body["counts"],
             seconds=body["seconds"],
@@ -129,3 +193,31 @@ def _foreign(response: httpx.Response) -> GraspClientError:
 
 def _floats(values: Any) -> Float32:
     return np.array(values, dtype=np.float32)
+
+
+def _grasp(fields: Mapping[str, Any]) -> Grasp:
+    return Grasp(
+        score=fields["score"],
+        T_cloud_hand=_floats(fields["T_cloud_hand"]),
+        T_cloud_tcp=_floats(fields["T_cloud_tcp"]),
+        width=fields["width"],
+        approach_point=_floats(fields["approach_point"]),
+        contact_point=_floats(fields["contact_point"]),
+        approach_direction=_floats(fields["approach_direction"]),
+        collision_free=fields["collision_free"],
+        clearance=fields["clearance"],
+    )
+
+
+def _debug(fields: Mapping[str, Any]) -> DebugInfo:
+    plane = fields["support_plane"]
+    return DebugInfo(
+        points=_floats(fields["points"]).reshape(-1, 3),
+        normals=_floats(fields["normals"]).reshape(-1, 3),
+        approach_index=np.array(fields["approach_index"], dtype=np.int32),
+        contact_index=np.array(fields["contact_index"], dtype=np.int32),
+        T_cloud_hand=_floats(fields["T_cloud_hand"]).reshape(-1, 4, 4),
+        score=_floats(fields["score"]),  # null becomes NaN
+        outcome=fields["outcome"],
+        support_plane=None if plane is None else _floats(plane),
+    )

@@ -5,16 +5,27 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Detection
+from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.settings import Settings
 
 
 class Detector(Protocol):
     """Finds grasps in a cloud with one set of weights."""
 
-    def detect(self, cloud: NDArray[Any], options: DetectOptions) -> Detection:
+    def detect(self, cloud: CloudInput, options: DetectOptions) -> Detection:
         """Find grasps; raises InvalidRequest for a cloud that does not suit."""
+
+    def score(
+        self,
+        cloud: CloudInput,
+        options: DetectOptions,
+        *,
+        edges: NDArray[Any] | None = None,
+        hand_poses: NDArray[Any] | None = None,
+    ) -> Scoring:
+        """Score edges (M, 2) or hand poses (M, 4, 4); raises InvalidRequest as `detect`."""
 
 
 class Catalogue(Protocol):
@@ -43,4 +54,6 @@ def load_backend(settings: Settings) -> Catalogue:
     # Torch takes seconds to import, and the ports should answer meanwhile.
     from edgegrasp_model.catalogue import ModelCatalogue
 
-    return ModelCatalogue.load(settings.weights, default=settings.default_model)
+    return ModelCatalogue.load(
+        settings.weights, default=settings.default_model, grippers=settings.grippers
+    )

@@ -1,22 +1,23 @@
-"""Turn what arrived on the wire into an array of points; whether it suits is the detector's part.
+"""Turn what arrived on the wire into arrays; whether they suit is the detector's part.
 
 Nothing is unpickled, and no count in a header is trusted before it is compared with the bytes at
 hand: a short body cannot make the server allocate a large array.
 """
 
-import io
-import math
-import zipfile
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.errors import UnsupportedMediaType
+from edgegrasp_service.npy_file import check_count, read_npy, read_npz
 from edgegrasp_service.pcd_file import read_pcd
 from edgegrasp_service.ply_file import read_ply
+from edgegrasp_service.sent_arrays import brief
+from edgegrasp_service.xyz_file import read_xyz
 
 Array = NDArray[Any]
 
@@ -37,12 +38,12 @@ def decode_packed(data: bytes, max_points: int) -> Array:
             f"{len(data)} bytes, which are no whole number of points",
             "Send 12 bytes a point: little-endian float32 x, y, z.",
         )
-    _check_count(len(data) // 12, max_points)
+    check_count(len(data) // 12, max_points)
     return np.frombuffer(data, dtype="<f4").reshape(-1, 3)
 
 
 def decode_list(points: object, max_points: int) -> Array:
-    """Read the lists of a JSON body.
+    """Read the lists of a JSON body; a hole of an organised cloud is [null, null, null].
 
     Returns:
         The same numbers as float64, of the shape they came in.
@@ -52,8 +53,8 @@ def decode_list(points: object, max_points: int) -> Array:
         PayloadTooLarge: More than `max_points` points.
     """
     if not isinstance(points, list):
-        raise InvalidRequest("points", _brief(points), "Send a list of [x, y, z] in metres.")
-    _check_count(len(points), max_points)
+        raise InvalidRequest("points", brief(points), "Send a list of [x, y, z] in metres.")
+    check_count(len(points), max_points)
     if not points:
         return np.empty((0, 3))
     try:
@@ -62,13 +63,14 @@ def decode_list(points: object, max_points: int) -> Array:
         raise InvalidRequest(
             "points", "rows of different lengths", "Send [x, y, z] rows."
         ) from None
-    if array.dtype.kind not in "iuf":
+    check_count(array.size // 3, max_points)
+    if array.dtype.kind not in "iuf" and not _has_holes(array):
         value = next((row for row in points if not _is_numbers(row)), points[0])
-        raise InvalidRequest("points", _brief(value), "Send numbers only: [x, y, z] in metres.")
+        raise InvalidRequest("points", brief(value), "Send numbers only: [x, y, z] in metres.")
     return array.astype(np.float64)
 
 
-def decode_file(file_format: str, data: bytes, max_points: int) -> Array:
+def decode_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
     """Read a point cloud file.
 
     Args:
@@ -77,7 +79,7 @@ def decode_file(file_format: str, data: bytes, max_points: int) -> Array:
         max_points: Most points accepted.
 
     Returns:
-        The array in the file for npy and npz, of whatever shape and dtype; (N, 3) for ply and pcd.
+        The arrays in the file, of whatever shape and dtype; points (N, 3) for ply, pcd and xyz.
 
     Raises:
         InvalidRequest: The file is truncated, or no file of that format.
@@ -91,92 +93,43 @@ def decode_file(file_format: str, data: bytes, max_points: int) -> Array:
     return _DECODERS[file_format](data, max_points)
 
 
-def _decode_npy(data: bytes, max_points: int) -> Array:
-    stream = io.BytesIO(data)
-    fix = "Send what numpy.save(file, points) writes, points of shape (N, 3)."
-    try:
-        version = np.lib.format.read_magic(stream)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, fortran_order, dtype = read_header(stream)
-    except Exception:  # numpy's header parser fails on foreign bytes in a dozen ways
-        raise InvalidRequest("cloud", f"{len(data)} bytes that are no .npy file", fix) from None
-    if any(size < 0 for size in shape):
-        raise InvalidRequest("cloud", f"shape {shape}", fix)
-    if dtype.hasobject or dtype.itemsize == 0:
-        raise InvalidRequest("cloud", f"dtype {dtype}", "Send float32 or float64 metres.")
-    expected = math.prod(shape) * dtype.itemsize
-    found = len(data) - stream.tell()
-    if found != expected:
-        raise InvalidRequest(
-            "cloud",
-            f"{found} bytes of data where the .npy header, shape {shape}, promises {expected}",
-            "Send the whole file.",
-        )
-    _check_count(shape[0] if shape else 1, max_points)
-    array = np.frombuffer(data, dtype=dtype, offset=stream.tell())
-    array = array.reshape(shape, order="F" if fortran_order else "C")
-    return array.astype(dtype.newbyteorder("="), copy=False)
+def _decode_npy(data: bytes, max_points: int) -> CloudInput:
+    return CloudInput(read_npy(data, max_points))
 
 
-def _decode_npz(data: bytes, max_points: int) -> Array:
-    fix = "Send what numpy.savez(file, points=points) writes."
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {member.filename: member for member in archive.infolist()}
-            name = "points.npy" if "points.npy" in members else next(iter(members), "")
-            if name != "points.npy" and len(members) != 1:
-                found = ", ".join(sorted(members)[:5]) or "nothing"
-                raise InvalidRequest("cloud", f"an .npz file with {found}", fix)
-            # Six doubles a point and a header: more than any cloud of max_points needs.
-            if members[name].file_size > 48 * max_points + 65536:
-                raise PayloadTooLarge(
-                    "cloud",
-                    f"an array of {members[name].file_size} bytes once unpacked",
-                    f"Send at most {max_points} points.",
-                )
-            with archive.open(members[name]) as member:
-                # Bounded: without a size it unpacks all, however much more than promised that is.
-                content = member.read(members[name].file_size)
-    except (InvalidRequest, PayloadTooLarge):
-        raise
-    except Exception:  # as does zipfile
-        value = f"{len(data)} bytes that are no whole .npz file"
-        raise InvalidRequest("cloud", value, fix) from None
-    return _decode_npy(content, max_points)
+def _decode_npz(data: bytes, max_points: int) -> CloudInput:
+    return CloudInput(**read_npz(data, max_points))
 
 
-def _decode_ply(data: bytes, max_points: int) -> Array:
-    return read_ply(data, lambda count: _check_count(count, max_points))
+def _decode_ply(data: bytes, max_points: int) -> CloudInput:
+    return read_ply(data, lambda count: check_count(count, max_points))
 
 
-def _decode_pcd(data: bytes, max_points: int) -> Array:
-    return read_pcd(data, lambda count: _check_count(count, max_points))
+def _decode_pcd(data: bytes, max_points: int) -> CloudInput:
+    return read_pcd(data, lambda count: check_count(count, max_points))
 
 
-_DECODERS: dict[str, Callable[[bytes, int], Array]] = {
+def _decode_xyz(data: bytes, max_points: int) -> CloudInput:
+    return read_xyz(data, lambda count: check_count(count, max_points))
+
+
+_DECODERS: dict[str, Callable[[bytes, int], CloudInput]] = {
     "npy": _decode_npy,
     "npz": _decode_npz,
     "ply": _decode_ply,
     "pcd": _decode_pcd,
+    "xyz": _decode_xyz,
 }
 
 FILE_FORMATS = tuple(_DECODERS)
 
 
-def _check_count(count: int, max_points: int) -> None:
-    if count > max_points:
-        raise PayloadTooLarge(
-            "cloud", f"{count} points", f"Send at most {max_points} points, e.g. downsampled."
-        )
+def _has_holes(array: Array) -> bool:
+    """Whether it is organised, of numbers and None."""
+    return array.ndim == 3 and all(
+        value is None or type(value) in (int, float) for value in array.ravel().tolist()
+    )
 
 
 def _is_numbers(row: object) -> bool:
     return isinstance(row, list) and all(type(value) in (int, float) for value in row)
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."

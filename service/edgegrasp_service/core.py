@@ -5,60 +5,35 @@ import logging
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
-from numpy.typing import NDArray
-
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_model.results import Detection
-from edgegrasp_service.backend import Catalogue
-from edgegrasp_service.cloud_decoding import decode_file, decode_list, decode_packed
+from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_service.backend import Catalogue, Detector
 from edgegrasp_service.errors import DetectorFailed, NotReady
+from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.sent_cloud import SentCloud, decode_cloud
 
 logger = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class PackedCloud:
-    """Little-endian float32 x, y, z."""
-
-    data: bytes
-
-    def decode(self, max_points: int) -> NDArray[Any]:
-        """The points as an array."""
-        return decode_packed(self.data, max_points)
-
-
-@dataclass(frozen=True)
-class ListCloud:
-    """Points as the lists of a JSON body."""
-
-    points: object
-
-    def decode(self, max_points: int) -> NDArray[Any]:
-        """The points as an array."""
-        return decode_list(self.points, max_points)
-
-
-@dataclass(frozen=True)
-class FileCloud:
-    """A point cloud file."""
-
-    format: str
-    data: bytes
-
-    def decode(self, max_points: int) -> NDArray[Any]:
-        """The points as an array."""
-        return decode_file(self.format, self.data, max_points)
+Answer = TypeVar("Answer", Detection, Scoring)
 
 
 @dataclass(frozen=True)
 class DetectRequest:
     """One request, whatever transport it came by."""
 
-    cloud: PackedCloud | ListCloud | FileCloud
+    cloud: SentCloud
     options: Mapping[str, object] = field(default_factory=dict)  # as named in DetectOptions
+
+
+@dataclass(frozen=True)
+class ScoreRequest(DetectRequest):
+    """One request to score what the caller gives."""
+
+    given: GivenGrasps = field(default_factory=GivenGrasps)
 
 
 @dataclass(frozen=True)
@@ -122,15 +97,39 @@ class GraspService:
         Raises:
             EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
         """
+
+        def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Detection:
+            return detector.detect(cloud, options)
+
+        return await self._answer(request, work)
+
+    async def score(self, request: ScoreRequest) -> Scoring:
+        """Score edges or hand poses that the caller gives.
+
+        Raises:
+            EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
+        """
+        request.given.check()
+        edges, hand_poses = request.given.edges, request.given.hand_poses
+
+        def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Scoring:
+            return detector.score(cloud, options, edges=edges, hand_poses=hand_poses)
+
+        return await self._answer(request, work)
+
+    async def _answer(
+        self, request: DetectRequest, work: Callable[[Detector, CloudInput, DetectOptions], Answer]
+    ) -> Answer:
+        """Decode a request, then do the work in the worker thread."""
         catalogue = self._ready_catalogue()
         options = parse_options(dict(request.options))
         detector = catalogue.get(options.model)
         loop = asyncio.get_running_loop()
         try:
-            cloud = await loop.run_in_executor(
-                self._decoders, request.cloud.decode, self._max_points
+            cloud, options = await loop.run_in_executor(
+                self._decoders, decode_cloud, request.cloud, options, self._max_points
             )
-            return await loop.run_in_executor(self._worker, detector.detect, cloud, options)
+            return await loop.run_in_executor(self._worker, work, detector, cloud, options)
         except EdgeGraspError:
             raise
         except Exception:
@@ -163,4 +162,5 @@ class GraspService:
 
 
 def _describe(options: DetectOptions) -> str:
-    return options.model_dump_json(exclude_defaults=True)
+    """Options as JSON; lists of rows may be long."""
+    return options.model_dump_json(exclude_defaults=True)[:2000]

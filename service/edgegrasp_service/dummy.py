@@ -7,14 +7,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud import Float32, validate_cloud
-from edgegrasp_model.errors import UnknownModel
+from edgegrasp_model.cloud_input import CloudInput, check_cloud
+from edgegrasp_model.errors import InvalidRequest, UnknownModel
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_model.results import (
+    DebugInfo,
+    Detection,
+    Evaluation,
+    Float32,
+    Grasp,
+    NoGrasp,
+    Outcome,
+    Scoring,
+)
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
 GRASPS = 10  # made at most
+WARNING = "The dummy detector made these grasps up."
 
 
 class DummyDetector:
@@ -23,18 +33,18 @@ class DummyDetector:
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
 
-    def detect(self, cloud: NDArray[Any], options: DetectOptions) -> Detection:
+    def detect(self, cloud: CloudInput, options: DetectOptions) -> Detection:
         """Make up grasps, the same ones for the same cloud and options.
 
         Args:
-            cloud: (N, 3), metres.
-            options: `num_approach_points`, `min_score`, `top_k` and `seed` have an effect.
+            cloud: As for a real detector.
+            options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
 
         Raises:
             InvalidRequest: The cloud is none, as for a real detector.
         """
         start = time.perf_counter()
-        points = validate_cloud(cloud, options.num_approach_points)
+        points = check_cloud(cloud, options.num_approach_points).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), options.num_approach_points, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
@@ -49,8 +59,53 @@ class DummyDetector:
             counts={"points": len(points), "scored": len(drawn), "returned": len(grasps)},
             seconds={"total": time.perf_counter() - start},
             model=NAME,
-            warnings=["The dummy detector made these grasps up."],
+            warnings=[WARNING],
+            debug=_debug(points, drawn, scores) if options.debug else None,
         )
+
+    def score(
+        self,
+        cloud: CloudInput,
+        options: DetectOptions,
+        *,
+        edges: NDArray[Any] | None = None,
+        hand_poses: NDArray[Any] | None = None,
+    ) -> Scoring:
+        """Make up scores; an edge from a point to itself defines no grasp.
+
+        Raises:
+            InvalidRequest: The cloud is none, or an edge names a row that it does not have.
+        """
+        start = time.perf_counter()
+        checked = check_cloud(cloud)
+        random = np.random.default_rng(options.seed)
+        if edges is not None:
+            outside = ((edges < 0) | (edges >= checked.rows_sent)).any(axis=1)
+            if outside.any():
+                bad = edges[int(np.argmax(outside))].tolist()
+                fix = f"Send rows of the cloud, 0 to {checked.rows_sent - 1}."
+                raise InvalidRequest("edges", str(bad), fix)
+            contacts: list[Float32 | None] = [
+                None if approach == contact else _row(checked.points, checked.row, contact)
+                for approach, contact in edges
+            ]
+        else:
+            assert hand_poses is not None
+            contacts = list((hand_poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
+        evaluations = [
+            Evaluation(None, NoGrasp.TOO_SHORT)
+            if contact is None
+            else Evaluation(_top_down(contact, float(score)), None)
+            for contact, score in zip(
+                contacts, random.random(len(contacts), dtype=np.float32), strict=True
+            )
+        ]
+        seconds = {"total": time.perf_counter() - start}
+        counts = {
+            "points": len(checked.points),
+            "scored": len(contacts) - sum(contact is None for contact in contacts),
+        }
+        return Scoring(evaluations, counts, seconds, NAME, [WARNING])
 
 
 class DummyCatalogue:
@@ -87,4 +142,26 @@ def _top_down(point: Float32, score: float) -> Grasp:
         contact_point=point,
         approach_direction=np.array([0.0, 0.0, -1.0], dtype=np.float32),
         collision_free=True,
+        clearance=0.0,
+    )
+
+
+def _row(points: Float32, rows: NDArray[np.int64], row: int) -> Float32:
+    """A point by its row in the cloud as sent; the next one for a hole."""
+    point: Float32 = points[min(int(np.searchsorted(rows, row)), len(points) - 1)]
+    return point
+
+
+def _debug(points: Float32, drawn: NDArray[np.int64], scores: Float32) -> DebugInfo:
+    outcome = [Outcome.RETURNED] * len(drawn[:GRASPS])
+    outcome += [Outcome.NOT_SCORED] * (len(drawn) - len(outcome))
+    return DebugInfo(
+        points=points,
+        normals=np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(points), 1)),
+        approach_index=drawn,
+        contact_index=drawn,
+        T_cloud_hand=np.stack([_top_down(points[row], 0.0).T_cloud_hand for row in drawn]),
+        score=np.where(np.arange(len(drawn)) < GRASPS, scores, np.float32(np.nan)),
+        outcome=outcome,
+        support_plane=None,
     )

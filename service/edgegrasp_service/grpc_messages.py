@@ -3,14 +3,20 @@
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import Message
-from google.protobuf.unknown_fields import UnknownFieldSet
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.results import Detection, Grasp
-from edgegrasp_service.core import DetectRequest, FileCloud, ModelInfo, PackedCloud
+from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_service.core import DetectRequest, ModelInfo, ScoreRequest
 from edgegrasp_service.errors import ErrorReport
+from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.option_messages import (
+    options_from_message,
+    plain_fields,
+    refuse_unknown_fields,
+)
+from edgegrasp_service.sent_arrays import PER_POINT, PackedArray
+from edgegrasp_service.sent_cloud import DepthCloud, FileCloud, PackedCloud, RosCloud, SentCloud
 
 
 def request_from_message(message: grasp_pb2.DetectGraspsRequest) -> DetectRequest:
@@ -20,42 +26,62 @@ def request_from_message(message: grasp_pb2.DetectGraspsRequest) -> DetectReques
         InvalidRequest: It has no cloud, or a field this server does not know.
     """
     refuse_unknown_fields(message, "request")
-    options = fields_from_message(message.options)
-    match message.WhichOneof("cloud"):
+    return DetectRequest(_cloud(message), options_from_message(message.options))
+
+
+def score_request_from_message(message: grasp_pb2.ScoreGraspsRequest) -> ScoreRequest:
+    """Take a request to score apart.
+
+    Raises:
+        InvalidRequest: It has no cloud, a pose is none, or a field is not known to this server.
+    """
+    refuse_unknown_fields(message, "request")
+    edges, poses = None, None
+    if message.edges:
+        edges = np.array([(edge.approach_index, edge.contact_index) for edge in message.edges])
+    for row, pose in enumerate(message.hand_poses):
+        if len(pose.T_cloud_hand) != 16:
+            value = f"{len(pose.T_cloud_hand)} numbers"
+            raise InvalidRequest(f"hand_poses.{row}.T_cloud_hand", value, "Send 16, row-major.")
+    if message.hand_poses:
+        poses = np.array([pose.T_cloud_hand for pose in message.hand_poses]).reshape(-1, 4, 4)
+    options = options_from_message(message.options)
+    return ScoreRequest(_cloud(message), options, GivenGrasps(edges, poses))
+
+
+def _cloud(message: Any) -> SentCloud:
+    """The cloud of either request; both have it in the same fields."""
+    which = message.WhichOneof("cloud")
+    beside = {
+        name: PackedArray(getattr(message, name)) for name in PER_POINT if message.HasField(name)
+    }
+    if message.depth_images:
+        if which is not None:
+            fix = "Send one of points, encoded, point_cloud2 and depth_images."
+            raise InvalidRequest("depth_images", f"images beside {which}", fix)
+        images = [_depth_image(image, row) for row, image in enumerate(message.depth_images)]
+        return SentCloud(DepthCloud(images), beside)
+    match which:
         case "points":
-            return DetectRequest(PackedCloud(message.points), options)
+            return SentCloud(PackedCloud(message.points), beside)
         case "encoded":
-            return DetectRequest(FileCloud(message.encoded.format, message.encoded.data), options)
+            file = message.encoded
+            return SentCloud(FileCloud(file.format, file.data), beside)
+        case "point_cloud2":
+            return SentCloud(RosCloud(plain_fields(message.point_cloud2)), beside)
         case _:
-            raise InvalidRequest("cloud", "nothing", "Set `points` or `encoded`.")
+            fix = "Set `points`, `encoded`, `point_cloud2` or `depth_images`."
+            raise InvalidRequest("cloud", "nothing", fix)
 
 
-def refuse_unknown_fields(message: Message, name: str) -> None:
-    """Raise InvalidRequest for fields that are in no schema this server has, at any depth."""
-    if len(unknown := UnknownFieldSet(message)):
-        numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
-        fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
-        raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
-    for field, value in message.ListFields():
-        if isinstance(value, Message):
-            refuse_unknown_fields(value, f"{name}.{field.name}")
-
-
-def fields_from_message(message: Message) -> dict[str, object]:
-    """The fields set in an options message, as the same options are written in JSON."""
-    return {field.name: _plain(value) for field, value in message.ListFields()}
-
-
-def _plain(value: Any) -> object:
-    match value:
-        case grasp_pb2.Vector():
-            return [value.x, value.y, value.z]
-        case grasp_pb2.Suppression(disabled=True):
-            return None
-        case Message():
-            return fields_from_message(value)
-        case _:
-            return value
+def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, object]:
+    fields = plain_fields(message)
+    if len(message.T_cloud_camera) != 16:
+        value = f"{len(message.T_cloud_camera)} numbers"
+        field = f"depth_images.{row}.T_cloud_camera"
+        raise InvalidRequest(field, value, "Send 16, row-major.")
+    rows = [list(message.T_cloud_camera[start : start + 4]) for start in range(0, 16, 4)]
+    return fields | {"T_cloud_camera": rows}
 
 
 def detection_message(detection: Detection) -> grasp_pb2.DetectGraspsResponse:
@@ -66,6 +92,24 @@ def detection_message(detection: Detection) -> grasp_pb2.DetectGraspsResponse:
         seconds=detection.seconds,
         model=detection.model,
         warnings=detection.warnings,
+        debug=None if detection.debug is None else _debug_message(detection.debug),
+    )
+
+
+def scoring_message(scoring: Scoring) -> grasp_pb2.ScoreGraspsResponse:
+    """Evaluations as a message."""
+    return grasp_pb2.ScoreGraspsResponse(
+        evaluations=[
+            grasp_pb2.Evaluation(
+                grasp=None if evaluation.grasp is None else _grasp_message(evaluation.grasp),
+                reason=evaluation.reason,
+            )
+            for evaluation in scoring.evaluations
+        ],
+        counts=scoring.counts,
+        seconds=scoring.seconds,
+        model=scoring.model,
+        warnings=scoring.warnings,
     )
 
 
@@ -91,4 +135,19 @@ def _grasp_message(grasp: Grasp) -> grasp_pb2.Grasp:
         contact_point=grasp.contact_point.tolist(),
         approach_direction=grasp.approach_direction.tolist(),
         collision_free=bool(grasp.collision_free),
+        clearance=grasp.clearance,
+    )
+
+
+def _debug_message(debug: DebugInfo) -> grasp_pb2.DebugInfo:
+    plane = debug.support_plane
+    return grasp_pb2.DebugInfo(
+        points=np.ravel(debug.points).tolist(),
+        normals=np.ravel(debug.normals).tolist(),
+        approach_index=debug.approach_index.tolist(),
+        contact_index=debug.contact_index.tolist(),
+        T_cloud_hand=np.ravel(debug.T_cloud_hand).tolist(),
+        score=debug.score.tolist(),
+        outcome=debug.outcome,
+        support_plane=[] if plane is None else plane.tolist(),
     )

@@ -3,6 +3,7 @@
 import logging
 from typing import Any, NoReturn
 
+from google.protobuf.message import Message
 from grpc import aio
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
@@ -16,6 +17,8 @@ from edgegrasp_service.grpc_messages import (
     error_message,
     models_message,
     request_from_message,
+    score_request_from_message,
+    scoring_message,
 )
 
 logger = logging.getLogger(__name__)
@@ -36,9 +39,18 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
     ) -> grasp_pb2.DetectGraspsResponse:
         """Find grasps in one cloud."""
         try:
-            if (size := request.ByteSize()) > self._max_body_bytes:
-                raise too_large(size, self._max_body_bytes)
+            self._check_size(request)
             return detection_message(await self._service.detect(request_from_message(request)))
+        except Exception as error:
+            await _abort(context, error)
+
+    async def ScoreGrasps(  # noqa: N802
+        self, request: grasp_pb2.ScoreGraspsRequest, context: Any
+    ) -> grasp_pb2.ScoreGraspsResponse:
+        """Score given edges or hand poses."""
+        try:
+            self._check_size(request)
+            return scoring_message(await self._service.score(score_request_from_message(request)))
         except Exception as error:
             await _abort(context, error)
 
@@ -50,6 +62,10 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
             return models_message(self._service.models())
         except Exception as error:
             await _abort(context, error)
+
+    def _check_size(self, request: Message) -> None:
+        if (size := request.ByteSize()) > self._max_body_bytes:
+            raise too_large(size, self._max_body_bytes)
 
 
 class GrpcServer:

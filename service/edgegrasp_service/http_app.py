@@ -2,6 +2,7 @@
 
 import http
 import logging
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse
@@ -17,11 +18,14 @@ from edgegrasp_service.http_bodies import (
     HealthBody,
     ModelsBody,
     ProblemBody,
+    ScoringBody,
     detection_body,
     models_body,
     problem_body,
+    scoring_body,
 )
-from edgegrasp_service.http_request import OPENAPI_REQUEST, read_request
+from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
+from edgegrasp_service.http_request import read_request, read_score_request
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +36,14 @@ Metres, radians, seconds. Positions and directions are in the frame of the cloud
 the field, the value received and the fix."""
 
 PROBLEM = {"content": {"application/problem+json": {"schema": ProblemBody.model_json_schema()}}}
+
+PROBLEMS: dict[int | str, dict[str, Any]] = {
+    400: {"description": "The cloud or an option is wrong.", **PROBLEM},
+    404: {"description": "No weights of that name.", **PROBLEM},
+    413: {"description": "Over the server's limits.", **PROBLEM},
+    415: {"description": "A body the server does not read.", **PROBLEM},
+    503: {"description": "Weights are loading, or the server is stopping.", **PROBLEM},
+}
 
 
 def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
@@ -46,20 +58,25 @@ def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
         "/v1/grasps",
         summary="Find grasps in one cloud",
         response_model=DetectionBody,
-        responses={
-            400: {"description": "The cloud or an option is wrong.", **PROBLEM},
-            404: {"description": "No weights of that name.", **PROBLEM},
-            413: {"description": "Over the server's limits.", **PROBLEM},
-            415: {"description": "A body the server does not read.", **PROBLEM},
-            503: {"description": "Weights are loading, or the server is stopping.", **PROBLEM},
-        },
-        openapi_extra=OPENAPI_REQUEST,
+        responses=PROBLEMS,
+        openapi_extra=OPENAPI_DETECT,
     )
     async def detect_grasps(request: Request) -> JSONResponse:
-        if not service.ready:  # before reading what would be read in vain
-            raise NotReady("Weights are still loading, or the server is stopping.")
+        _require_ready(service)
         detection = await service.detect(await read_request(request))
         return JSONResponse(detection_body(detection))
+
+    @app.post(
+        "/v1/grasps:score",
+        summary="Score edges or hand poses in one cloud",
+        response_model=ScoringBody,
+        responses=PROBLEMS,
+        openapi_extra=OPENAPI_SCORE,
+    )
+    async def score_grasps(request: Request) -> JSONResponse:
+        _require_ready(service)
+        scoring = await service.score(await read_score_request(request))
+        return JSONResponse(scoring_body(scoring))
 
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
     async def list_models() -> JSONResponse:
@@ -81,6 +98,12 @@ def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
         return JSONResponse({"status": "not ready"}, status_code=503)
 
     return app
+
+
+def _require_ready(service: GraspService) -> None:
+    """Raise NotReady before reading what would be read in vain."""
+    if not service.ready:
+        raise NotReady("Weights are still loading, or the server is stopping.")
 
 
 async def _answer_error(request: Request, error: Exception) -> JSONResponse:

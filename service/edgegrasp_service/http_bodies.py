@@ -1,12 +1,13 @@
 """Bodies of the HTTP answers: what the OpenAPI document promises, and how they are written."""
 
+import math
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_model.results import DebugInfo, Detection, Grasp, NoGrasp, Outcome, Scoring
 from edgegrasp_service.core import ModelInfo
 from edgegrasp_service.errors import ErrorReport
 
@@ -33,13 +34,49 @@ class GraspBody(_Body):
     approach_point: Vector = Field(description="p_a, metres, cloud frame")
     contact_point: Vector = Field(description="p_c, metres, cloud frame")
     approach_direction: Vector = Field(description="unit, the direction the hand moves; its +z")
-    collision_free: bool = Field(description="whether the open hand meets no point of the cloud")
+    collision_free: bool = Field(
+        description="whether the open hand meets nothing at the grasp and on its ways"
+    )
+    clearance: float = Field(
+        description="metres from the open hand at the grasp to the nearest thing; 0 or less: within"
+    )
+
+
+class DebugBody(_Body):
+    """The processed cloud and every candidate, whatever became of it."""
+
+    points: list[Vector] = Field(description="metres, cloud frame")
+    normals: list[Vector] = Field(description="unit")
+    approach_index: list[int] = Field(description="p_a of each candidate, rows of points")
+    contact_index: list[int] = Field(description="p_c of each candidate, rows of points")
+    T_cloud_hand: list[Matrix] = Field(description="of each candidate")
+    score: list[float | None] = Field(description="of each candidate; null: not scored")
+    outcome: list[Outcome] = Field(description="of each candidate")
+    support_plane: Row | None = Field(description="unit normal and offset, metres")
 
 
 class DetectionBody(_Body):
     """Ranked grasps of one cloud, and how they came about."""
 
     grasps: list[GraspBody] = Field(description="best first")
+    counts: dict[str, int] = Field(description="what passed each stage")
+    seconds: dict[str, float] = Field(description="spent in each stage, and their total")
+    model: str = Field(description="name of the weights used")
+    warnings: list[str]
+    debug: DebugBody | None = Field(description="null but where options.debug is set")
+
+
+class EvaluationBody(_Body):
+    """What the network says of one edge or hand pose."""
+
+    grasp: GraspBody | None = Field(description="null where it defines none")
+    reason: NoGrasp | None = Field(description="why it defines none")
+
+
+class ScoringBody(_Body):
+    """Evaluations of what the caller gave."""
+
+    evaluations: list[EvaluationBody] = Field(description="in the order of the request")
     counts: dict[str, int] = Field(description="what passed each stage")
     seconds: dict[str, float] = Field(description="spent in each stage, and their total")
     model: str = Field(description="name of the weights used")
@@ -94,7 +131,20 @@ def detection_body(detection: Detection) -> dict[str, object]:
         "seconds": detection.seconds,
         "model": detection.model,
         "warnings": detection.warnings,
+        "debug": None if detection.debug is None else _debug_body(detection.debug),
     }
+
+
+def scoring_body(scoring: Scoring) -> dict[str, object]:
+    """Evaluations as ScoringBody."""
+    evaluations = [
+        {
+            "grasp": None if evaluation.grasp is None else _grasp_body(evaluation.grasp),
+            "reason": evaluation.reason,
+        }
+        for evaluation in scoring.evaluations
+    ]
+    return vars(scoring) | {"evaluations": evaluations}
 
 
 def models_body(models: list[ModelInfo]) -> dict[str, object]:
@@ -125,6 +175,22 @@ def _grasp_body(grasp: Grasp) -> dict[str, object]:
         "contact_point": _floats(grasp.contact_point),
         "approach_direction": _floats(grasp.approach_direction),
         "collision_free": bool(grasp.collision_free),
+        "clearance": _float32(grasp.clearance),
+    }
+
+
+def _debug_body(debug: DebugInfo) -> dict[str, object]:
+    scores = debug.score.tolist()
+    plane = debug.support_plane
+    return {
+        "points": _floats(debug.points),
+        "normals": _floats(debug.normals),
+        "approach_index": debug.approach_index.tolist(),
+        "contact_index": debug.contact_index.tolist(),
+        "T_cloud_hand": _floats(debug.T_cloud_hand),
+        "score": [None if math.isnan(score) else score for score in scores],
+        "outcome": debug.outcome,
+        "support_plane": None if plane is None else _floats(plane),
     }
 
 

@@ -1,7 +1,8 @@
-"""Read the body of POST /v1/grasps: JSON, a point cloud file, or a form with a file."""
+"""Read the bodies of the POST routes: JSON, a point cloud file, or a form with parts."""
 
 import json
 from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import PurePath
 from typing import Any
 
@@ -10,74 +11,163 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.cloud_decoding import FILE_FORMATS
-from edgegrasp_service.core import DetectRequest, FileCloud, ListCloud
+from edgegrasp_service.core import DetectRequest, ScoreRequest
 from edgegrasp_service.errors import UnsupportedMediaType
+from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.npy_file import read_npy
 from edgegrasp_service.options_text import options_from_query
+from edgegrasp_service.sent_arrays import (
+    PER_POINT,
+    ListArray,
+    NpyArray,
+    SentArray,
+    array_from_lists,
+    brief,
+)
+from edgegrasp_service.sent_cloud import (
+    DepthCloud,
+    FileCloud,
+    ListCloud,
+    RosCloud,
+    SentCloud,
+    Source,
+)
 
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
-ACCEPTED = ", ".join(["application/json", *FILE_TYPES, "multipart/form-data"])
+JSON_OR_FORM = ("application/json", "multipart/form-data")
+MAX_PART_BYTES = 2**31
+
+# Clouds of a JSON body; a form has the part `cloud`, a file, in the place of `points`.
+SOURCES: dict[str, Callable[[Any], Source | DepthCloud]] = {
+    "points": ListCloud,
+    "point_cloud2": RosCloud,
+    "depth_images": DepthCloud,
+}
+GIVEN = ("edges", "hand_poses")
 
 
 async def read_request(request: Request) -> DetectRequest:
-    """Read one request.
+    """Read one request for a detection.
 
     Raises:
         InvalidRequest: The body is not what its content type says, or has unknown fields.
         UnsupportedMediaType: There is no reader for the content type.
         PayloadTooLarge: The body exceeds the server's limit.
     """
-    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    media_type = _media_type(request)
     if media_type in FILE_TYPES:
-        cloud = FileCloud(FILE_TYPES[media_type], await request.body())
+        cloud = SentCloud(FileCloud(FILE_TYPES[media_type], await request.body()))
         return DetectRequest(cloud, options_from_query(request.query_params.multi_items()))
+    accepted = (JSON_OR_FORM[0], *FILE_TYPES, JSON_OR_FORM[1])
+    return _request(await _read_fields(request, media_type, accepted, given=()))
+
+
+async def read_score_request(request: Request) -> ScoreRequest:
+    """Read one request to score edges or hand poses; raises as `read_request`."""
+    fields = await _read_fields(request, _media_type(request), JSON_OR_FORM, GIVEN)
+    arrays = {name: _given(name, fields.pop(name)) for name in GIVEN if name in fields}
+    detect = _request(fields)
+    return ScoreRequest(detect.cloud, detect.options, GivenGrasps(**arrays))
+
+
+def _media_type(request: Request) -> str:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def _read_fields(
+    request: Request, media_type: str, accepted: tuple[str, ...], given: tuple[str, ...]
+) -> dict[str, Any]:
+    """The fields of a JSON body, or the parts of a form."""
+    if media_type not in accepted:
+        fix = f"Send one of: {', '.join(accepted)}."
+        raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
     if request.query_params:
         name = next(iter(request.query_params))
         raise InvalidRequest(name, "a query parameter", "Send options in the part `options`.")
     if media_type == "application/json":
-        return _from_json(await request.body())
-    if media_type == "multipart/form-data":
-        return await _from_form(request)
-    raise UnsupportedMediaType("Content-Type", repr(media_type), f"Send one of: {ACCEPTED}.")
-
-
-def _from_json(body: bytes) -> DetectRequest:
-    fields = _object("body", body)
-    for name in fields:
-        if name not in ("points", "options"):
-            raise InvalidRequest(name, "an unknown field", "Send points and options only.")
-    if "points" not in fields:
-        raise InvalidRequest("points", "nothing", "Send a list of [x, y, z] in metres.")
-    options = fields.get("options", {})
-    if not isinstance(options, dict):
-        raise InvalidRequest("options", repr(options)[:80], "Send a JSON object.")
-    return DetectRequest(ListCloud(fields["points"]), options)
-
-
-async def _from_form(request: Request) -> DetectRequest:
+        fields = _object("body", await request.body())
+        _refuse_unknown(fields, (*SOURCES, *PER_POINT, *given, "options"), "field")
+        return fields
+    known = ("cloud", *list(SOURCES)[1:], *PER_POINT, *given, "options")
     try:
-        async with request.form(max_files=2, max_fields=2) as form:
-            return await _from_parts(form)
+        # The body as a whole is limited already, so its parts need not be.
+        many = len(known) + 1
+        async with request.form(
+            max_files=many, max_fields=many, max_part_size=MAX_PART_BYTES
+        ) as form:
+            return await _from_parts(form, known)
     except HTTPException as error:
         fix = "Send a file part `cloud` and a JSON part `options`."
         raise InvalidRequest("body", f"a form that cannot be read ({error.detail})", fix) from None
 
 
-async def _from_parts(form: FormData) -> DetectRequest:
+async def _from_parts(form: FormData, known: tuple[str, ...]) -> dict[str, Any]:
+    """The parts of a form: files as FileCloud and NpyArray, JSON as what it says."""
+    _refuse_unknown(form, known, "part")
     for name, count in Counter(name for name, _ in form.multi_items()).items():
-        if name not in ("cloud", "options"):
-            raise InvalidRequest(name, "an unknown part", "Send cloud and options only.")
         if count > 1:
             raise InvalidRequest(name, f"{count} parts", "Send one.")
-    upload, options = form.get("cloud"), form.get("options", "{}")
-    if not isinstance(upload, UploadFile):
-        raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-    # curl sends `-F options=@file;type=application/json` as a file too.
-    text = await options.read() if isinstance(options, UploadFile) else options.encode()
-    return DetectRequest(
-        FileCloud(_format_of(upload), await upload.read()), _object("options", text)
-    )
+    fields: dict[str, Any] = {}
+    for name, part in form.items():
+        if name == "cloud":
+            if not isinstance(part, UploadFile):
+                raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+            fields["cloud"] = FileCloud(_format_of(part), await part.read())
+            continue
+        # curl sends `-F options=@file;type=application/json` as a file too.
+        data = await part.read() if isinstance(part, UploadFile) else part.encode()
+        if isinstance(part, UploadFile) and _format_of(part) == "npy" and name != "options":
+            fields[name] = NpyArray(data)
+        else:
+            fields[name] = _json(name, data)
+    return fields
+
+
+def _request(fields: dict[str, Any]) -> DetectRequest:
+    options = fields.get("options", {})
+    if not isinstance(options, dict):
+        raise InvalidRequest("options", brief(options), "Send a JSON object.")
+    beside: dict[str, SentArray] = {}
+    for name in PER_POINT:
+        if fields.get(name) is not None:
+            array = fields[name]
+            beside[name] = array if isinstance(array, NpyArray) else ListArray(array)
+    return DetectRequest(SentCloud(_source(fields), beside), options)
+
+
+def _source(fields: Mapping[str, Any]) -> Source | DepthCloud:
+    sources = [name for name in ("cloud", *SOURCES) if fields.get(name) is not None]
+    if not sources:
+        fix = "Send a list of [x, y, z] in metres, point_cloud2, depth_images or a file `cloud`."
+        raise InvalidRequest("points", "nothing", fix)
+    if len(sources) > 1:
+        value = f"a cloud beside {sources[0]}"
+        raise InvalidRequest(sources[1], value, "Send one cloud.")
+    name = sources[0]
+    if isinstance(fields[name], NpyArray):
+        raise InvalidRequest(name, "an .npy file", "Send JSON, or the part `cloud`.")
+    if name == "cloud":
+        file: FileCloud = fields[name]
+        return file
+    source: Source | DepthCloud = SOURCES[name](fields[name])
+    return source
+
+
+def _given(name: str, value: object) -> Any:
+    if value is None:
+        return None
+    if isinstance(value, NpyArray):
+        return read_npy(value.data, 2**31, name)
+    return array_from_lists(name, value)
+
+
+def _refuse_unknown(fields: Mapping[str, Any], known: tuple[str, ...], kind: str) -> None:
+    for name in fields:
+        if name not in known:
+            *names, last = known
+            fix = f"Send {', '.join(names)} and {last} only."
+            raise InvalidRequest(name, f"an unknown {kind}", fix)
 
 
 def _format_of(upload: UploadFile) -> str:
@@ -87,64 +177,14 @@ def _format_of(upload: UploadFile) -> str:
 
 
 def _object(field: str, text: bytes) -> dict[str, Any]:
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
+    value = _json(field, text)
     if not isinstance(value, dict):
-        raise InvalidRequest(field, repr(value)[:80], "Send a JSON object.")
+        raise InvalidRequest(field, brief(value), "Send a JSON object.")
     return value
 
 
-def _openapi_request() -> dict[str, Any]:
-    options = DetectOptions.model_json_schema(ref_template="#/components/schemas/{model}")
-    # Inline, so that the document needs no component the framework does not know of.
-    definitions = options.pop("$defs", {})
-    options = _inlined(options, definitions)
-    point = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
-    points = {"type": "array", "items": point, "description": "x, y, z in metres"}
-    body = {
-        "type": "object",
-        "required": ["points"],
-        "additionalProperties": False,
-        "properties": {"points": points, "options": options},
-    }
-    form = {
-        "type": "object",
-        "required": ["cloud"],
-        "properties": {"cloud": {"type": "string", "format": "binary"}, "options": options},
-    }
-    file = {"schema": {"type": "string", "format": "binary"}}
-    content: dict[str, Any] = {"application/json": {"schema": body}}
-    content |= dict.fromkeys(FILE_TYPES, file)
-    content["multipart/form-data"] = {
-        "schema": form,
-        "encoding": {"options": {"contentType": "application/json"}},
-    }
-    note = "With a point cloud file as body. As JSON; lists of numbers also as 0.1,0.2,0.3."
-    parameters = [
-        {
-            "name": name,
-            "in": "query",
-            "required": False,
-            "description": f"{schema.get('description', '')}. {note}",
-            "content": {"application/json": {"schema": schema}},
-        }
-        for name, schema in options["properties"].items()
-    ]
-    return {"requestBody": {"required": True, "content": content}, "parameters": parameters}
-
-
-def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
-    if isinstance(schema, list):
-        return [_inlined(item, definitions) for item in schema]
-    if not isinstance(schema, dict):
-        return schema
-    if "$ref" in schema:
-        target = definitions[schema["$ref"].rpartition("/")[2]]
-        rest = {name: value for name, value in schema.items() if name != "$ref"}
-        return _inlined(target | rest, definitions)
-    return {name: _inlined(value, definitions) for name, value in schema.items()}
-
-
-OPENAPI_REQUEST = _openapi_request()
+def _json(field: str, text: bytes) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None

@@ -8,7 +8,7 @@ from edgegrasp_model.options import DetectOptions
 
 
 def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, object]:
-    """Decode query parameters, one an option.
+    """Decode query parameters, or what the command line takes; one an option.
 
     A value is JSON (`seed=3`, `suppression=null`, `workspace={"min":[0,0,0],"max":[1,1,1]}`),
     numbers between commas (`viewpoint=0.1,0.2,0.3`), or else the text itself
@@ -29,6 +29,8 @@ def _value(name: str, text: str) -> object:
     field = DetectOptions.model_fields.get(name)
     if field is not None and field.annotation is str:
         return text  # weights may be named 7 or null
+    if name == "gripper" and not text.startswith("{") and text != "null":
+        return text
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

@@ -3,15 +3,21 @@
 import struct
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_service.errors import DecoderMissing
-from edgegrasp_service.point_records import read_ascii_records, read_binary_records
+from edgegrasp_service.point_records import (
+    columns,
+    read_ascii_records,
+    read_binary_records,
+    unpacked_colors,
+)
 
 SCALARS = {
     "F4": "<f4", "F8": "<f8",
@@ -19,18 +25,21 @@ SCALARS = {
     "U1": "<u1", "U2": "<u2", "U4": "<u4", "U8": "<u8",
 }  # fmt: skip
 MAX_HEADER_LINE = 16384
+NORMALS = ("normal_x", "normal_y", "normal_z")
+COLORS = ("rgb", "rgba")  # packed in 4 bytes
 FIX = "Send a whole PCD file with the fields x, y and z."
 
 
-def read_pcd(data: bytes, check_count: Callable[[int], None]) -> NDArray[Any]:
-    """Read x, y, z of the points.
+def read_pcd(data: bytes, check_count: Callable[[int], None]) -> CloudInput:
+    """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb where there are any.
 
     Args:
         data: The file's bytes.
         check_count: Called with the promised number of points before any is read.
 
     Returns:
-        (N, 3) of the type the file declares.
+        Arrays (N, 3), or points (H, W, 3) where the file is organised; points of the type the
+        file declares.
 
     Raises:
         InvalidRequest: The file is truncated, or no PCD file.
@@ -40,15 +49,33 @@ def read_pcd(data: bytes, check_count: Callable[[int], None]) -> NDArray[Any]:
     count, record = _layout(header)
     check_count(count)
     encoding = " ".join(header["DATA"])
+    if encoding == "binary_compressed":
+        return _organised(_read_compressed(data, body, count, record), header)
     if encoding == "binary":
         rows = read_binary_records(body, record, count, "PCD")
     elif encoding == "ascii":
         rows = read_ascii_records(body, record, count, "PCD")
-    elif encoding == "binary_compressed":
-        return _read_compressed(data, body, count, record)
     else:
         raise _invalid(f"a PCD file with DATA {encoding[:40]!r}")
-    return np.stack([rows[axis] for axis in "xyz"], axis=1)
+    packed = next((rows[name] for name in COLORS if name in (record.names or ())), None)
+    cloud = CloudInput(
+        points=columns(rows, ("x", "y", "z")),
+        normals=columns(rows, NORMALS),
+        colors=unpacked_colors(packed) if packed is not None and packed.itemsize == 4 else None,
+    )
+    return _organised(cloud, header)
+
+
+def _organised(cloud: CloudInput, header: dict[str, list[str]]) -> CloudInput:
+    """The cloud with its points in rows and columns, if the header promises several rows."""
+    sizes = [header.get(name, ["1"])[:1] or ["1"] for name in ("HEIGHT", "WIDTH")]
+    points = np.asarray(cloud.points)
+    if not all(size[0].isdecimal() and len(size[0]) < 10 for size in sizes):
+        return cloud
+    height, width = (int(size[0]) for size in sizes)
+    if height < 2 or height * width != len(points):
+        return cloud
+    return replace(cloud, points=points.reshape(height, width, 3))
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -80,13 +107,15 @@ def _layout(header: dict[str, list[str]]) -> tuple[int, np.dtype[Any]]:
     for column, (name, (kind, size, repeat)) in enumerate(zip(names, kinds, strict=True)):
         if kind + size not in SCALARS or not repeat.isdecimal() or not 1 <= int(repeat) <= 1000:
             raise _invalid(f"a PCD field of TYPE {kind[:8]}, SIZE {size[:8]}, COUNT {repeat[:8]}")
-        # Fields other than the coordinates may share a name, or hold several numbers.
-        labels = [name] if name in "xyz" else [f"{column}.{part}" for part in range(int(repeat))]
+        # Fields that are not read may share a name, or hold several numbers.
+        known = name in ("x", "y", "z", *NORMALS, *COLORS) and names.count(name) == 1
+        known = known and (repeat == "1" or name in "xyz")
+        labels = [name] if known else [f"{column}.{part}" for part in range(int(repeat))]
         fields += [(label, SCALARS[kind + size]) for label in labels]
     return int(points[0]), np.dtype(fields)
 
 
-def _read_compressed(data: bytes, body: bytes, count: int, record: np.dtype[Any]) -> NDArray[Any]:
+def _read_compressed(data: bytes, body: bytes, count: int, record: np.dtype[Any]) -> CloudInput:
     sizes = struct.unpack_from("<II", body) if len(body) >= 8 else (0, 0)
     if len(body) - 8 < sizes[0] or sizes[1] != count * record.itemsize:
         raise _invalid(f"{len(body)} bytes of compressed data, which are not all of a PCD file")
@@ -102,10 +131,15 @@ def _read_compressed(data: bytes, body: bytes, count: int, record: np.dtype[Any]
         path = Path(folder) / "cloud.pcd"
         path.write_bytes(data)
         with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            points = np.asarray(open3d.io.read_point_cloud(path).points)
-    if len(points) != count:
-        raise _invalid(f"a PCD file of {len(points)} points where its header promises {count}")
-    return points
+            cloud = open3d.io.read_point_cloud(path)
+    if len(cloud.points) != count:
+        value = f"a PCD file of {len(cloud.points)} points where its header promises {count}"
+        raise _invalid(value)
+    return CloudInput(
+        points=np.asarray(cloud.points),
+        normals=np.asarray(cloud.normals) if cloud.has_normals() else None,
+        colors=np.asarray(cloud.colors) if cloud.has_colors() else None,
+    )
 
 
 def _invalid(value: str) -> InvalidRequest:

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.point_records import read_ascii_records, read_binary_records
+from edgegrasp_service.point_records import columns, read_ascii_records, read_binary_records
 
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -23,15 +23,15 @@ BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"binary_little_endian": "<", "binar
 FIX = "Send a whole PLY file with vertices of float x, y, z."
 
 
-def read_ply(data: bytes, check_count: Callable[[int], None]) -> NDArray[Any]:
-    """Read x, y, z of the vertices.
+def read_ply(data: bytes, check_count: Callable[[int], None]) -> CloudInput:
+    """Read x, y, z of the vertices, and nx, ny, nz and red, green, blue where there are any.
 
     Args:
         data: The file's bytes.
         check_count: Called with the promised number of vertices before any is read.
 
     Returns:
-        (N, 3) of the type the file declares.
+        Arrays (N, 3) of the types the file declares.
 
     Raises:
         InvalidRequest: The file is truncated, or no PLY file with vertices.
@@ -50,7 +50,11 @@ def read_ply(data: bytes, check_count: Callable[[int], None]) -> NDArray[Any]:
         rows = read_ascii_records(body, record, count, "PLY")
     else:
         raise _invalid(f"a PLY file of format {encoding[:40]!r}")
-    return np.stack([rows[axis] for axis in "xyz"], axis=1)
+    return CloudInput(
+        points=columns(rows, ("x", "y", "z")),
+        normals=columns(rows, ("nx", "ny", "nz")),
+        colors=columns(rows, ("red", "green", "blue")),
+    )
 
 
 def _vertex_records(lines: list[list[str]]) -> tuple[int, np.dtype[Any]]:

@@ -50,3 +50,23 @@ def read_ascii_records(
         for column, name in enumerate(names):
             rows[name] = table[:, column]
     return rows
+
+
+def columns(rows: NDArray[np.void], names: tuple[str, ...]) -> NDArray[Any] | None:
+    """Fields of the rows side by side; None where one of them is missing."""
+    if not set(names) <= set(rows.dtype.names or ()):
+        return None
+    return np.stack([rows[name] for name in names], axis=-1)
+
+
+def unpacked_colors(packed: NDArray[Any]) -> NDArray[np.uint8]:
+    """Red, green and blue out of 0x00RRGGBB, which PCL and ROS keep in a float32 or uint32.
+
+    Args:
+        packed: (...) of 4 bytes each, native byte order.
+
+    Returns:
+        (..., 3)
+    """
+    values = np.ascontiguousarray(packed).view(np.uint32)
+    return np.stack([values >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)

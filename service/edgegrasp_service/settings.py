@@ -28,6 +28,9 @@ class Settings(BaseSettings):
     weights: tuple[Path, ...] = Field(
         default=(), description="weights files or folders of them, besides those that ship"
     )
+    grippers: tuple[Path, ...] = Field(
+        default=(), description="gripper files (.toml), named by their stem in requests"
+    )
     default_model: str = Field(default="", description="weights used when a request names none")
     max_body_bytes: int = Field(
         default=32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
+from edgegrasp_model.options import DetectOptions
 
 
 @pytest.fixture
@@ -36,17 +37,40 @@ def test_json_is_that_of_the_http_api(transport: str, file: str, dummy_server) -
 
 
 def test_every_option(file: str, dummy_server) -> None:
-    options = (
-        "--model dummy --num-approach-points 12 --num-candidates 9 --sampling uniform --seed 4 "
-        "--viewpoint 0 0 -0.5 --up 0 0 1 --support 0 0 1 -0.1 --workspace -1 -1 -1 1 1 1 "
-        "--collision ignore --min-score 0.1 --top-k 2 --suppression 0 0 --timeout 20"
+    flags = (
+        "--model dummy --gripper panda --num-approach-points 12 --num-candidates 9 "
+        "--sampling uniform --seed 4 --viewpoint -0.1,0,-0.5 --up 0,0,1 "
+        '--support {"kind":"ransac","distance":0.01} '
+        '--workspace {"min":[-1,-1,-1],"max":[1,1,1]} '
+        '--approach-region {"exclude":[{"kind":"indices","indices":[1,2]}]} '
+        '--contact-region {"include":[{"kind":"sphere","center":[0,0,0],"radius":1}]} '
+        '--approach-direction {"preset":"side"} --collision {"margin":0.001} '
+        "--min-score 0.1 --top-k 2 --suppression null --order highest --debug --timeout 20"
     )
-    server = ("--server", dummy_server.grpc_address)
-    code, output = run("detect", file, *server, "--json", *options.split())
-    assert code == 0
-    document = json.loads(output)
-    assert len(document["grasps"]) == 2
-    assert document["counts"]["scored"] == 12
+    given = {word[2:].replace("-", "_") for word in flags.split() if word.startswith("--")}
+    assert given - {"timeout"} == set(DetectOptions.model_fields)
+    for address in (dummy_server.grpc_address, dummy_server.http_url):
+        code, output = run("detect", file, "--server", address, "--json", *flags.split())
+        assert code == 0
+        document = json.loads(output)
+        assert len(document["grasps"]) == 2
+        assert document["counts"]["scored"] == 12
+        assert len(document["debug"]["outcome"]) == len(document["debug"]["score"]) == 12
+        assert document["debug"]["score"][-1] is None
+
+
+def test_options_file(file: str, dummy_server, tmp_path: Path) -> None:
+    options = tmp_path / "options.json"
+    options.write_text(json.dumps({"top_k": 4, "seed": 3, "collision": {"mode": "penalise"}}))
+    server = ("--server", dummy_server.grpc_address, "--json", "--options", str(options))
+    assert len(json.loads(run("detect", file, *server)[1])["grasps"]) == 4
+    code, output = run("detect", file, *server, "--top-k", "2")
+    assert (code, len(json.loads(output)["grasps"])) == (0, 2)
+    for text, sentence in (("[]", "a JSON object is needed"), ("{", "Expecting property name")):
+        options.write_text(text)
+        code, output = run("detect", file, *server)
+        assert code == 1
+        assert sentence in output
 
 
 def test_table(file: str, dummy_server) -> None:
@@ -61,7 +85,16 @@ def test_table(file: str, dummy_server) -> None:
     [
         (["--seed", "-1"], "options.seed: got -1."),
         (["--model", "resnet"], "options.model: got 'resnet'. Use one of: dummy."),
-        (["--workspace", "1", "0", "0", "0", "1", "1"], "options.workspace: got"),
+        (
+            ["--workspace", '{"min":[1,0,0],"max":[0,1,1]}'],
+            "options.workspace: got",
+        ),
+        (["--up", "0,0"], "options.up: got [0.0, 0.0]. Give three numbers: x, y, z."),
+        (["--collision", "dodge"], "options.collision.mode: got 'dodge'."),
+        (
+            ["--approach-region", '{"include":[{"kind":"cube"}]}'],
+            "options.approach_region.include.0: got 'cube'. Set its kind to one of box,",
+        ),
     ],
 )
 def test_bad_options(options: list[str], sentence: str, file: str, dummy_server) -> None:
@@ -74,7 +107,7 @@ def test_bad_options(options: list[str], sentence: str, file: str, dummy_server)
     ("name", "content", "sentence"),
     [
         ("absent.npy", None, "No such file"),
-        ("cloud.xyz", b"0 0 0", "Send one of: npy, npz, ply, pcd."),
+        ("cloud.las", b"0 0 0", "Send one of: npy, npz, ply, pcd, xyz."),
         ("cloud.npy", b"foreign", "cloud: got 7 bytes that are no .npy file."),
     ],
 )

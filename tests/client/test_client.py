@@ -77,6 +77,16 @@ def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
 
 ALL_OPTIONS: dict[str, Any] = {
     "model": "dummy",
+    "gripper": {
+        "name": "mine",
+        "max_opening": np.float32(0.07),
+        "tip_z": 0.1,
+        "contact_z": 0.09,
+        "tcp_z": 0.08,
+        "hand": {"boxes": [[[-0.1, -0.1, -0.1], [0.1, 0.1, 0.05]]]},
+        "finger": {"boxes": np.array([[[-0.01, 0.0, 0.05], [0.01, 0.01, 0.1]]])},
+        "swing": None,
+    },
     "num_approach_points": np.int64(12),
     "num_candidates": 100,
     "sampling": "uniform",
@@ -85,10 +95,24 @@ ALL_OPTIONS: dict[str, Any] = {
     "up": (0, 0, 2),
     "support": {"normal": np.array([0.0, 0.0, 1.0]), "offset": np.float32(-0.05)},
     "workspace": {"min": [-1, -1, -1], "max": (1, 1, 1)},
-    "collision": "penalise",
+    "approach_region": {
+        "include": [
+            {"kind": "mask", "mask": np.arange(500) % 2 == 0},
+            {"kind": "indices", "indices": np.arange(10)},
+            {"kind": "half_space", "normal": (0, 0, 1), "offset": 0},
+        ]
+    },
+    "contact_region": {"exclude": ({"kind": "segments", "ids": np.array([3, -1])},)},
+    "approach_direction": {"cones": [{"direction": (0, 0, -1), "max_angle": 1}], "preset": None},
+    "collision": {
+        "mode": "penalise",
+        "obstacles": [{"kind": "box", "min": [0] * 3, "max": [1] * 3}],
+    },
     "min_score": 0.25,
     "top_k": 3,
     "suppression": {"translation": 0.02},
+    "order": "clearance",
+    "debug": True,
 }
 
 
@@ -123,6 +147,26 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
         ({"workspace": {"min": [0, 0, 0], "max": [1, 1, 1], "mid": 3}}, "options.workspace.mid"),
         ({"workspace": {"min": [1, 0, 0], "max": [0, 1, 1]}}, "options.workspace"),
         ({"workspace": [1, 2]}, "options.workspace"),
+        ({"support": {"kind": "ransac", "distance": 0.0}}, "options.support.distance"),
+        ({"support": {"kind": "cylinder"}}, "options.support"),
+        ({"approach_region": {"include": [{"kind": "cube"}]}}, "options.approach_region.include.0"),
+        ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "options.approach_region"),
+        (
+            {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}},
+            "options.contact_region.include.0.indices.1",
+        ),
+        (
+            {"contact_region": {"exclude": [{"kind": "sphere", "center": [0] * 3, "radius": -1}]}},
+            "options.contact_region.exclude.0.radius",
+        ),
+        ({"approach_direction": {}}, "options.approach_direction"),
+        ({"approach_direction": {"preset": "up"}}, "options.approach_direction.preset"),
+        ({"collision": "dodge"}, "options.collision"),
+        ({"collision": {"margin": 1.0}}, "options.collision.margin"),
+        ({"gripper": {"max_opening": 0.1}}, "options.gripper.tip_z"),
+        ({"gripper": 7}, "options.gripper"),
+        ({"viewpoint": [[0, 0, 1], [0, 0]]}, "options.viewpoint"),
+        ({"order": "best"}, "options.order"),
         ({"suppression": {"rotation": -1.0}}, "options.suppression.rotation"),
         ({"min_score": 1.5}, "options.min_score"),
         ({"top_k": 0}, "options.top_k"),
@@ -149,7 +193,7 @@ def test_bad_options(options: dict[str, Any], field: str, client, cloud) -> None
         (np.zeros((3, 3)), "3 points for num_approach_points"),
         (np.zeros((40, 3), dtype=object), "dtype object"),
         ([[0.0, 0.0, 0.0]], "a list"),
-        ("cloud.xyz", "'cloud.xyz'"),
+        ("cloud.las", "'cloud.las'"),
         ("absent.npy", "absent.npy (No such file or directory)"),
     ],
 )

@@ -30,6 +30,7 @@ def files_of(cloud: np.ndarray) -> dict[str, bytes]:
         "npz": npz.getvalue(),
         "ply": ply.format(len(cloud)).encode() + cloud.tobytes(),
         "pcd": pcd.format(len(cloud)).encode() + cloud.tobytes(),
+        "xyz": "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode(),
     }
 
 

@@ -27,37 +27,228 @@ DESCRIPTOR: _descriptor.FileDescriptor
 
 @_typing.final
 class DetectGraspsRequest(_message.Message):
+    """A cloud, what comes with it, and options. The cloud is one of `points`, `encoded`,
+    `point_cloud2` and `depth_images`. Rows of the cloud are counted row-major where it is
+    organised; those of depth images are their pixels, one image after the other.
+    """
+
     DESCRIPTOR: _descriptor.Descriptor
 
     POINTS_FIELD_NUMBER: _builtins.int
     ENCODED_FIELD_NUMBER: _builtins.int
+    POINT_CLOUD2_FIELD_NUMBER: _builtins.int
     OPTIONS_FIELD_NUMBER: _builtins.int
+    DEPTH_IMAGES_FIELD_NUMBER: _builtins.int
+    NORMALS_FIELD_NUMBER: _builtins.int
+    COLORS_FIELD_NUMBER: _builtins.int
+    SEGMENT_IDS_FIELD_NUMBER: _builtins.int
+    VIEW_IDS_FIELD_NUMBER: _builtins.int
     points: _builtins.bytes
     """N points as packed little-endian float32 x, y, z; N * 12 bytes; metres."""
+    normals: _builtins.bytes
+    """A normal for each row of the cloud, outward, any length; packed little-endian float32."""
+    colors: _builtins.bytes
+    """A colour for each row of the cloud; packed little-endian float32 red, green, blue."""
+    segment_ids: _builtins.bytes
+    """The segment that each row of the cloud belongs to; packed little-endian int32."""
+    view_ids: _builtins.bytes
+    """Which of options.viewpoint saw each row of the cloud; packed little-endian int32."""
     @_builtins.property
     def encoded(self) -> Global___EncodedCloud:
         """A point cloud file."""
 
     @_builtins.property
+    def point_cloud2(self) -> Global___PointCloud2:
+        """The layout of a ROS message."""
+
+    @_builtins.property
     def options(self) -> Global___DetectOptions:
         """Absent fields take the server's defaults."""
+
+    @_builtins.property
+    def depth_images(self) -> _containers.RepeatedCompositeFieldContainer[Global___DepthImage]:
+        """Views to fuse; their cameras are the viewpoints."""
 
     def __init__(
         self,
         *,
         points: _builtins.bytes = ...,
         encoded: Global___EncodedCloud | None = ...,
+        point_cloud2: Global___PointCloud2 | None = ...,
         options: Global___DetectOptions | None = ...,
+        depth_images: _abc.Iterable[Global___DepthImage] | None = ...,
+        normals: _builtins.bytes | None = ...,
+        colors: _builtins.bytes | None = ...,
+        segment_ids: _builtins.bytes | None = ...,
+        view_ids: _builtins.bytes | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["cloud", b"cloud", "encoded", b"encoded", "options", b"options", "points", b"points"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_colors", b"_colors", "_normals", b"_normals", "_segment_ids", b"_segment_ids", "_view_ids", b"_view_ids", "cloud", b"cloud", "colors", b"colors", "encoded", b"encoded", "normals", b"normals", "options", b"options", "point_cloud2", b"point_cloud2", "points", b"points", "segment_ids", b"segment_ids", "view_ids", b"view_ids"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cloud", b"cloud", "encoded", b"encoded", "options", b"options", "points", b"points"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_colors", b"_colors", "_normals", b"_normals", "_segment_ids", b"_segment_ids", "_view_ids", b"_view_ids", "cloud", b"cloud", "colors", b"colors", "depth_images", b"depth_images", "encoded", b"encoded", "normals", b"normals", "options", b"options", "point_cloud2", b"point_cloud2", "points", b"points", "segment_ids", b"segment_ids", "view_ids", b"view_ids"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_cloud: _TypeAlias = _typing.Literal["points", "encoded"]  # noqa: Y015
+    _WhichOneofReturnType__colors: _TypeAlias = _typing.Literal["colors"]  # noqa: Y015
+    _WhichOneofArgType__colors: _TypeAlias = _typing.Literal["_colors", b"_colors"]  # noqa: Y015
+    _WhichOneofReturnType__normals: _TypeAlias = _typing.Literal["normals"]  # noqa: Y015
+    _WhichOneofArgType__normals: _TypeAlias = _typing.Literal["_normals", b"_normals"]  # noqa: Y015
+    _WhichOneofReturnType__segment_ids: _TypeAlias = _typing.Literal["segment_ids"]  # noqa: Y015
+    _WhichOneofArgType__segment_ids: _TypeAlias = _typing.Literal["_segment_ids", b"_segment_ids"]  # noqa: Y015
+    _WhichOneofReturnType__view_ids: _TypeAlias = _typing.Literal["view_ids"]  # noqa: Y015
+    _WhichOneofArgType__view_ids: _TypeAlias = _typing.Literal["_view_ids", b"_view_ids"]  # noqa: Y015
+    _WhichOneofReturnType_cloud: _TypeAlias = _typing.Literal["points", "encoded", "point_cloud2"]  # noqa: Y015
     _WhichOneofArgType_cloud: _TypeAlias = _typing.Literal["cloud", b"cloud"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__colors) -> _WhichOneofReturnType__colors | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__normals) -> _WhichOneofReturnType__normals | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__segment_ids) -> _WhichOneofReturnType__segment_ids | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__view_ids) -> _WhichOneofReturnType__view_ids | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType_cloud) -> _WhichOneofReturnType_cloud | None: ...
 
 Global___DetectGraspsRequest: _TypeAlias = DetectGraspsRequest  # noqa: Y015
+
+@_typing.final
+class ScoreGraspsRequest(_message.Message):
+    """As DetectGraspsRequest, and either edges or hand poses."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POINTS_FIELD_NUMBER: _builtins.int
+    ENCODED_FIELD_NUMBER: _builtins.int
+    POINT_CLOUD2_FIELD_NUMBER: _builtins.int
+    OPTIONS_FIELD_NUMBER: _builtins.int
+    DEPTH_IMAGES_FIELD_NUMBER: _builtins.int
+    NORMALS_FIELD_NUMBER: _builtins.int
+    COLORS_FIELD_NUMBER: _builtins.int
+    SEGMENT_IDS_FIELD_NUMBER: _builtins.int
+    VIEW_IDS_FIELD_NUMBER: _builtins.int
+    EDGES_FIELD_NUMBER: _builtins.int
+    HAND_POSES_FIELD_NUMBER: _builtins.int
+    points: _builtins.bytes
+    """N points as packed little-endian float32 x, y, z; N * 12 bytes; metres."""
+    normals: _builtins.bytes
+    """A normal for each row of the cloud, outward, any length; packed little-endian float32."""
+    colors: _builtins.bytes
+    """A colour for each row of the cloud; packed little-endian float32 red, green, blue."""
+    segment_ids: _builtins.bytes
+    """The segment that each row of the cloud belongs to; packed little-endian int32."""
+    view_ids: _builtins.bytes
+    """Which of options.viewpoint saw each row of the cloud; packed little-endian int32."""
+    @_builtins.property
+    def encoded(self) -> Global___EncodedCloud:
+        """A point cloud file."""
+
+    @_builtins.property
+    def point_cloud2(self) -> Global___PointCloud2:
+        """The layout of a ROS message."""
+
+    @_builtins.property
+    def options(self) -> Global___DetectOptions:
+        """Absent fields take the server's defaults."""
+
+    @_builtins.property
+    def depth_images(self) -> _containers.RepeatedCompositeFieldContainer[Global___DepthImage]:
+        """Views to fuse; their cameras are the viewpoints."""
+
+    @_builtins.property
+    def edges(self) -> _containers.RepeatedCompositeFieldContainer[Global___Edge]:
+        """Edges to score."""
+
+    @_builtins.property
+    def hand_poses(self) -> _containers.RepeatedCompositeFieldContainer[Global___HandPose]:
+        """Hand poses to score."""
+
+    def __init__(
+        self,
+        *,
+        points: _builtins.bytes = ...,
+        encoded: Global___EncodedCloud | None = ...,
+        point_cloud2: Global___PointCloud2 | None = ...,
+        options: Global___DetectOptions | None = ...,
+        depth_images: _abc.Iterable[Global___DepthImage] | None = ...,
+        normals: _builtins.bytes | None = ...,
+        colors: _builtins.bytes | None = ...,
+        segment_ids: _builtins.bytes | None = ...,
+        view_ids: _builtins.bytes | None = ...,
+        edges: _abc.Iterable[Global___Edge] | None = ...,
+        hand_poses: _abc.Iterable[Global___HandPose] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_colors", b"_colors", "_normals", b"_normals", "_segment_ids", b"_segment_ids", "_view_ids", b"_view_ids", "cloud", b"cloud", "colors", b"colors", "encoded", b"encoded", "normals", b"normals", "options", b"options", "point_cloud2", b"point_cloud2", "points", b"points", "segment_ids", b"segment_ids", "view_ids", b"view_ids"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_colors", b"_colors", "_normals", b"_normals", "_segment_ids", b"_segment_ids", "_view_ids", b"_view_ids", "cloud", b"cloud", "colors", b"colors", "depth_images", b"depth_images", "edges", b"edges", "encoded", b"encoded", "hand_poses", b"hand_poses", "normals", b"normals", "options", b"options", "point_cloud2", b"point_cloud2", "points", b"points", "segment_ids", b"segment_ids", "view_ids", b"view_ids"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__colors: _TypeAlias = _typing.Literal["colors"]  # noqa: Y015
+    _WhichOneofArgType__colors: _TypeAlias = _typing.Literal["_colors", b"_colors"]  # noqa: Y015
+    _WhichOneofReturnType__normals: _TypeAlias = _typing.Literal["normals"]  # noqa: Y015
+    _WhichOneofArgType__normals: _TypeAlias = _typing.Literal["_normals", b"_normals"]  # noqa: Y015
+    _WhichOneofReturnType__segment_ids: _TypeAlias = _typing.Literal["segment_ids"]  # noqa: Y015
+    _WhichOneofArgType__segment_ids: _TypeAlias = _typing.Literal["_segment_ids", b"_segment_ids"]  # noqa: Y015
+    _WhichOneofReturnType__view_ids: _TypeAlias = _typing.Literal["view_ids"]  # noqa: Y015
+    _WhichOneofArgType__view_ids: _TypeAlias = _typing.Literal["_view_ids", b"_view_ids"]  # noqa: Y015
+    _WhichOneofReturnType_cloud: _TypeAlias = _typing.Literal["points", "encoded", "point_cloud2"]  # noqa: Y015
+    _WhichOneofArgType_cloud: _TypeAlias = _typing.Literal["cloud", b"cloud"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__colors) -> _WhichOneofReturnType__colors | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__normals) -> _WhichOneofReturnType__normals | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__segment_ids) -> _WhichOneofReturnType__segment_ids | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__view_ids) -> _WhichOneofReturnType__view_ids | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_cloud) -> _WhichOneofReturnType_cloud | None: ...
+
+Global___ScoreGraspsRequest: _TypeAlias = ScoreGraspsRequest  # noqa: Y015
+
+@_typing.final
+class Edge(_message.Message):
+    """An approach point and a contact point, rows of the cloud as sent; a pair in JSON."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    APPROACH_INDEX_FIELD_NUMBER: _builtins.int
+    CONTACT_INDEX_FIELD_NUMBER: _builtins.int
+    approach_index: _builtins.int
+    contact_index: _builtins.int
+    def __init__(
+        self,
+        *,
+        approach_index: _builtins.int = ...,
+        contact_index: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["approach_index", b"approach_index", "contact_index", b"contact_index"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Edge: _TypeAlias = Edge  # noqa: Y015
+
+@_typing.final
+class HandPose(_message.Message):
+    """A pose of the hand; four rows of four numbers in JSON."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    T_CLOUD_HAND_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """16 numbers, 4 x 4 row-major. Hand frame: z out of the palm, y the closing direction."""
+
+    def __init__(
+        self,
+        *,
+        T_cloud_hand: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HandPose: _TypeAlias = HandPose  # noqa: Y015
 
 @_typing.final
 class EncodedCloud(_message.Message):
@@ -68,7 +259,9 @@ class EncodedCloud(_message.Message):
     FORMAT_FIELD_NUMBER: _builtins.int
     DATA_FIELD_NUMBER: _builtins.int
     format: _builtins.str
-    """"npy", "npz" (the array `points`, or the only one), "ply" or "pcd"."""
+    """"npy" (shape (N, 3), or (H, W, 3) with NaN holes), "npz" (arrays `points`, `normals`,
+    `colors`, `segment_ids`, `view_ids`; or points alone under any name), "ply", "pcd" or "xyz".
+    """
     data: _builtins.bytes
     """The file's bytes."""
     def __init__(
@@ -86,12 +279,189 @@ class EncodedCloud(_message.Message):
 Global___EncodedCloud: _TypeAlias = EncodedCloud  # noqa: Y015
 
 @_typing.final
+class PointCloud2(_message.Message):
+    """The layout of sensor_msgs/PointCloud2, metres. Fields x, y, z; normal_x, normal_y, normal_z and
+    rgb or rgba where there are any. Of height 2 or more it is organised, with NaN holes.
+    """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    HEIGHT_FIELD_NUMBER: _builtins.int
+    WIDTH_FIELD_NUMBER: _builtins.int
+    FIELDS_FIELD_NUMBER: _builtins.int
+    IS_BIGENDIAN_FIELD_NUMBER: _builtins.int
+    POINT_STEP_FIELD_NUMBER: _builtins.int
+    ROW_STEP_FIELD_NUMBER: _builtins.int
+    DATA_FIELD_NUMBER: _builtins.int
+    height: _builtins.int
+    width: _builtins.int
+    is_bigendian: _builtins.bool
+    point_step: _builtins.int
+    """Bytes from point to point."""
+    row_step: _builtins.int
+    """Bytes from row to row."""
+    data: _builtins.bytes
+    """height * row_step bytes; base64 in JSON."""
+    @_builtins.property
+    def fields(self) -> _containers.RepeatedCompositeFieldContainer[Global___PointField]: ...
+    def __init__(
+        self,
+        *,
+        height: _builtins.int = ...,
+        width: _builtins.int = ...,
+        fields: _abc.Iterable[Global___PointField] | None = ...,
+        is_bigendian: _builtins.bool = ...,
+        point_step: _builtins.int = ...,
+        row_step: _builtins.int = ...,
+        data: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "fields", b"fields", "height", b"height", "is_bigendian", b"is_bigendian", "point_step", b"point_step", "row_step", b"row_step", "width", b"width"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PointCloud2: _TypeAlias = PointCloud2  # noqa: Y015
+
+@_typing.final
+class PointField(_message.Message):
+    """One field of every point."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    DATATYPE_FIELD_NUMBER: _builtins.int
+    COUNT_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    offset: _builtins.int
+    """Bytes from the start of the point."""
+    datatype: _builtins.int
+    """1 int8, 2 uint8, 3 int16, 4 uint16, 5 int32, 6 uint32, 7 float32, 8 float64."""
+    count: _builtins.int
+    """Numbers in the field; 0 means 1."""
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        offset: _builtins.int = ...,
+        datatype: _builtins.int = ...,
+        count: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["count", b"count", "datatype", b"datatype", "name", b"name", "offset", b"offset"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PointField: _TypeAlias = PointField  # noqa: Y015
+
+@_typing.final
+class DepthImage(_message.Message):
+    """What a camera saw. Camera frame: x right, y down, z forward."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DEPTH_FIELD_NUMBER: _builtins.int
+    INTRINSICS_FIELD_NUMBER: _builtins.int
+    T_CLOUD_CAMERA_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def depth(self) -> Global___Depth:
+        """Distance along z at each pixel."""
+
+    @_builtins.property
+    def intrinsics(self) -> Global___Intrinsics: ...
+    @_builtins.property
+    def T_cloud_camera(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres."""
+
+    def __init__(
+        self,
+        *,
+        depth: Global___Depth | None = ...,
+        intrinsics: Global___Intrinsics | None = ...,
+        T_cloud_camera: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_camera", b"T_cloud_camera", "depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DepthImage: _TypeAlias = DepthImage  # noqa: Y015
+
+@_typing.final
+class Depth(_message.Message):
+    """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    HEIGHT_FIELD_NUMBER: _builtins.int
+    WIDTH_FIELD_NUMBER: _builtins.int
+    ENCODING_FIELD_NUMBER: _builtins.int
+    DATA_FIELD_NUMBER: _builtins.int
+    height: _builtins.int
+    width: _builtins.int
+    encoding: _builtins.str
+    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres."""
+    data: _builtins.bytes
+    """Packed little-endian pixels; base64 in JSON."""
+    def __init__(
+        self,
+        *,
+        height: _builtins.int = ...,
+        width: _builtins.int = ...,
+        encoding: _builtins.str = ...,
+        data: _builtins.bytes = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["data", b"data", "encoding", b"encoding", "height", b"height", "width", b"width"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Depth: _TypeAlias = Depth  # noqa: Y015
+
+@_typing.final
+class Intrinsics(_message.Message):
+    """A pinhole camera without distortion, pixels. The centre of the top left pixel is (0, 0)."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FX_FIELD_NUMBER: _builtins.int
+    FY_FIELD_NUMBER: _builtins.int
+    CX_FIELD_NUMBER: _builtins.int
+    CY_FIELD_NUMBER: _builtins.int
+    fx: _builtins.float
+    fy: _builtins.float
+    cx: _builtins.float
+    cy: _builtins.float
+    def __init__(
+        self,
+        *,
+        fx: _builtins.float = ...,
+        fy: _builtins.float = ...,
+        cx: _builtins.float = ...,
+        cy: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cx", b"cx", "cy", b"cy", "fx", b"fx", "fy", b"fy"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Intrinsics: _TypeAlias = Intrinsics  # noqa: Y015
+
+@_typing.final
 class DetectOptions(_message.Message):
-    """What a caller may ask of one detection."""
+    """What a caller may ask of one detection. The order is that of the options elsewhere; the numbers
+    tell what was there first.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
     MODEL_FIELD_NUMBER: _builtins.int
+    GRIPPER_FIELD_NUMBER: _builtins.int
     NUM_APPROACH_POINTS_FIELD_NUMBER: _builtins.int
     NUM_CANDIDATES_FIELD_NUMBER: _builtins.int
     SAMPLING_FIELD_NUMBER: _builtins.int
@@ -100,10 +470,15 @@ class DetectOptions(_message.Message):
     UP_FIELD_NUMBER: _builtins.int
     SUPPORT_FIELD_NUMBER: _builtins.int
     WORKSPACE_FIELD_NUMBER: _builtins.int
+    APPROACH_REGION_FIELD_NUMBER: _builtins.int
+    CONTACT_REGION_FIELD_NUMBER: _builtins.int
+    APPROACH_DIRECTION_FIELD_NUMBER: _builtins.int
     COLLISION_FIELD_NUMBER: _builtins.int
     MIN_SCORE_FIELD_NUMBER: _builtins.int
     TOP_K_FIELD_NUMBER: _builtins.int
     SUPPRESSION_FIELD_NUMBER: _builtins.int
+    ORDER_FIELD_NUMBER: _builtins.int
+    DEBUG_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Weights to use, one of ListModels; empty: the server's default."""
     num_approach_points: _builtins.int
@@ -113,28 +488,52 @@ class DetectOptions(_message.Message):
     sampling: _builtins.str
     """How approach points are sampled: "farthest" or "uniform"."""
     seed: _builtins.int
-    """Seed of the sampling: same cloud, options and seed, same grasps."""
-    collision: _builtins.str
-    """Grasps whose hand meets the cloud: "avoid" (left out), "penalise" (ranked last) or "ignore"."""
+    """Seed of every random choice: same cloud, options and seed, same grasps."""
     min_score: _builtins.float
     """Lowest score returned, in [0, 1]."""
     top_k: _builtins.int
     """Grasps returned at most."""
+    order: _builtins.str
+    """What comes first: "score"; "highest", the highest TCP along up among scores of 0.9 and more;
+    or "clearance".
+    """
+    debug: _builtins.bool
+    """Whether to return the processed cloud and every candidate."""
     @_builtins.property
-    def viewpoint(self) -> Global___Vector:
-        """Camera position, metres; orients the normals."""
+    def gripper(self) -> Global___GripperChoice:
+        """Absent: the gripper the weights were trained for."""
+
+    @_builtins.property
+    def viewpoint(self) -> _containers.RepeatedCompositeFieldContainer[Global___Vector]:
+        """Camera position, metres; orients the normals. Several: `view_ids` says which saw each point."""
 
     @_builtins.property
     def up(self) -> Global___Vector:
         """Direction away from gravity; of any length but zero."""
 
     @_builtins.property
-    def support(self) -> Global___SupportPlane:
+    def support(self) -> Global___Support:
         """Plane the objects rest on; no part of the hand goes below it."""
 
     @_builtins.property
     def workspace(self) -> Global___Workspace:
         """Points outside are dropped first."""
+
+    @_builtins.property
+    def approach_region(self) -> Global___Region:
+        """Where approach points may lie; absent: everywhere."""
+
+    @_builtins.property
+    def contact_region(self) -> Global___Region:
+        """Where contact points may lie; absent: everywhere."""
+
+    @_builtins.property
+    def approach_direction(self) -> Global___ApproachDirection:
+        """Ways the hand may move; absent: not from below."""
+
+    @_builtins.property
+    def collision(self) -> Global___Collision:
+        """What the hand must not meet."""
 
     @_builtins.property
     def suppression(self) -> Global___Suppression:
@@ -144,25 +543,31 @@ class DetectOptions(_message.Message):
         self,
         *,
         model: _builtins.str | None = ...,
+        gripper: Global___GripperChoice | None = ...,
         num_approach_points: _builtins.int | None = ...,
         num_candidates: _builtins.int | None = ...,
         sampling: _builtins.str | None = ...,
         seed: _builtins.int | None = ...,
-        viewpoint: Global___Vector | None = ...,
+        viewpoint: _abc.Iterable[Global___Vector] | None = ...,
         up: Global___Vector | None = ...,
-        support: Global___SupportPlane | None = ...,
+        support: Global___Support | None = ...,
         workspace: Global___Workspace | None = ...,
-        collision: _builtins.str | None = ...,
+        approach_region: Global___Region | None = ...,
+        contact_region: Global___Region | None = ...,
+        approach_direction: Global___ApproachDirection | None = ...,
+        collision: Global___Collision | None = ...,
         min_score: _builtins.float | None = ...,
         top_k: _builtins.int | None = ...,
         suppression: Global___Suppression | None = ...,
+        order: _builtins.str | None = ...,
+        debug: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_collision", b"_collision", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "collision", b"collision", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_collision", b"_collision", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "collision", b"collision", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__collision: _TypeAlias = _typing.Literal["collision"]  # noqa: Y015
-    _WhichOneofArgType__collision: _TypeAlias = _typing.Literal["_collision", b"_collision"]  # noqa: Y015
+    _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
+    _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
     _WhichOneofReturnType__min_score: _TypeAlias = _typing.Literal["min_score"]  # noqa: Y015
     _WhichOneofArgType__min_score: _TypeAlias = _typing.Literal["_min_score", b"_min_score"]  # noqa: Y015
     _WhichOneofReturnType__model: _TypeAlias = _typing.Literal["model"]  # noqa: Y015
@@ -171,6 +576,8 @@ class DetectOptions(_message.Message):
     _WhichOneofArgType__num_approach_points: _TypeAlias = _typing.Literal["_num_approach_points", b"_num_approach_points"]  # noqa: Y015
     _WhichOneofReturnType__num_candidates: _TypeAlias = _typing.Literal["num_candidates"]  # noqa: Y015
     _WhichOneofArgType__num_candidates: _TypeAlias = _typing.Literal["_num_candidates", b"_num_candidates"]  # noqa: Y015
+    _WhichOneofReturnType__order: _TypeAlias = _typing.Literal["order"]  # noqa: Y015
+    _WhichOneofArgType__order: _TypeAlias = _typing.Literal["_order", b"_order"]  # noqa: Y015
     _WhichOneofReturnType__sampling: _TypeAlias = _typing.Literal["sampling"]  # noqa: Y015
     _WhichOneofArgType__sampling: _TypeAlias = _typing.Literal["_sampling", b"_sampling"]  # noqa: Y015
     _WhichOneofReturnType__seed: _TypeAlias = _typing.Literal["seed"]  # noqa: Y015
@@ -178,7 +585,7 @@ class DetectOptions(_message.Message):
     _WhichOneofReturnType__top_k: _TypeAlias = _typing.Literal["top_k"]  # noqa: Y015
     _WhichOneofArgType__top_k: _TypeAlias = _typing.Literal["_top_k", b"_top_k"]  # noqa: Y015
     @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__collision) -> _WhichOneofReturnType__collision | None: ...
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__min_score) -> _WhichOneofReturnType__min_score | None: ...
     @_typing.overload
@@ -187,6 +594,8 @@ class DetectOptions(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__num_approach_points) -> _WhichOneofReturnType__num_approach_points | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__num_candidates) -> _WhichOneofReturnType__num_candidates | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__order) -> _WhichOneofReturnType__order | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__sampling) -> _WhichOneofReturnType__sampling | None: ...
     @_typing.overload
@@ -224,32 +633,299 @@ class Vector(_message.Message):
 Global___Vector: _TypeAlias = Vector  # noqa: Y015
 
 @_typing.final
-class SupportPlane(_message.Message):
-    """The points p with normal . p = offset."""
+class Quaternion(_message.Message):
+    """A rotation of length 1; [x, y, z, w] in JSON."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    X_FIELD_NUMBER: _builtins.int
+    Y_FIELD_NUMBER: _builtins.int
+    Z_FIELD_NUMBER: _builtins.int
+    W_FIELD_NUMBER: _builtins.int
+    x: _builtins.float
+    y: _builtins.float
+    z: _builtins.float
+    w: _builtins.float
+    def __init__(
+        self,
+        *,
+        x: _builtins.float = ...,
+        y: _builtins.float = ...,
+        z: _builtins.float = ...,
+        w: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["w", b"w", "x", b"x", "y", b"y", "z", b"z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Quaternion: _TypeAlias = Quaternion  # noqa: Y015
+
+@_typing.final
+class GripperChoice(_message.Message):
+    """A gripper by name, or its geometry; in JSON the one or the other without a field around it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    GEOMETRY_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """One that ships with the server, or that it was started with."""
+    @_builtins.property
+    def geometry(self) -> Global___GripperGeometry: ...
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        geometry: Global___GripperGeometry | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["choice", b"choice", "geometry", b"geometry", "name", b"name"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["choice", b"choice", "geometry", b"geometry", "name", b"name"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_choice: _TypeAlias = _typing.Literal["name", "geometry"]  # noqa: Y015
+    _WhichOneofArgType_choice: _TypeAlias = _typing.Literal["choice", b"choice"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_choice) -> _WhichOneofReturnType_choice | None: ...
+
+Global___GripperChoice: _TypeAlias = GripperChoice  # noqa: Y015
+
+@_typing.final
+class GripperGeometry(_message.Message):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    MAX_OPENING_FIELD_NUMBER: _builtins.int
+    TIP_Z_FIELD_NUMBER: _builtins.int
+    CONTACT_Z_FIELD_NUMBER: _builtins.int
+    TCP_Z_FIELD_NUMBER: _builtins.int
+    HAND_FIELD_NUMBER: _builtins.int
+    FINGER_FIELD_NUMBER: _builtins.int
+    SWING_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """Shown in results."""
+    max_opening: _builtins.float
+    """Metres between the open fingers' inner faces."""
+    tip_z: _builtins.float
+    """Fingertips of the open gripper, metres along z."""
+    contact_z: _builtins.float
+    """Where contacts are put, metres along z."""
+    tcp_z: _builtins.float
+    """Origin of the TCP frame, metres along z."""
+    @_builtins.property
+    def hand(self) -> Global___HandPart:
+        """The hand without its fingers."""
+
+    @_builtins.property
+    def finger(self) -> Global___HandPart:
+        """One finger, its inner face at y = 0; mirrored."""
+
+    @_builtins.property
+    def swing(self) -> Global___Swing:
+        """How the fingers swing; absent: they close in a straight line."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str | None = ...,
+        max_opening: _builtins.float | None = ...,
+        tip_z: _builtins.float | None = ...,
+        contact_z: _builtins.float | None = ...,
+        tcp_z: _builtins.float | None = ...,
+        hand: Global___HandPart | None = ...,
+        finger: Global___HandPart | None = ...,
+        swing: Global___Swing | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__contact_z: _TypeAlias = _typing.Literal["contact_z"]  # noqa: Y015
+    _WhichOneofArgType__contact_z: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z"]  # noqa: Y015
+    _WhichOneofReturnType__max_opening: _TypeAlias = _typing.Literal["max_opening"]  # noqa: Y015
+    _WhichOneofArgType__max_opening: _TypeAlias = _typing.Literal["_max_opening", b"_max_opening"]  # noqa: Y015
+    _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
+    _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
+    _WhichOneofReturnType__tcp_z: _TypeAlias = _typing.Literal["tcp_z"]  # noqa: Y015
+    _WhichOneofArgType__tcp_z: _TypeAlias = _typing.Literal["_tcp_z", b"_tcp_z"]  # noqa: Y015
+    _WhichOneofReturnType__tip_z: _TypeAlias = _typing.Literal["tip_z"]  # noqa: Y015
+    _WhichOneofArgType__tip_z: _TypeAlias = _typing.Literal["_tip_z", b"_tip_z"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__contact_z) -> _WhichOneofReturnType__contact_z | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_opening) -> _WhichOneofReturnType__max_opening | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__name) -> _WhichOneofReturnType__name | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tcp_z) -> _WhichOneofReturnType__tcp_z | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tip_z) -> _WhichOneofReturnType__tip_z | None: ...
+
+Global___GripperGeometry: _TypeAlias = GripperGeometry  # noqa: Y015
+
+@_typing.final
+class HandPart(_message.Message):
+    """Boxes of the hand or of one finger, hand frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOXES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def boxes(self) -> _containers.RepeatedCompositeFieldContainer[Global___HandBox]: ...
+    def __init__(
+        self,
+        *,
+        boxes: _abc.Iterable[Global___HandBox] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["boxes", b"boxes"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HandPart: _TypeAlias = HandPart  # noqa: Y015
+
+@_typing.final
+class HandBox(_message.Message):
+    """An axis-aligned box in the hand frame; [min, max] in JSON."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def min(self) -> Global___Vector:
+        """Lower corner, metres."""
+
+    @_builtins.property
+    def max(self) -> Global___Vector:
+        """Upper corner, metres."""
+
+    def __init__(
+        self,
+        *,
+        min: Global___Vector | None = ...,
+        max: Global___Vector | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HandBox: _TypeAlias = HandBox  # noqa: Y015
+
+@_typing.final
+class Swing(_message.Message):
+    """A linkage that carries each finger along an arc."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RADIUS_FIELD_NUMBER: _builtins.int
+    REACH_FIELD_NUMBER: _builtins.int
+    radius: _builtins.float
+    """Length of the link that carries a finger, metres."""
+    reach: _builtins.float
+    """Outward part (y) of that link in the open gripper, metres."""
+    def __init__(
+        self,
+        *,
+        radius: _builtins.float | None = ...,
+        reach: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
+    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
+    _WhichOneofReturnType__reach: _TypeAlias = _typing.Literal["reach"]  # noqa: Y015
+    _WhichOneofArgType__reach: _TypeAlias = _typing.Literal["_reach", b"_reach"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__reach) -> _WhichOneofReturnType__reach | None: ...
+
+Global___Swing: _TypeAlias = Swing  # noqa: Y015
+
+@_typing.final
+class Support(_message.Message):
+    """Either a plane that is given, the points p with normal . p = offset, or one to look for."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
     NORMAL_FIELD_NUMBER: _builtins.int
     OFFSET_FIELD_NUMBER: _builtins.int
+    RANSAC_FIELD_NUMBER: _builtins.int
     offset: _builtins.float
     """normal . p of its points, metres."""
     @_builtins.property
     def normal(self) -> Global___Vector:
         """Unit normal, away from the table."""
 
+    @_builtins.property
+    def ransac(self) -> Global___RansacPlane:
+        """Look for the plane in the cloud; `"kind": "ransac"` in JSON, its fields beside it."""
+
     def __init__(
         self,
         *,
         normal: Global___Vector | None = ...,
-        offset: _builtins.float = ...,
+        offset: _builtins.float | None = ...,
+        ransac: Global___RansacPlane | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["normal", b"normal"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["normal", b"normal", "offset", b"offset"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
+    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
 
-Global___SupportPlane: _TypeAlias = SupportPlane  # noqa: Y015
+Global___Support: _TypeAlias = Support  # noqa: Y015
+
+@_typing.final
+class RansacPlane(_message.Message):
+    """How to look for the support plane. Its points are removed; the plane stays as an obstacle."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DISTANCE_FIELD_NUMBER: _builtins.int
+    MAX_TILT_FIELD_NUMBER: _builtins.int
+    MIN_SHARE_FIELD_NUMBER: _builtins.int
+    distance: _builtins.float
+    """Metres from the plane within which points belong to it."""
+    max_tilt: _builtins.float
+    """Radians between its normal and up."""
+    min_share: _builtins.float
+    """Share of the cloud's points it must hold."""
+    def __init__(
+        self,
+        *,
+        distance: _builtins.float | None = ...,
+        max_tilt: _builtins.float | None = ...,
+        min_share: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__distance: _TypeAlias = _typing.Literal["distance"]  # noqa: Y015
+    _WhichOneofArgType__distance: _TypeAlias = _typing.Literal["_distance", b"_distance"]  # noqa: Y015
+    _WhichOneofReturnType__max_tilt: _TypeAlias = _typing.Literal["max_tilt"]  # noqa: Y015
+    _WhichOneofArgType__max_tilt: _TypeAlias = _typing.Literal["_max_tilt", b"_max_tilt"]  # noqa: Y015
+    _WhichOneofReturnType__min_share: _TypeAlias = _typing.Literal["min_share"]  # noqa: Y015
+    _WhichOneofArgType__min_share: _TypeAlias = _typing.Literal["_min_share", b"_min_share"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__distance) -> _WhichOneofReturnType__distance | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_tilt) -> _WhichOneofReturnType__max_tilt | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__min_share) -> _WhichOneofReturnType__min_share | None: ...
+
+Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
 
 @_typing.final
 class Workspace(_message.Message):
@@ -280,6 +956,433 @@ class Workspace(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Workspace: _TypeAlias = Workspace  # noqa: Y015
+
+@_typing.final
+class Region(_message.Message):
+    """What lies in any of `include` and in none of `exclude`."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INCLUDE_FIELD_NUMBER: _builtins.int
+    EXCLUDE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def include(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
+        """Union of shapes; none: everywhere."""
+
+    @_builtins.property
+    def exclude(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
+        """Union of shapes taken away."""
+
+    def __init__(
+        self,
+        *,
+        include: _abc.Iterable[Global___Shape] | None = ...,
+        exclude: _abc.Iterable[Global___Shape] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exclude", b"exclude", "include", b"include"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Region: _TypeAlias = Region  # noqa: Y015
+
+@_typing.final
+class Shape(_message.Message):
+    """A part of the cloud; in JSON `kind` is the name of the field set here, its fields beside it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOX_FIELD_NUMBER: _builtins.int
+    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
+    SPHERE_FIELD_NUMBER: _builtins.int
+    HALF_SPACE_FIELD_NUMBER: _builtins.int
+    INDICES_FIELD_NUMBER: _builtins.int
+    MASK_FIELD_NUMBER: _builtins.int
+    SEGMENTS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def box(self) -> Global___Box: ...
+    @_builtins.property
+    def oriented_box(self) -> Global___OrientedBox: ...
+    @_builtins.property
+    def sphere(self) -> Global___Sphere: ...
+    @_builtins.property
+    def half_space(self) -> Global___HalfSpace: ...
+    @_builtins.property
+    def indices(self) -> Global___Indices: ...
+    @_builtins.property
+    def mask(self) -> Global___Mask: ...
+    @_builtins.property
+    def segments(self) -> Global___Segments: ...
+    def __init__(
+        self,
+        *,
+        box: Global___Box | None = ...,
+        oriented_box: Global___OrientedBox | None = ...,
+        sphere: Global___Sphere | None = ...,
+        half_space: Global___HalfSpace | None = ...,
+        indices: Global___Indices | None = ...,
+        mask: Global___Mask | None = ...,
+        segments: Global___Segments | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box", "sphere", "half_space", "indices", "mask", "segments"]  # noqa: Y015
+    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
+
+Global___Shape: _TypeAlias = Shape  # noqa: Y015
+
+@_typing.final
+class Box(_message.Message):
+    """An axis-aligned box in the cloud's frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def min(self) -> Global___Vector:
+        """Lower corner, metres."""
+
+    @_builtins.property
+    def max(self) -> Global___Vector:
+        """Upper corner, metres."""
+
+    def __init__(
+        self,
+        *,
+        min: Global___Vector | None = ...,
+        max: Global___Vector | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Box: _TypeAlias = Box  # noqa: Y015
+
+@_typing.final
+class OrientedBox(_message.Message):
+    """A box in any orientation."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CENTER_FIELD_NUMBER: _builtins.int
+    HALF_EXTENTS_FIELD_NUMBER: _builtins.int
+    QUATERNION_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def center(self) -> Global___Vector:
+        """Its middle, metres."""
+
+    @_builtins.property
+    def half_extents(self) -> Global___Vector:
+        """Half its lengths along its own axes, metres."""
+
+    @_builtins.property
+    def quaternion(self) -> Global___Quaternion:
+        """Turns the box's axes into the cloud's (T_cloud_box); absent: no rotation."""
+
+    def __init__(
+        self,
+        *,
+        center: Global___Vector | None = ...,
+        half_extents: Global___Vector | None = ...,
+        quaternion: Global___Quaternion | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___OrientedBox: _TypeAlias = OrientedBox  # noqa: Y015
+
+@_typing.final
+class Sphere(_message.Message):
+    """A ball."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CENTER_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    radius: _builtins.float
+    """Metres."""
+    @_builtins.property
+    def center(self) -> Global___Vector:
+        """Its middle, metres."""
+
+    def __init__(
+        self,
+        *,
+        center: Global___Vector | None = ...,
+        radius: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
+    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
+
+Global___Sphere: _TypeAlias = Sphere  # noqa: Y015
+
+@_typing.final
+class HalfSpace(_message.Message):
+    """The points p with normal . p >= offset."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NORMAL_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    offset: _builtins.float
+    """normal . p on the plane, metres."""
+    @_builtins.property
+    def normal(self) -> Global___Vector:
+        """Unit, into the region."""
+
+    def __init__(
+        self,
+        *,
+        normal: Global___Vector | None = ...,
+        offset: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
+    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
+
+Global___HalfSpace: _TypeAlias = HalfSpace  # noqa: Y015
+
+@_typing.final
+class Indices(_message.Message):
+    """Points by their row in the cloud as it was sent."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INDICES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]: ...
+    def __init__(
+        self,
+        *,
+        indices: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["indices", b"indices"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Indices: _TypeAlias = Indices  # noqa: Y015
+
+@_typing.final
+class Mask(_message.Message):
+    """Points by one truth value for each row of the cloud as it was sent."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MASK_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]: ...
+    def __init__(
+        self,
+        *,
+        mask: _abc.Iterable[_builtins.bool] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["mask", b"mask"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Mask: _TypeAlias = Mask  # noqa: Y015
+
+@_typing.final
+class Segments(_message.Message):
+    """Points by the segment they belong to: `segment_ids` of the request."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    IDS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]: ...
+    def __init__(
+        self,
+        *,
+        ids: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ids", b"ids"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Segments: _TypeAlias = Segments  # noqa: Y015
+
+@_typing.final
+class ApproachDirection(_message.Message):
+    """Directions in which the hand may move: those in any cone or in the preset."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CONES_FIELD_NUMBER: _builtins.int
+    PRESET_FIELD_NUMBER: _builtins.int
+    preset: _builtins.str
+    """"top-down": within 30 degrees of straight down; "side": within 30 degrees of the horizontal."""
+    @_builtins.property
+    def cones(self) -> _containers.RepeatedCompositeFieldContainer[Global___Cone]: ...
+    def __init__(
+        self,
+        *,
+        cones: _abc.Iterable[Global___Cone] | None = ...,
+        preset: _builtins.str | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "preset", b"preset"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "cones", b"cones", "preset", b"preset"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__preset: _TypeAlias = _typing.Literal["preset"]  # noqa: Y015
+    _WhichOneofArgType__preset: _TypeAlias = _typing.Literal["_preset", b"_preset"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__preset) -> _WhichOneofReturnType__preset | None: ...
+
+Global___ApproachDirection: _TypeAlias = ApproachDirection  # noqa: Y015
+
+@_typing.final
+class Cone(_message.Message):
+    """Directions within an angle of one."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DIRECTION_FIELD_NUMBER: _builtins.int
+    MAX_ANGLE_FIELD_NUMBER: _builtins.int
+    max_angle: _builtins.float
+    """Radians between it and the hand's way."""
+    @_builtins.property
+    def direction(self) -> Global___Vector:
+        """The way the hand moves toward the object, +z of the hand; any length but zero."""
+
+    def __init__(
+        self,
+        *,
+        direction: Global___Vector | None = ...,
+        max_angle: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_angle: _TypeAlias = _typing.Literal["max_angle"]  # noqa: Y015
+    _WhichOneofArgType__max_angle: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_angle) -> _WhichOneofReturnType__max_angle | None: ...
+
+Global___Cone: _TypeAlias = Cone  # noqa: Y015
+
+@_typing.final
+class Collision(_message.Message):
+    """What the hand must not meet, and on which way; in JSON a bare mode will do."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MODE_FIELD_NUMBER: _builtins.int
+    MARGIN_FIELD_NUMBER: _builtins.int
+    OPENING_FIELD_NUMBER: _builtins.int
+    APPROACH_LENGTH_FIELD_NUMBER: _builtins.int
+    RETREAT_LENGTH_FIELD_NUMBER: _builtins.int
+    RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
+    OBSTACLES_FIELD_NUMBER: _builtins.int
+    mode: _builtins.str
+    """Grasps whose hand collides: "avoid" (left out), "penalise" (ranked last) or "ignore"."""
+    margin: _builtins.float
+    """Metres kept free around the hand."""
+    opening: _builtins.float
+    """Metres between the fingers on the way in; absent: the gripper's maximum."""
+    approach_length: _builtins.float
+    """Metres of straight way in along the approach."""
+    retreat_length: _builtins.float
+    """Metres of straight way out."""
+    retreat_direction: _builtins.str
+    """Way out: "back" along the approach, or "up"."""
+    @_builtins.property
+    def obstacles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Obstacle]:
+        """Solid boxes beside the cloud."""
+
+    def __init__(
+        self,
+        *,
+        mode: _builtins.str | None = ...,
+        margin: _builtins.float | None = ...,
+        opening: _builtins.float | None = ...,
+        approach_length: _builtins.float | None = ...,
+        retreat_length: _builtins.float | None = ...,
+        retreat_direction: _builtins.str | None = ...,
+        obstacles: _abc.Iterable[Global___Obstacle] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "obstacles", b"obstacles", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__approach_length: _TypeAlias = _typing.Literal["approach_length"]  # noqa: Y015
+    _WhichOneofArgType__approach_length: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length"]  # noqa: Y015
+    _WhichOneofReturnType__margin: _TypeAlias = _typing.Literal["margin"]  # noqa: Y015
+    _WhichOneofArgType__margin: _TypeAlias = _typing.Literal["_margin", b"_margin"]  # noqa: Y015
+    _WhichOneofReturnType__mode: _TypeAlias = _typing.Literal["mode"]  # noqa: Y015
+    _WhichOneofArgType__mode: _TypeAlias = _typing.Literal["_mode", b"_mode"]  # noqa: Y015
+    _WhichOneofReturnType__opening: _TypeAlias = _typing.Literal["opening"]  # noqa: Y015
+    _WhichOneofArgType__opening: _TypeAlias = _typing.Literal["_opening", b"_opening"]  # noqa: Y015
+    _WhichOneofReturnType__retreat_direction: _TypeAlias = _typing.Literal["retreat_direction"]  # noqa: Y015
+    _WhichOneofArgType__retreat_direction: _TypeAlias = _typing.Literal["_retreat_direction", b"_retreat_direction"]  # noqa: Y015
+    _WhichOneofReturnType__retreat_length: _TypeAlias = _typing.Literal["retreat_length"]  # noqa: Y015
+    _WhichOneofArgType__retreat_length: _TypeAlias = _typing.Literal["_retreat_length", b"_retreat_length"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__approach_length) -> _WhichOneofReturnType__approach_length | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__margin) -> _WhichOneofReturnType__margin | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__mode) -> _WhichOneofReturnType__mode | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__opening) -> _WhichOneofReturnType__opening | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_direction) -> _WhichOneofReturnType__retreat_direction | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_length) -> _WhichOneofReturnType__retreat_length | None: ...
+
+Global___Collision: _TypeAlias = Collision  # noqa: Y015
+
+@_typing.final
+class Obstacle(_message.Message):
+    """A solid box; in JSON `kind` is the name of the field set here, its fields beside it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOX_FIELD_NUMBER: _builtins.int
+    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def box(self) -> Global___Box: ...
+    @_builtins.property
+    def oriented_box(self) -> Global___OrientedBox: ...
+    def __init__(
+        self,
+        *,
+        box: Global___Box | None = ...,
+        oriented_box: Global___OrientedBox | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box"]  # noqa: Y015
+    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
+
+Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
@@ -367,6 +1470,7 @@ class DetectGraspsResponse(_message.Message):
     SECONDS_FIELD_NUMBER: _builtins.int
     MODEL_FIELD_NUMBER: _builtins.int
     WARNINGS_FIELD_NUMBER: _builtins.int
+    DEBUG_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Name of the weights used."""
     @_builtins.property
@@ -385,6 +1489,10 @@ class DetectGraspsResponse(_message.Message):
     def warnings(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """What the caller should know about the result, in words."""
 
+    @_builtins.property
+    def debug(self) -> Global___DebugInfo:
+        """Set where options.debug is."""
+
     def __init__(
         self,
         *,
@@ -393,10 +1501,11 @@ class DetectGraspsResponse(_message.Message):
         seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
         model: _builtins.str = ...,
         warnings: _abc.Iterable[_builtins.str] | None = ...,
+        debug: Global___DebugInfo | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "grasps", b"grasps", "model", b"model", "seconds", b"seconds", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "model", b"model", "seconds", b"seconds", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -416,12 +1525,15 @@ class Grasp(_message.Message):
     CONTACT_POINT_FIELD_NUMBER: _builtins.int
     APPROACH_DIRECTION_FIELD_NUMBER: _builtins.int
     COLLISION_FREE_FIELD_NUMBER: _builtins.int
+    CLEARANCE_FIELD_NUMBER: _builtins.int
     score: _builtins.float
     """Probability that the grasp holds, in [0, 1]."""
     width: _builtins.float
     """Opening to command before closing, metres."""
     collision_free: _builtins.bool
-    """Whether the open hand at the grasp meets no point of the cloud."""
+    """Whether the open hand meets nothing at the grasp and on its ways."""
+    clearance: _builtins.float
+    """Metres from the open hand at the grasp to the nearest thing; 0 or less: within it."""
     @_builtins.property
     def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """16 floats, 4 x 4 row-major. Hand frame: z out of the palm, y the closing direction."""
@@ -453,14 +1565,195 @@ class Grasp(_message.Message):
         contact_point: _abc.Iterable[_builtins.float] | None = ...,
         approach_direction: _abc.Iterable[_builtins.float] | None = ...,
         collision_free: _builtins.bool = ...,
+        clearance: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "collision_free", b"collision_free", "contact_point", b"contact_point", "score", b"score", "width", b"width"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "score", b"score", "width", b"width"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___Grasp: _TypeAlias = Grasp  # noqa: Y015
+
+@_typing.final
+class DebugInfo(_message.Message):
+    """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    POINTS_FIELD_NUMBER: _builtins.int
+    NORMALS_FIELD_NUMBER: _builtins.int
+    APPROACH_INDEX_FIELD_NUMBER: _builtins.int
+    CONTACT_INDEX_FIELD_NUMBER: _builtins.int
+    T_CLOUD_HAND_FIELD_NUMBER: _builtins.int
+    SCORE_FIELD_NUMBER: _builtins.int
+    OUTCOME_FIELD_NUMBER: _builtins.int
+    SUPPORT_PLANE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def points(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """V * 3 floats, metres, cloud frame."""
+
+    @_builtins.property
+    def normals(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """V * 3 floats, unit."""
+
+    @_builtins.property
+    def approach_index(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """E rows of `points`: p_a."""
+
+    @_builtins.property
+    def contact_index(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """E rows of `points`: p_c."""
+
+    @_builtins.property
+    def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """E * 16 floats, each 4 x 4 row-major."""
+
+    @_builtins.property
+    def score(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """E floats; NaN (null in JSON): not scored."""
+
+    @_builtins.property
+    def outcome(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """E words: "returned", or what became of it."""
+
+    @_builtins.property
+    def support_plane(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Unit normal and offset in metres of the support plane, given or found; empty: none."""
+
+    def __init__(
+        self,
+        *,
+        points: _abc.Iterable[_builtins.float] | None = ...,
+        normals: _abc.Iterable[_builtins.float] | None = ...,
+        approach_index: _abc.Iterable[_builtins.int] | None = ...,
+        contact_index: _abc.Iterable[_builtins.int] | None = ...,
+        T_cloud_hand: _abc.Iterable[_builtins.float] | None = ...,
+        score: _abc.Iterable[_builtins.float] | None = ...,
+        outcome: _abc.Iterable[_builtins.str] | None = ...,
+        support_plane: _abc.Iterable[_builtins.float] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "approach_index", b"approach_index", "contact_index", b"contact_index", "normals", b"normals", "outcome", b"outcome", "points", b"points", "score", b"score", "support_plane", b"support_plane"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___DebugInfo: _TypeAlias = DebugInfo  # noqa: Y015
+
+@_typing.final
+class ScoreGraspsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    @_typing.final
+    class CountsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.int
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.int = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    @_typing.final
+    class SecondsEntry(_message.Message):
+        DESCRIPTOR: _descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: _builtins.int
+        VALUE_FIELD_NUMBER: _builtins.int
+        key: _builtins.str
+        value: _builtins.float
+        def __init__(
+            self,
+            *,
+            key: _builtins.str = ...,
+            value: _builtins.float = ...,
+        ) -> None: ...
+        _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+        def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+        _ClearFieldArgType: _TypeAlias = _typing.Literal["key", b"key", "value", b"value"]  # noqa: Y015
+        def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+        def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+    EVALUATIONS_FIELD_NUMBER: _builtins.int
+    COUNTS_FIELD_NUMBER: _builtins.int
+    SECONDS_FIELD_NUMBER: _builtins.int
+    MODEL_FIELD_NUMBER: _builtins.int
+    WARNINGS_FIELD_NUMBER: _builtins.int
+    model: _builtins.str
+    """Name of the weights used."""
+    @_builtins.property
+    def evaluations(self) -> _containers.RepeatedCompositeFieldContainer[Global___Evaluation]:
+        """In the order of the edges or hand poses."""
+
+    @_builtins.property
+    def counts(self) -> _containers.ScalarMap[_builtins.str, _builtins.int]:
+        """Points, edges or hand poses that passed each stage."""
+
+    @_builtins.property
+    def seconds(self) -> _containers.ScalarMap[_builtins.str, _builtins.float]:
+        """Time spent in each stage, and their `total`; seconds."""
+
+    @_builtins.property
+    def warnings(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """What the caller should know about the result, in words."""
+
+    def __init__(
+        self,
+        *,
+        evaluations: _abc.Iterable[Global___Evaluation] | None = ...,
+        counts: _abc.Mapping[_builtins.str, _builtins.int] | None = ...,
+        seconds: _abc.Mapping[_builtins.str, _builtins.float] | None = ...,
+        model: _builtins.str = ...,
+        warnings: _abc.Iterable[_builtins.str] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "evaluations", b"evaluations", "model", b"model", "seconds", b"seconds", "warnings", b"warnings"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ScoreGraspsResponse: _TypeAlias = ScoreGraspsResponse  # noqa: Y015
+
+@_typing.final
+class Evaluation(_message.Message):
+    """What the network says of one edge or hand pose."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    GRASP_FIELD_NUMBER: _builtins.int
+    REASON_FIELD_NUMBER: _builtins.int
+    reason: _builtins.str
+    """Why it defines none, in a word; null in JSON where it defines one."""
+    @_builtins.property
+    def grasp(self) -> Global___Grasp:
+        """Absent (null in JSON) where it defines no grasp."""
+
+    def __init__(
+        self,
+        *,
+        grasp: Global___Grasp | None = ...,
+        reason: _builtins.str | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_reason", b"_reason", "grasp", b"grasp", "reason", b"reason"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_reason", b"_reason", "grasp", b"grasp", "reason", b"reason"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__reason: _TypeAlias = _typing.Literal["reason"]  # noqa: Y015
+    _WhichOneofArgType__reason: _TypeAlias = _typing.Literal["_reason", b"_reason"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__reason) -> _WhichOneofReturnType__reason | None: ...
+
+Global___Evaluation: _TypeAlias = Evaluation  # noqa: Y015
 
 @_typing.final
 class ListModelsRequest(_message.Message):

@@ -39,6 +39,11 @@ class GraspServiceStub:
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.SerializeToString,
                 response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.FromString,
                 _registered_method=True)
+        self.ScoreGrasps = channel.unary_unary(
+                '/edgegrasp.v1.GraspService/ScoreGrasps',
+                request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsRequest.SerializeToString,
+                response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsResponse.FromString,
+                _registered_method=True)
         self.ListModels = channel.unary_unary(
                 '/edgegrasp.v1.GraspService/ListModels',
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.SerializeToString,
@@ -60,6 +65,13 @@ class GraspServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ScoreGrasps(self, request, context):
+        """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def ListModels(self, request, context):
         """Lists the weights that options.model can name.
         """
@@ -74,6 +86,11 @@ def add_GraspServiceServicer_to_server(servicer, server):
                     servicer.DetectGrasps,
                     request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.FromString,
                     response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.SerializeToString,
+            ),
+            'ScoreGrasps': grpc.unary_unary_rpc_method_handler(
+                    servicer.ScoreGrasps,
+                    request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsRequest.FromString,
+                    response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsResponse.SerializeToString,
             ),
             'ListModels': grpc.unary_unary_rpc_method_handler(
                     servicer.ListModels,
@@ -108,6 +125,33 @@ class GraspService:
             '/edgegrasp.v1.GraspService/DetectGrasps',
             edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.SerializeToString,
             edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ScoreGrasps(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/edgegrasp.v1.GraspService/ScoreGrasps',
+            edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsRequest.SerializeToString,
+            edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsResponse.FromString,
             options,
             channel_credentials,
             insecure,

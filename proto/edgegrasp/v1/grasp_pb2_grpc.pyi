@@ -45,6 +45,8 @@ class GraspServiceStub:
       RESOURCE_EXHAUSTED  the request exceeds the server's limits
       UNAVAILABLE         weights are still loading, or the server is stopping
     """
+    ScoreGrasps: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]
+    """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]
     """Lists the weights that options.model can name."""
 
@@ -58,6 +60,8 @@ class GraspServiceAsyncStub(GraspServiceStub):
       RESOURCE_EXHAUSTED  the request exceeds the server's limits
       UNAVAILABLE         weights are still loading, or the server is stopping
     """
+    ScoreGrasps: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]  # type: ignore[assignment]
+    """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]  # type: ignore[assignment]
     """Lists the weights that options.model can name."""
 
@@ -74,6 +78,14 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
           RESOURCE_EXHAUSTED  the request exceeds the server's limits
           UNAVAILABLE         weights are still loading, or the server is stopping
         """
+
+    @_abc_1.abstractmethod
+    def ScoreGrasps(
+        self,
+        request: _grasp_pb2.ScoreGraspsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_grasp_pb2.ScoreGraspsResponse, _abc.Awaitable[_grasp_pb2.ScoreGraspsResponse]]:
+        """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
 
     @_abc_1.abstractmethod
     def ListModels(
