@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.support import SupportPlane
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -21,7 +22,6 @@ LOW = 0.03  # metres over the support plane up to which contacts get a level gra
 MIN_LEVEL = 0.3  # horizontal part of a normal from which its heading can be trusted
 MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a level grasp
 MIN_DROP = -0.002  # metres a contact may lie above the approach point of a level grasp
-MIN_APPROACH_UP = -0.1  # the hand does not come from below: cosine of approach and up
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,13 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.pair)
+
+    @staticmethod
+    def none() -> "Candidates":
+        """No candidate."""
+        rows, numbers = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+        vectors = np.empty((0, 3), dtype=np.float32)
+        return Candidates(rows, rows, rows, vectors, numbers, np.empty((0, 4, 4), np.float32))
 
     @staticmethod
     def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
@@ -75,25 +82,38 @@ def edge_grasps(
     Returns:
         The pairs that define an edge grasp which fits the gripper.
     """
+    edge = measure_edges(cloud, approach_index, contact_index)
+    pair = np.flatnonzero(
+        (edge.length > MIN_EDGE)
+        & (edge.length < gripper.max_opening / 2 - EDGE_MARGIN)
+        & (edge.depth > MIN_DEPTH)
+        & (edge.depth < gripper.finger_depth)
+    )
+    ahead, normal, depth = edge.ahead[pair], edge.normal[pair], edge.depth[pair]
+    contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
+    pose = edge_grasp_poses(cloud.points[approach_index[pair]], ahead, normal, depth, contact_z)
+    return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
+
+
+class EdgeMeasures(NamedTuple):
+    """Edges r = p_c - p_a, taken apart by the normal at the contact."""
+
+    normal: Float32  # (M, 3) unit n_c
+    along: Float32  # (M,) r . n_c, metres
+    ahead: Float32  # (M, 3) r_perp, the part of r orthogonal to n_c
+    length: Float32  # (M,) |r|, metres
+    depth: Float32  # (M,) |r_perp|, metres
+
+
+def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> EdgeMeasures:
+    """Measure the edges of pairs (M,), (M,) of points, rows of the cloud."""
     normal = cloud.normals[contact_index]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
     along = np.einsum("md,md->m", edge, normal)
-    ahead = edge - along[:, None] * normal  # (M, 3) r_perp
+    ahead = edge - along[:, None] * normal
     length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
-    pair = np.flatnonzero(
-        (length > MIN_EDGE)
-        & (length < gripper.max_opening / 2 - EDGE_MARGIN)
-        & (depth > MIN_DEPTH)
-        & (depth < gripper.finger_depth)
-    )
-    contact_z = gripper.contact_z_at(2 * np.abs(along[pair]))
-    pose = edge_grasp_poses(
-        cloud.points[approach_index[pair]], ahead[pair], normal[pair], depth[pair], contact_z
-    )
-    return Candidates(
-        pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth[pair], pose
-    )
+    return EdgeMeasures(normal, along, ahead, length, depth)
 
 
 def edge_grasp_poses(
@@ -122,11 +142,6 @@ def edge_grasp_poses(
     pose[:, :3, 3] = approach_point + (depth - contact_z)[:, None] * z
     pose[:, 3, 3] = 1.0
     return pose
-
-
-def from_above(candidates: Candidates, up: Float32) -> NDArray[np.bool_]:
-    """Which candidates do not come from below.  # (E,)."""
-    return candidates.approach @ (up / np.linalg.norm(up)) > MIN_APPROACH_UP
 
 
 def level_grasps(
@@ -178,23 +193,32 @@ def level_grasps(
     return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
 
 
-def drawn_back(candidates: Candidates, support: SupportPlane, gripper: Gripper) -> Candidates:
+def drawn_back(
+    candidates: Candidates, support: SupportPlane, gripper: Gripper, margin: float = 0.0
+) -> tuple[Candidates, NDArray[np.bool_]]:
     """Draw hands that would cut into the support plane back along their approach, if that helps.
 
     The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: what
     lies flat on a table is held by the tips.
 
+    Args:
+        candidates: E of them.
+        support: The plane.
+        gripper: Its boxes.
+        margin: Metres that the hand stays above the plane.
+
     Returns:
-        The candidates whose hands stay above the plane.
+        The candidates, and which of their hands (E,) stay above the plane; the others are as
+        they were.
     """
-    clearance = support_clearance(candidates.T_cloud_hand, support, gripper)
+    clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         back = np.where(clearance >= 0, 0.0, -clearance / rise)
     clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
-    pose = candidates.T_cloud_hand[clear]
-    pose[:, :3, 3] += back[clear, None] * candidates.approach[clear]
-    return replace(candidates.take(clear), T_cloud_hand=pose)
+    pose = candidates.T_cloud_hand.copy()
+    pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
+    return replace(candidates, T_cloud_hand=pose), clear
 
 
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:

@@ -9,6 +9,7 @@ import torch
 
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidCheckpoint, UnknownModel
+from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
@@ -42,6 +43,7 @@ class ModelCatalogue:
         weights: Sequence[Path] = (),
         default: str = "",
         device: torch.device | str = "cpu",
+        grippers: Sequence[Path] = (),
     ) -> Self:
         """Load the weights that ship with the package, then a user's own, which win by name.
 
@@ -49,11 +51,14 @@ class ModelCatalogue:
             weights: `.safetensors` files, or folders of them; a model is named as its file.
             default: As for the constructor.
             device: Where the networks run.
+            grippers: Gripper files that requests may name by their stem.
 
         Raises:
             InvalidCheckpoint: A file cannot be used, or there is none.
             UnknownModel: There are no weights of the default's name.
+            InvalidGripper: A gripper file cannot be used.
         """
+        own = {file.stem: load_gripper(file) for file in grippers}
         files: dict[str, Path] = {}
         for source in (WEIGHTS_FOLDER, *weights):
             found = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
@@ -61,7 +66,7 @@ class ModelCatalogue:
                 file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
             }
         return cls(
-            {name: GraspDetector.load(file, device) for name, file in files.items()}, default
+            {name: GraspDetector.load(file, device, own) for name, file in files.items()}, default
         )
 
     def names(self) -> list[str]:

@@ -18,7 +18,7 @@ NORMAL_NEIGHBORS = 20
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points and their unit normals, metres, in the caller's frame."""
+    """Points and their unit normals, metres."""
 
     points: Float32  # (N, 3)
     normals: Float32  # (N, 3)
@@ -71,32 +71,46 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
     return np.ascontiguousarray(cloud, dtype=np.float32)
 
 
-def voxel_downsample(points: Float32, voxel_size: float) -> Float32:
-    """Replace the points of each occupied voxel by their mean.
+@dataclass(frozen=True)
+class Voxels:
+    """The occupied voxels of a cloud, ordered by place: the order of the points does not matter."""
 
-    Args:
-        points: (N, 3).
-        voxel_size: Edge of a voxel, metres.
+    voxel: NDArray[np.int64]  # (N,) voxel of each point
+    size: NDArray[np.int64]  # (V,) points in each
 
-    Returns:
-        (V, 3), ordered by voxel, so that the order of the input does not matter.
-    """
+    def mean(self, values: NDArray[np.floating]) -> Float32:
+        """Mean (V, 3) of a vector of each point (N, 3)."""
+        sums = [np.bincount(self.voxel, values[:, axis], len(self.size)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
+
+    def share(self, holds: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Share (V,) of each voxel's points for which something holds (N,)."""
+        return np.bincount(self.voxel, holds, len(self.size)) / self.size
+
+    def commonest(self, labels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Commonest label (V,) in each voxel, of labels (N,) from 0 to count - 1."""
+        tally = np.bincount(self.voxel * count + labels, minlength=count * len(self.size))
+        best: NDArray[np.int64] = tally.reshape(-1, count).argmax(axis=1)
+        return best
+
+
+def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
+    """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
     low = points.min(axis=0).astype(np.float64)
     cells = np.floor((points - low) / voxel_size).astype(np.int64)  # (N, 3)
     sizes = cells.max(axis=0) + 1
     keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(voxel, weights=points[:, axis]) for axis in range(3)], axis=1)
-    return (sums / count[:, None]).astype(np.float32)
+    return Voxels(voxel, count)
 
 
-def without_outliers(points: Float32) -> Float32:
-    """Drop points whose mean distance to their neighbours is far above the cloud's own."""
+def inliers(points: Float32) -> NDArray[np.bool_]:
+    """Which points (N,) are not far from their neighbours by the measure of the whole cloud."""
     if len(points) <= OUTLIER_NEIGHBORS:
-        return points
+        return np.ones(len(points), dtype=bool)
     distances, _ = cKDTree(points).query(points, k=range(2, OUTLIER_NEIGHBORS + 2))
     mean = np.mean(distances, axis=1)
-    kept: Float32 = points[mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()]
+    kept: NDArray[np.bool_] = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
     return kept
 
 
@@ -118,7 +132,7 @@ def estimate_normals(points: Float32) -> Float32:
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
-    """Turn each normal to the side of its surface that the viewpoint sees."""
+    """Turn each normal to the side of its surface that the viewpoint, (3,) or (N, 3), sees."""
     away = np.einsum("nd,nd->n", normals, viewpoint - points) < 0
     return np.where(away[:, None], -normals, normals).astype(np.float32)
 

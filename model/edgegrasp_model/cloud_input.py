@@ -34,6 +34,17 @@ class CheckedCloud:
     segment_ids: NDArray[np.int64] | None = None  # (N,)
     view_ids: NDArray[np.int64] | None = None  # (N,)
 
+    def take(self, kept: NDArray[np.bool_]) -> "CheckedCloud":
+        """The points for which `kept` (N,) holds; rows are counted as before."""
+        return CheckedCloud(
+            self.points[kept],
+            self.row[kept],
+            self.rows_sent,
+            None if self.normals is None else self.normals[kept],
+            None if self.segment_ids is None else self.segment_ids[kept],
+            None if self.view_ids is None else self.view_ids[kept],
+        )
+
 
 def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
     """Check a caller's cloud, and drop the holes of an organised one.

@@ -1,31 +1,191 @@
-"""Where the hand would hit the cloud, and how far its fingers must open."""
+"""Where the hand would hit something, how near it comes, and how far its fingers must open."""
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from edgegrasp_model.candidates import support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import APPROACH_LENGTH, HandView
+from edgegrasp_model.hand_view import CHUNK, HandView, Reach, reach_of
+from edgegrasp_model.obstacles import SolidBoxes, separation, signed_distance
+from edgegrasp_model.options import Collision
+from edgegrasp_model.scene import Scene
+from edgegrasp_model.support import SupportPlane
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
+TOUCH = 1e-6  # metres; hands drawn back onto the support plane end this near to it
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 
 
-def collides(view: HandView, gripper: Gripper) -> NDArray[np.bool_]:
-    """Which open hands meet a point of the cloud at the grasp or on the straight way to it.
+def collides(
+    scene: Scene, view: HandView, T_cloud_hand: Float32, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which open hands meet the cloud, the support plane or an obstacle.
+
+    At the grasp, on the straight way to it and on the way out, each box of the hand grown by the
+    margin on every side.
 
     Args:
-        view: The cloud from the hands of E candidates.
+        scene: Cloud, support plane and obstacles, canonical frame.
+        view: The cloud from the E hands, within `collision_reach`.
+        T_cloud_hand: (E, 4, 4), canonical frame.
         gripper: Its boxes, fingers open to the maximum.
+        request: Margin and ways.
 
     Returns:
         (E,)
     """
-    hit = np.zeros(len(view.candidate), dtype=bool)
-    for low, high in gripper.boxes(gripper.max_opening):
-        swept = low - np.array([0.0, 0.0, APPROACH_LENGTH])
-        hit |= ((view.position > swept) & (view.position < high)).all(axis=1)
+    hit = meets_cloud(view, T_cloud_hand, gripper, request)
+    if scene.support is not None:
+        hit |= meets_support(T_cloud_hand, scene.support, gripper, request)
+    if len(scene.obstacles):
+        hit |= meets_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+    return hit
+
+
+def collision_reach(gripper: Gripper, request: Collision) -> Reach:
+    """What of the cloud has to be seen from a hand to know whether it collides."""
+    lift = request.retreat_length if request.retreat_direction == "up" else 0.0
+    return reach_of(gripper, around=request.margin, back=_way_back(request), lift=lift)
+
+
+def meets_cloud(
+    view: HandView, T_cloud_hand: Float32, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which open hands meet a point of the cloud.  # (E,)."""
+    position = view.position
+    hit = np.zeros(len(position), dtype=bool)
+    boxes = _grown_boxes(gripper, request)
+    for low, high in _lengthened(boxes, request):
+        hit |= ((position > low) & (position < high)).all(axis=1)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        lift = request.retreat_length * (UP @ T_cloud_hand[view.candidate, :3, :3])  # (P, 3)
+        for low, high in boxes:
+            hit |= _passed_over(position, lift, low, high)
     result = np.zeros(view.num_candidates, dtype=bool)
     result[view.candidate[hit]] = True
     return result
+
+
+def meets_support(
+    T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which hands come nearer to the support plane than the margin.  # (E,)."""
+    normal = np.asarray(support.normal)
+    height = support_clearance(T_cloud_hand, support, gripper)
+    rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
+    lowest = np.minimum(height, height + _way_back(request) * rise)
+    if request.retreat_direction == "up":
+        lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
+    return np.asarray(lowest < request.margin - TOUCH)
+
+
+def meets_obstacles(
+    T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which open hands meet a box.  # (E,)."""
+    grown = _grown_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, _lengthened(grown, request))
+    hit = _meets_any(at_rest, obstacles, None)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        hands = SolidBoxes.of_hands(T_cloud_hand, grown)
+        hit |= _meets_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
+    return np.asarray(hit.reshape(len(T_cloud_hand), -1).any(axis=1))
+
+
+def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Distance of each open hand at the grasp to what is nearest: cloud, support or obstacle.
+
+    Args:
+        scene: Canonical frame.
+        T_cloud_hand: (E, 4, 4), canonical frame.
+        gripper: Its boxes, fingers open to the maximum.
+
+    Returns:
+        (E,) metres. Where something is within the hand: minus how deep the deepest lies under
+        the surface of the box it is in.
+    """
+    nearest = _cloud_clearance(scene.cloud.points, T_cloud_hand, gripper)
+    if scene.support is not None:
+        nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
+    boxes = gripper.boxes(gripper.max_opening)
+    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
+    for place in range(len(scene.obstacles)):
+        box = scene.obstacles.take(np.full(len(hands), place))
+        # A bound that costs little leaves few boxes to measure exactly.
+        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
+        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
+        distance = np.full(len(hands), np.inf)
+        distance[near] = signed_distance(hands.take(near), box.take(near))
+        nearest = np.minimum(nearest, distance.reshape(-1, len(boxes)).min(axis=1))
+    return nearest.astype(np.float32)
+
+
+def _cloud_clearance(points: Float32, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Signed distance (E,) of points (N, 3) to the boxes of each hand, the least."""
+    boxes = torch.from_numpy(gripper.boxes(gripper.max_opening).astype(np.float32))
+    middle, extent = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3)
+    pose = torch.from_numpy(T_cloud_hand)
+    turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
+    shift = -turn @ pose[:, :3, 3:]
+    columns = torch.from_numpy(np.ascontiguousarray(points.T))  # (3, N)
+    nearest = torch.full((len(pose),), torch.inf)
+    for start in range(0, len(pose), CHUNK):
+        part = slice(start, start + CHUNK)
+        position = torch.baddbmm(shift[part], turn[part], columns.expand(len(turn[part]), -1, -1))
+        for center, half in zip(middle, extent, strict=True):
+            beyond = (position - center[:, None]).abs_() - half[:, None]  # (chunk, 3, N)
+            inside = beyond.amax(dim=1).clamp_(max=0.0)
+            outside = beyond.clamp_(min=0.0).square_().sum(dim=1).sqrt_()
+            nearest[part] = torch.minimum(nearest[part], (inside + outside).amin(dim=1))
+    return nearest.numpy()
+
+
+def _way_back(request: Collision) -> float:
+    """Metres of straight way behind the grasp that the hand passes."""
+    out = request.retreat_length if request.retreat_direction == "back" else 0.0
+    return max(request.approach_length, out)
+
+
+def _grown_boxes(gripper: Gripper, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) of the open hand with the margin around them."""
+    boxes = gripper.boxes(gripper.max_opening)
+    boxes[:, 0] -= request.margin
+    boxes[:, 1] += request.margin
+    return boxes
+
+
+def _lengthened(boxes: Float64, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) that also cover the ways along the hand's z."""
+    swept = boxes.copy()
+    swept[:, 0, 2] -= _way_back(request)
+    return swept
+
+
+def _passed_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
+    """Which points (P, 3) a box (3,), (3,) passes over while it moves by `lift` (P, 3)."""
+    step = np.where(np.abs(lift) < 1e-12, 1e-12, lift)
+    one, other = (position - high) / step, (position - low) / step  # shares of the way
+    enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+    return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
+
+
+def _meets_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
+    """Which boxes (M,), moved along `sweep` (3,), meet an obstacle."""
+    hit = np.zeros(len(boxes), dtype=bool)
+    way = np.zeros(3) if sweep is None else sweep
+    for center, half in zip(obstacles.center, obstacles.half, strict=True):
+        apart = np.linalg.norm(center - boxes.center - way / 2, axis=1)
+        bound = boxes.radius + np.linalg.norm(half) + np.linalg.norm(way) / 2
+        near = np.flatnonzero(~hit & (apart < bound))
+        theirs = SolidBoxes(np.tile(center, (len(near), 1)), np.tile(half, (len(near), 1, 1)))
+        moved = None if sweep is None else np.tile(sweep, (len(near), 1))
+        hit[near] = separation(boxes.take(near), theirs, moved) < 0
+    return hit
 
 
 def widths_needed(view: HandView, gripper: Gripper) -> NDArray[np.float32]:

@@ -1,27 +1,33 @@
 """The pipeline: a point cloud in, ranked grasps out."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from edgegrasp_model.assembly import debug_info, grasps_in_cloud
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
-from edgegrasp_model.cloud import Cloud, validate_cloud
-from edgegrasp_model.collision import widths_needed
+from edgegrasp_model.cloud_input import CheckedCloud, check_cloud
+from edgegrasp_model.collision import UP, clearances, widths_needed
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.evaluation import Scorer, evaluate
+from edgegrasp_model.given_grasps import check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, load_gripper
+from edgegrasp_model.gripper_choice import chosen_gripper
 from edgegrasp_model.hand_description import describe_hands
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.preparation import Sample, clean_cloud, sample_candidates
-from edgegrasp_model.ranking import ranked, suppress
-from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_model.preparation import Sample, sample_candidates
+from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
+from edgegrasp_model.scene import Scene, build_scene
+from edgegrasp_model.selection import select
 
 Float32 = NDArray[np.float32]
 
@@ -31,7 +37,9 @@ class Prepared:
     """A request between the stages: what to score, and what to make of the scores."""
 
     options: DetectOptions
-    cloud: Cloud | None = None
+    gripper: Gripper
+    crop_radius: float  # metres
+    scene: Scene | None = None
     sample: Sample | None = None
     width: Float32 | None = None  # (E,) metres
     batch: BallBatch | None = None  # None where there is nothing to score
@@ -46,9 +54,13 @@ class Prepared:
         yield
         self.seconds[stage] = time.perf_counter() - start
 
+    def total_seconds(self) -> dict[str, float]:
+        """Seconds of each stage and of all."""
+        return self.seconds | {"total": sum(self.seconds.values())}
+
 
 class GraspDetector:
-    """Detects grasps with one network and one gripper; holds no state between requests."""
+    """Detects grasps with one network; holds no state between requests."""
 
     def __init__(
         self,
@@ -56,14 +68,30 @@ class GraspDetector:
         metadata: CheckpointMetadata,
         gripper: Gripper,
         device: torch.device | str = "cpu",
+        grippers: Mapping[str, Gripper] | None = None,
     ) -> None:
+        """Wrap a network.
+
+        Args:
+            network: Scores the candidates.
+            metadata: What its weights were trained for.
+            gripper: The one it was trained for, used where a request names none.
+            device: Where it runs.
+            grippers: A user's own that requests may name, beside those that ship.
+        """
         self.network = network.to(device).eval()
         self.metadata = metadata
         self.gripper = gripper
         self.device = device
+        self.grippers = dict(grippers or {})
 
     @classmethod
-    def load(cls, path: Path, device: torch.device | str = "cpu") -> Self:
+    def load(
+        cls,
+        path: Path,
+        device: torch.device | str = "cpu",
+        grippers: Mapping[str, Gripper] | None = None,
+    ) -> Self:
         """Load a checkpoint and the gripper it was trained for.
 
         Raises:
@@ -71,20 +99,21 @@ class GraspDetector:
             InvalidGripper: Its gripper is not known here.
         """
         network, metadata = load_checkpoint(path, device)
-        return cls(network, metadata, load_gripper(metadata.gripper), device)
+        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
 
         Args:
-            cloud: (N, 3) float32 or float64 array, metres; its frame is the frame of the result.
+            cloud: (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
+                CloudInput. Its frame is the frame of the options and of the result.
             options: What to ask for; the defaults where omitted.
 
         Returns:
             Ranked grasps. None found is an answer too: the counts and warnings say why.
 
         Raises:
-            InvalidRequest: The cloud cannot be used; names field, value and fix.
+            InvalidRequest: The cloud or an option cannot be used; names field, value and fix.
         """
         prepared = self.prepare(cloud, options or DetectOptions())
         with prepared.timed("network"):
@@ -93,35 +122,26 @@ class GraspDetector:
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
         """First stage: everything before the network, on the processor."""
-        points = validate_cloud(cloud, options.num_approach_points)
-        prepared = Prepared(options)
-        if options.viewpoint is None:
+        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points), options)
+        scene, gripper = prepared.scene, prepared.gripper
+        if scene is None:
+            return prepared
+        if not scene.approach_allowed.any():
             prepared.warnings.append(
-                "viewpoint is not given: normals are turned upward; send the camera's position."
-            )
-        with prepared.timed("cloud"):
-            clean = clean_cloud(points, options, self.metadata.voxel_size, prepared.counts)
-        if clean is None:
-            prepared.warnings.append(
-                f"only {prepared.counts['kept']} points are left after cropping and cleaning."
+                "the approach region holds no point of the processed cloud. Rows hold a voxel by "
+                "half of its points: around a single point, send a sphere."
             )
             return prepared
         with prepared.timed("candidates"):
-            sample = sample_candidates(
-                clean,
-                options,
-                self.gripper,
-                self.metadata.crop_radius,
-                self.metadata.k,
-                prepared.counts,
-            )
-        prepared.cloud, prepared.sample = clean, sample
+            radius, k = prepared.crop_radius, self.metadata.k
+            sample = sample_candidates(scene, options, gripper, radius, k, prepared.counts)
+        prepared.sample = sample
         if len(sample.candidates) == 0:
             prepared.warnings.append("no candidate satisfies every constraint; see counts.")
             return prepared
         with prepared.timed("description"):
-            prepared.width = widths_needed(sample.view, self.gripper)
-            prepared.batch = self._batch(clean, sample, options)
+            prepared.width = widths_needed(sample.view, gripper)
+            prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
     def run(self, batch: BallBatch) -> Float32:
@@ -132,22 +152,125 @@ class GraspDetector:
 
     def finish(self, prepared: Prepared, logits: NDArray[np.floating]) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
+        scene, sample, width = prepared.scene, prepared.sample, prepared.width
+        counts, options, gripper = prepared.counts, prepared.options, prepared.gripper
+        grasps, debug = [], None
         with prepared.timed("ranking"):
-            grasps = self._ranked_grasps(prepared, logits) if len(logits) else []
-        prepared.counts["returned"] = len(grasps)
-        seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
-        return Detection(grasps, prepared.counts, seconds, self.metadata.name, prepared.warnings)
+            score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
+            if scene is not None and sample is not None and width is not None:
+                rows, outcome = select(scene, sample, score, gripper, options, counts)
+                best, free = sample.candidates.take(rows), sample.collision_free[rows]
+                clear = clearances(scene, best.T_cloud_hand, gripper)
+                grasps = grasps_in_cloud(
+                    scene, best, gripper, score[rows], width[rows], free, clear
+                )
+            if options.debug and scene is not None:
+                debug = debug_info(scene, sample, score, outcome)
+        counts["returned"] = len(grasps)
+        seconds, name = prepared.total_seconds(), self.metadata.name
+        return Detection(grasps, counts, seconds, name, prepared.warnings, debug)
 
-    def _batch(self, cloud: Cloud, sample: Sample, options: DetectOptions) -> BallBatch:
+    def score(
+        self,
+        cloud: object,
+        options: DetectOptions | None = None,
+        *,
+        edges: object | None = None,
+        hand_poses: object | None = None,
+    ) -> Scoring:
+        """Score edges or hand poses of the caller's (the paper's grasp evaluation function).
+
+        Options say what the scene is, which hand it is and what it must not meet. Regions,
+        directions and what concerns sampling and selection have no effect. The hand of an edge
+        that would cut into the support plane is drawn back where that helps, as in `detect`;
+        given hand poses stay.
+
+        Args:
+            cloud: As for `detect`.
+            options: As for `detect`.
+            edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. They
+                stand for the points of the processed cloud that they went into.
+            hand_poses: (M, 4, 4) T_cloud_hand. Exactly one of the two is given.
+
+        Returns:
+            One evaluation for each edge or pose, in order.
+
+        Raises:
+            InvalidRequest: The cloud, an option, the edges or the poses cannot be used.
+        """
+        if (edges is None) == (hand_poses is None):
+            value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"
+            raise InvalidRequest("edges", value, "Send one of the two.")
+        sent, options = check_cloud(cloud), options or DetectOptions()
+        asked: NDArray[Any] = (
+            check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
+        )
+        no_region = {"approach_region": None, "contact_region": None}
+        prepared = self._with_scene(sent, options.model_copy(update=no_region))
+        evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
+        if prepared.scene is not None:
+            scene, gripper = prepared.scene, prepared.gripper
+            scorer = Scorer(
+                lambda batch: self._probability(self.run(batch)),
+                prepared.crop_radius,
+                self.metadata.k,
+                self.metadata.network.hand_description_size > 0,
+            )
+            with prepared.timed("candidates"):
+                if edges is None:
+                    poses = scene.frame.poses(asked)
+                    given = from_hand_poses(scene, poses, gripper, scorer.crop_radius)
+                else:
+                    margin = options.collision.margin
+                    given = from_edges(scene, asked, gripper, scorer.crop_radius, margin)
+            with prepared.timed("network"):
+                evaluations = evaluate(scene, given, gripper, options.collision, scorer)
+        prepared.counts["given"] = len(asked)
+        prepared.counts["scored"] = sum(each.grasp is not None for each in evaluations)
+        seconds, name = prepared.total_seconds(), self.metadata.name
+        return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
+
+    def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
+        """Choose the gripper and build the scene, where enough of the cloud is left."""
+        gripper = chosen_gripper(options, self.gripper, self.grippers)
+        radius = self.metadata.crop_radius
+        if options.gripper is not None:  # the ball has to hold every contact within reach
+            radius = max(radius, gripper.max_opening / 2)
+        prepared = Prepared(options, gripper, radius)
+        if gripper.name != self.gripper.name:
+            prepared.warnings.append(
+                f"the weights were trained for the gripper {self.gripper.name!r}: for "
+                f"{gripper.name!r} their scores rank grasps, but promise less."
+            )
+        if options.viewpoint is None and sent.normals is None:
+            prepared.warnings.append(
+                "viewpoint is not given: normals are turned upward; send the camera's position."
+            )
+        with prepared.timed("cloud"):
+            prepared.scene = build_scene(
+                sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
+            )
+        if prepared.scene is None:
+            prepared.warnings.append(
+                f"only {prepared.counts['kept']} points are left after cropping and cleaning."
+            )
+        return prepared
+
+    def _probability(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Calibrated probabilities (E,) of logits (E,)."""
+        scaled = logits.astype(np.float64) / self.metadata.temperature
+        probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-scaled))
+        return probability
+
+    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> BallBatch:
         candidates, description = sample.candidates, None
         if self.metadata.network.hand_description_size:
-            up = np.asarray(options.up, dtype=np.float32)
             description = describe_hands(
-                cloud, candidates, self.gripper, up, options.support, sample.view
+                scene.cloud, candidates, gripper, UP, scene.support, sample.view
             )
         return BallBatch.from_cloud(
-            cloud.points,
-            cloud.normals,
+            scene.cloud.points,
+            scene.cloud.normals,
             sample.approach_index,
             sample.crop,
             candidates.pair,
@@ -155,34 +278,3 @@ class GraspDetector:
             candidates.depth,
             description,
         )
-
-    def _ranked_grasps(self, prepared: Prepared, logits: NDArray[np.floating]) -> list[Grasp]:
-        sample, cloud, width = prepared.sample, prepared.cloud, prepared.width
-        assert sample is not None
-        assert cloud is not None
-        assert width is not None
-        options, counts = prepared.options, prepared.counts
-        score = 1.0 / (1.0 + np.exp(-logits.astype(np.float64) / self.metadata.temperature))
-        order = ranked(score, sample.collision_free)
-        order = order[score[order] >= options.min_score]
-        counts["above_min_score"] = len(order)
-        T_cloud_hand = sample.candidates.T_cloud_hand
-        T_cloud_tcp = T_cloud_hand @ self.gripper.T_hand_tcp
-        if options.suppression is not None:
-            order = suppress(T_cloud_tcp, order, options.suppression, options.top_k)
-        order = order[: options.top_k]
-        candidates = sample.candidates
-        return [
-            Grasp(
-                score=float(np.float32(score[row])),
-                T_cloud_hand=T_cloud_hand[row],
-                T_cloud_tcp=T_cloud_tcp[row],
-                width=float(width[row]),
-                approach_point=cloud.points[candidates.approach_index[row]],
-                contact_point=cloud.points[candidates.contact_index[row]],
-                approach_direction=T_cloud_hand[row, :3, 2],
-                collision_free=bool(sample.collision_free[row]),
-                clearance=0.0,
-            )
-            for row in order
-        ]

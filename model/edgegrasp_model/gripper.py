@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -175,6 +175,26 @@ class Gripper:
         left[..., 0, 1], left[..., 1, 1] = -right[..., 1, 1], -right[..., 0, 1]
         hand = np.broadcast_to(np.asarray(self.hand_boxes), (*opening.shape, *self._hand_shape))
         return np.concatenate([hand, right, left], axis=-3)
+
+    def opened_to(self, opening: float) -> "Gripper":
+        """The same gripper where it opens no further than to `opening` metres."""
+        ahead = float(self.tip_advance(opening))
+        forward = tuple(
+            ((low[0], low[1], low[2] + ahead), (high[0], high[1], high[2] + ahead))
+            for low, high in self.finger_boxes
+        )
+        swing = self.swing
+        if swing is not None:
+            reach = swing.reach - (self.max_opening - opening) / 2
+            swing = Swing(radius=swing.radius, reach=reach)
+        return replace(
+            self,
+            max_opening=opening,
+            tip_z=self.tip_z + ahead,
+            contact_z=self.contact_z + ahead,
+            finger_boxes=forward,
+            swing=swing,
+        )
 
     @property
     def _hand_shape(self) -> tuple[int, int, int]:

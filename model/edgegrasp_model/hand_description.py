@@ -5,75 +5,21 @@ from: how many points the hand would hit, what lies between its fingers, how it 
 and support. The classifier of `edgegrasp-plus` reads it beside the paper's edge feature.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import Candidates, support_clearance
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Boxes, Gripper
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView, hand_views, reach_of
+from edgegrasp_model.support import SupportPlane
 
 Float32 = NDArray[np.float32]
 
-NEAR = 0.006  # metres around a finger that count as near it
-APPROACH_LENGTH = 0.05  # metres of straight approach before the grasp
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
-CHUNK = 128  # candidates at a time, so that the work stays in cache
-
-
-@dataclass(frozen=True)
-class HandView:
-    """Cloud points in the hand frames of some candidates, those far from the hand left out."""
-
-    candidate: NDArray[np.int64]  # (P,) ascending
-    row: NDArray[np.int64]  # (P,) row of the cloud
-    position: Float32  # (P, 3) in the hand frame
-    num_candidates: int
-
-    def take(self, rows: NDArray[np.int64]) -> "HandView":
-        """The views of the given candidates, which must ascend."""
-        renumbered = np.full(self.num_candidates, -1, dtype=np.int64)
-        renumbered[rows] = np.arange(len(rows))
-        kept = renumbered[self.candidate] >= 0
-        return HandView(
-            renumbered[self.candidate[kept]], self.row[kept], self.position[kept], len(rows)
-        )
-
-
-def hand_views(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper) -> HandView:
-    """See the cloud from each hand, within the reach of its boxes and its straight approach.
-
-    Args:
-        cloud: N points.
-        T_cloud_hand: (E, 4, 4).
-        gripper: Its boxes bound what is kept.
-    """
-    boxes = gripper.boxes(gripper.max_opening)
-    low = boxes[:, 0].min(axis=0) - np.array([NEAR, NEAR, APPROACH_LENGTH])
-    high = boxes[:, 1].max(axis=0) + np.array([NEAR, NEAR, 2 * NEAR])
-    high[2] += gripper.foremost_z - gripper.tip_z
-    points = torch.from_numpy(np.ascontiguousarray(cloud.points.T))  # (3, N)
-    pose = torch.from_numpy(T_cloud_hand)
-    turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
-    shift = -turn @ pose[:, :3, 3:]  # (E, 3, 1)
-    found = [(torch.empty(0, dtype=torch.int64),) * 2 + (torch.empty(0, 3),)]
-    for start in range(0, len(pose), CHUNK):
-        part = slice(start, start + CHUNK)
-        position = torch.baddbmm(shift[part], turn[part], points.expand(len(turn[part]), -1, -1))
-        inside = torch.ones_like(position[:, 0], dtype=torch.bool)  # (chunk, N)
-        for axis in range(3):
-            along = position[:, axis]
-            inside &= (along > float(low[axis])) & (along < float(high[axis]))
-        candidate, row = inside.nonzero(as_tuple=True)
-        found.append((candidate + start, row, position.transpose(1, 2)[candidate, row]))
-    candidates, rows, positions = (torch.cat(parts).numpy() for parts in zip(*found, strict=True))
-    return HandView(candidates, rows, positions, len(T_cloud_hand))
 
 
 class _Region:
@@ -127,7 +73,8 @@ def describe_hands(
     Returns:
         (E, HAND_DESCRIPTION_SIZE) counts (logarithm of 1 + n), metres and cosines.
     """
-    view = view or hand_views(cloud, candidates.T_cloud_hand, gripper)
+    reach = reach_of(gripper)
+    view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
     x, y, z = (np.ascontiguousarray(column) for column in view.position.T)
     turn = candidates.T_cloud_hand[view.candidate, :3, :3]
     normal = np.einsum("pd,pdk->kp", cloud.normals[view.row], turn)  # (3, P)

@@ -1,82 +1,53 @@
-"""From a caller's cloud to the candidates that the network scores."""
+"""From a scene to the candidates that the network scores."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model import cloud as clouds
 from edgegrasp_model.ball_batch import BallCrop, crop_balls
-from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, from_above, level_grasps
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import collides
+from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
+from edgegrasp_model.collision import UP, collides, collision_reach
+from edgegrasp_model.directions import allowed_ways
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import HandView, hand_views
+from edgegrasp_model.hand_view import HandView, hand_views
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import Outcome
 from edgegrasp_model.sampling import sample_approach_points
+from edgegrasp_model.scene import Scene
 
-Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
-SUPPORT_MARGIN = 0.005  # metres above the support plane below which points belong to it
-MIN_POINTS = 4  # fewer make no surface
 SAMPLING_ROUNDS = 4  # further approach points are tried where no hand is free of collision
 OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
 APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
+CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
+
+
+@dataclass(frozen=True)
+class Round:
+    """Every candidate around one set of approach points, and what has become of it so far."""
+
+    candidates: Candidates  # E of them
+    outcome: NDArray[np.int8]  # (E,) CODE of its Outcome; RETURNED: still in
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Candidates around one set of approach points."""
+    """The candidates to score, around one set of approach points; canonical frame."""
 
-    approach_index: NDArray[np.int64]  # (A,) rows of the cloud
+    approach_index: Int64  # (A,) rows of the cloud
     crop: BallCrop
     candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
     view: HandView  # of the same candidates
-    collision_free: NDArray[np.bool_]  # (E,)
-
-
-def clean_cloud(
-    points: Float32, options: DetectOptions, voxel_size: float, counts: dict[str, int]
-) -> Cloud | None:
-    """Crop, voxelise, drop outliers, estimate normals and turn them to the viewpoint.
-
-    Args:
-        points: (N, 3) validated, metres.
-        options: workspace, support, viewpoint and up.
-        voxel_size: Metres.
-        counts: Gets the number of points left after each step.
-
-    Returns:
-        The cloud, or None where too few points are left to make a surface.
-    """
-    counts["points"] = len(points)
-    if options.workspace is not None:
-        box = options.workspace
-        inside = (points >= np.asarray(box.min)) & (points <= np.asarray(box.max))
-        points = points[inside.all(axis=1)]
-    counts["in_workspace"] = len(points)
-    if options.support is not None:
-        height = points @ np.asarray(options.support.normal) - options.support.offset
-        points = points[height > SUPPORT_MARGIN]
-    counts["above_support"] = len(points)
-    if len(points):
-        points = clouds.voxel_downsample(points, voxel_size)
-    counts["voxels"] = len(points)
-    if len(points):
-        points = clouds.without_outliers(points)
-    counts["kept"] = len(points)
-    if len(points) < MIN_POINTS:
-        return None
-    up = np.asarray(options.up, dtype=np.float32)
-    viewpoint = clouds.assumed_viewpoint(points, up)
-    if options.viewpoint is not None:
-        viewpoint = np.asarray(options.viewpoint, dtype=np.float32)
-    normals = clouds.orient_normals(points, clouds.estimate_normals(points), viewpoint)
-    return Cloud(points, normals)
+    collision_free: Bools  # (E,)
+    rounds: list[Round]  # the last of which holds these candidates
+    row: Int64  # (E,) their rows in it
 
 
 def sample_candidates(
-    cloud: Cloud,
+    scene: Scene,
     options: DetectOptions,
     gripper: Gripper,
     crop_radius: float,
@@ -86,7 +57,7 @@ def sample_candidates(
     """Sample approach points and the candidates around them, free of collision where possible.
 
     Args:
-        cloud: The clean cloud.
+        scene: With at least one point in the approach region.
         options: Sampling, constraints and seed.
         gripper: What has to fit.
         crop_radius: Radius of the balls, metres.
@@ -98,54 +69,85 @@ def sample_candidates(
     """
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
     rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
-    for _ in range(SAMPLING_ROUNDS):
-        approach_index = sample_approach_points(
-            cloud.points, options.num_approach_points, options.sampling, rng_approach
+    approach_rows = np.flatnonzero(scene.approach_allowed)
+    limit = OVERSAMPLING * options.num_candidates
+    rounds: list[Round] = []
+    while True:
+        chosen = sample_approach_points(
+            scene.cloud.points[approach_rows],
+            options.num_approach_points,
+            options.sampling,
+            rng_approach,
         )
-        crop = crop_balls(cloud.points, approach_index, crop_radius, k)
-        candidates = _constrained(cloud, approach_index, crop, options, gripper, counts)
-        limit = OVERSAMPLING * options.num_candidates
-        if len(candidates) > limit:
-            candidates = candidates.take(_subset(len(candidates), limit, rng_candidates))
-        view = hand_views(cloud, candidates.T_cloud_hand, gripper)
-        free = ~collides(view, gripper)
+        approach_index = approach_rows[chosen]
+        crop = crop_balls(scene.cloud.points, approach_index, crop_radius, k)
+        this = _constrained(scene, approach_index, crop, options, gripper, counts)
+        rounds.append(this)
+        passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
+        row = passed[_subset(len(passed), limit, rng_candidates)]
+        this.outcome[passed] = CODE[Outcome.NOT_CHECKED]
+        candidates = this.candidates.take(row)
+        reach = collision_reach(gripper, options.collision)
+        view = hand_views(scene.cloud, candidates.T_cloud_hand, reach)
+        free = ~collides(scene, view, candidates.T_cloud_hand, gripper, options.collision)
+        ignored = options.collision.mode == "ignore"
+        this.outcome[row] = CODE[Outcome.NOT_SCORED]
+        this.outcome[row[~free & ~ignored]] = CODE[Outcome.COLLISION]
+        _add(counts, "checked", len(row))
         _add(counts, "collision_free", int(free.sum()))
-        if free.any() or options.collision.mode == "ignore":
+        found = len(row) > 0 if ignored else free.any()
+        # The same approach points would come up again, and the same candidates around them.
+        exhausted = len(approach_rows) <= len(chosen) and len(passed) <= limit
+        if found or exhausted or len(rounds) == SAMPLING_ROUNDS:
             break
-    rows = _preferred(free, options, rng_candidates)
-    counts["scored"] = len(rows)
-    return Sample(approach_index, crop, candidates.take(rows), view.take(rows), free[rows])
+    scored = _preferred(free, options, rng_candidates)
+    this.outcome[row[scored]] = CODE[Outcome.RETURNED]
+    counts["scored"] = len(scored)
+    return Sample(
+        approach_index,
+        crop,
+        candidates.take(scored),
+        view.take(scored),
+        free[scored],
+        rounds,
+        row[scored],
+    )
 
 
 def _constrained(
-    cloud: Cloud,
-    approach_index: NDArray[np.int64],
+    scene: Scene,
+    approach_index: Int64,
     crop: BallCrop,
     options: DetectOptions,
     gripper: Gripper,
     counts: dict[str, int],
-) -> Candidates:
-    """The edge grasps of some balls that satisfy every constraint but collision."""
+) -> Round:
+    """The edge grasps of some balls, and which satisfy every constraint but collision."""
     _add(counts, "approach_points", len(approach_index))
     _add(counts, "pairs", len(crop.ball_rows))
-    pairs = approach_index[crop.ball_of_point], crop.ball_rows
-    candidates = edge_grasps(cloud, *pairs, gripper)
-    if options.support is not None:
-        level = level_grasps(cloud, *pairs, options.support, gripper)
+    pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
+    _add(counts, "in_contact_region", len(pair))
+    pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
+    candidates = edge_grasps(scene.cloud, *pairs, gripper)
+    if scene.support is not None:
+        level = level_grasps(scene.cloud, *pairs, scene.support, gripper)
         candidates = Candidates.concatenate([candidates, level])
+    candidates = replace(candidates, pair=pair[candidates.pair])
     _add(counts, "candidates", len(candidates))
-    up = np.asarray(options.up, dtype=np.float32)
-    candidates = candidates.take(from_above(candidates, up))
-    _add(counts, "from_above", len(candidates))
-    if options.support is not None:
-        candidates = drawn_back(candidates, options.support, gripper)
-    _add(counts, "clear_of_support", len(candidates))
-    return candidates
+    outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
+    if scene.support is not None:
+        margin = options.collision.margin
+        candidates, clear = drawn_back(candidates, scene.support, gripper, margin)
+        outcome[~clear] = CODE[Outcome.SUPPORT]
+    way = -candidates.approach
+    allowed = allowed_ways(way, options.approach_direction, UP, scene.frame.directions)
+    outcome[~allowed] = CODE[Outcome.DIRECTION]
+    _add(counts, "in_direction", int(allowed.sum()))
+    _add(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
+    return Round(candidates, outcome)
 
 
-def _preferred(
-    free: NDArray[np.bool_], options: DetectOptions, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _preferred(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
     """Ascending rows of at most num_candidates candidates, those free of collision first."""
     if options.collision.mode == "ignore":
         return _subset(len(free), options.num_candidates, rng)
@@ -157,7 +159,7 @@ def _preferred(
     return rows
 
 
-def _subset(size: int, limit: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _subset(size: int, limit: int, rng: np.random.Generator) -> Int64:
     """Ascending rows of at most `limit` out of `size`."""
     if size <= limit:
         return np.arange(size, dtype=np.int64)

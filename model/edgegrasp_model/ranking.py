@@ -1,5 +1,7 @@
 """Order scored grasps and thin out near duplicates."""
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,15 +9,38 @@ from edgegrasp_model.options import Suppression
 
 Float32 = NDArray[np.float32]
 
+SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 
-def ranked(score: NDArray[np.floating], collision_free: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows best first: collision-free ones before the others, then by score.  # (E,)."""
-    return np.lexsort((-score, ~collision_free)).astype(np.int64)
+
+def ranked(
+    score: NDArray[np.floating],
+    collision_free: NDArray[np.bool_],
+    order: Literal["score", "highest", "clearance"] = "score",
+    height: NDArray[np.floating] | None = None,
+    clearance: NDArray[np.floating] | None = None,
+) -> NDArray[np.int64]:
+    """Rows best first: those free of collision before the others, and each of the two in order.
+
+    Args:
+        score: (E,) probabilities.
+        collision_free: (E,)
+        order: By score; by height where the score is SURE_SCORE or more, then the others by
+            score; or by clearance, then by score.
+        height: (E,) of the TCP along up, for `highest`.
+        clearance: (E,) for `clearance`.
+    """
+    keys: tuple[NDArray[np.floating], ...] = (-score,)
+    if order == "highest" and height is not None:
+        sure = score >= SURE_SCORE
+        keys = (-score, np.where(sure, -height, -score), np.where(sure, 0.0, 1.0))
+    if order == "clearance" and clearance is not None:
+        keys = (-score, -clearance)
+    return np.lexsort((*keys, ~collision_free)).astype(np.int64)
 
 
 def suppress(
     T_cloud_tcp: Float32, order: NDArray[np.int64], suppression: Suppression, top_k: int
-) -> NDArray[np.int64]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keep the best of each group of near duplicates.
 
     A hand and the same hand turned by 180 degrees about its approach count as one.
@@ -27,9 +52,10 @@ def suppress(
         top_k: How many to keep at most.
 
     Returns:
-        (at most top_k,) rows, best first.
+        (at most top_k,) rows kept, best first, and the rows that are near one of them.
     """
     kept: list[int] = []
+    dropped = [order[:0]]
     left = order
     while len(left) and len(kept) < top_k:
         best, left = int(left[0]), left[1:]
@@ -37,8 +63,9 @@ def suppress(
         apart = np.linalg.norm(T_cloud_tcp[left, :3, 3] - T_cloud_tcp[best, :3, 3], axis=1)
         turned = rotation_distance(T_cloud_tcp[left, :3, :3], T_cloud_tcp[best, :3, :3])
         near = (apart < suppression.translation) & (turned < suppression.rotation)
+        dropped.append(left[near])
         left = left[~near]
-    return np.asarray(kept, dtype=np.int64)
+    return np.asarray(kept, dtype=np.int64), np.concatenate(dropped)
 
 
 def rotation_distance(rotations: Float32, rotation: Float32) -> Float32:

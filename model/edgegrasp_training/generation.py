@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
-from edgegrasp_model.preparation import Sample, clean_cloud, sample_candidates
+from edgegrasp_model.preparation import Sample, sample_candidates
+from edgegrasp_model.scene import build_scene
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
@@ -134,20 +136,23 @@ def _label(
     """Sample candidates as the detector does and try some of them."""
     gripper = load_gripper()
     request = _request(observation, int(rng.integers(2**32)))
-    cloud = clean_cloud(observation.cloud, request, VOXEL_SIZE, {})
-    if cloud is None:
+    if len(observation.cloud) == 0:
         return _empty(observation)
-    sample = sample_candidates(cloud, request, gripper, SAMPLED_RADIUS, SAMPLED_K, {})
+    scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
+    if scene is None:
+        return _empty(observation)
+    sample = sample_candidates(scene, request, gripper, SAMPLED_RADIUS, SAMPLED_K, {})
     rows = _chosen(sample, options, rng)
     candidates = sample.candidates.take(rows)
-    outcomes = [simulation.try_grasp(pose).success for pose in candidates.T_cloud_hand]
+    T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    outcomes = [simulation.try_grasp(pose).success for pose in T_world_hand]
     return LabelledView(
-        points=cloud.points,
-        normals=cloud.normals,
+        points=scene.points_in_cloud,
+        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
         camera_position=observation.camera_position,
         approach_index=candidates.approach_index,
         contact_index=candidates.contact_index,
-        T_world_hand=candidates.T_cloud_hand,
+        T_world_hand=T_world_hand,
         success=np.asarray(outcomes, dtype=np.int8),
     )
 

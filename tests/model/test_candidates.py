@@ -6,12 +6,11 @@ from edgegrasp_model.candidates import (
     TIP_MARGIN,
     drawn_back,
     edge_grasps,
-    from_above,
     support_clearance,
 )
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.support import SupportPlane
 
 PANDA = load_gripper()
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
@@ -61,12 +60,6 @@ def test_a_point_does_not_make_an_edge_with_itself() -> None:
     assert len(edge_grasps(cloud, same, same, PANDA)) == 0
 
 
-def test_hands_from_below_are_told_apart() -> None:
-    _, candidates, _, _ = random_pairs(1)
-    up = np.array([0.0, 0.0, 2.0], dtype=np.float32)
-    np.testing.assert_array_equal(from_above(candidates, up), candidates.approach[:, 2] > -0.1)
-
-
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_support_clearance_is_the_lowest_point_of_any_box(seed: int) -> None:
@@ -86,7 +79,9 @@ def test_support_clearance_is_the_lowest_point_of_any_box(seed: int) -> None:
 def test_hands_are_drawn_back_just_out_of_the_table(seed: int) -> None:
     _, candidates, _, _ = random_pairs(seed)
     before = support_clearance(candidates.T_cloud_hand, TABLE, PANDA)
-    clear = drawn_back(candidates, TABLE, PANDA)
+    drawn, kept = drawn_back(candidates, TABLE, PANDA)
+    clear = drawn.take(kept)
+    np.testing.assert_array_equal(drawn.T_cloud_hand[~kept], candidates.T_cloud_hand[~kept])
     after = support_clearance(clear.T_cloud_hand, TABLE, PANDA)
     assert (after >= -1e-6).all()
     assert set(candidates.pair[before >= 0]) <= set(clear.pair)

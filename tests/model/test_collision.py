@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import FINGER_CLEARANCE, collides, widths_needed
+from edgegrasp_model.collision import FINGER_CLEARANCE, meets_cloud, widths_needed
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_description import APPROACH_LENGTH, hand_views
+from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
+from edgegrasp_model.options import Collision
 
 PANDA = load_gripper()
 HAND = np.eye(4, dtype=np.float32)[None]
@@ -12,7 +13,7 @@ HAND = np.eye(4, dtype=np.float32)[None]
 
 def seen(*points: tuple[float, float, float]):
     cloud = Cloud(np.array(points, np.float32), np.zeros((len(points), 3), np.float32))
-    return hand_views(cloud, HAND, PANDA)
+    return hand_views(cloud, HAND, reach_of(PANDA))
 
 
 @pytest.mark.parametrize(
@@ -31,7 +32,7 @@ def seen(*points: tuple[float, float, float]):
     ],
 )
 def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hits: bool) -> None:
-    assert collides(seen(point), PANDA).tolist() == [hits]
+    assert meets_cloud(seen(point), HAND, PANDA, Collision()).tolist() == [hits]
 
 
 def test_the_width_is_what_lies_between_the_fingers_and_clearance() -> None:
@@ -48,8 +49,8 @@ def test_views_of_some_hands_are_those_of_all_taken() -> None:
     hands[:, :3, 3] = rng.uniform(-0.05, 0.05, (9, 3))
     rows = np.array([1, 4, 8])
     taken, direct = (
-        hand_views(cloud, hands, PANDA).take(rows),
-        hand_views(cloud, hands[rows], PANDA),
+        hand_views(cloud, hands, reach_of(PANDA)).take(rows),
+        hand_views(cloud, hands[rows], reach_of(PANDA)),
     )
     np.testing.assert_array_equal(taken.candidate, direct.candidate)
     np.testing.assert_array_equal(taken.row, direct.row)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from edgegrasp_model.candidates import EDGE_MARGIN, edge_grasps, level_grasps, support_clearance
 from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import collides, widths_needed
+from edgegrasp_model.collision import meets_cloud, widths_needed
 from edgegrasp_model.errors import InvalidGripper
 from edgegrasp_model.gripper import (
     GRIPPER_FOLDER,
@@ -18,12 +18,14 @@ from edgegrasp_model.gripper import (
     gripper_names,
     load_gripper,
 )
-from edgegrasp_model.hand_description import describe_hands, hand_views
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.options import Collision, SupportPlane
 
 GRIPPERS = [load_gripper(name) for name in gripper_names()]
 SWINGING = [gripper for gripper in GRIPPERS if gripper.swing is not None]
 by_name = pytest.mark.parametrize("gripper", GRIPPERS, ids=lambda gripper: gripper.name)
+HAND = np.eye(4, dtype=np.float32)[None]
 swinging = pytest.mark.parametrize("gripper", SWINGING, ids=lambda gripper: gripper.name)
 
 
@@ -155,8 +157,8 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
     between = np.array([[0.0, 0.0, gripper.contact_z]], np.float32)
     for point, hits in [(c[None], True) for c in centres] + [(between, False)]:
         cloud = Cloud(point, np.zeros_like(point))
-        view = hand_views(cloud, np.eye(4, dtype=np.float32)[None], gripper)
-        assert collides(view, gripper).tolist() == [hits]
+        view = hand_views(cloud, HAND, reach_of(gripper))
+        assert meets_cloud(view, HAND, gripper, Collision()).tolist() == [hits]
     cloud = edge_cloud(0.02, 0.01)
     pose = edge_grasps(cloud, np.array([0]), np.array([1]), gripper)
     points = centres @ pose.T_cloud_hand[0, :3, :3].T + pose.T_cloud_hand[0, :3, 3]
@@ -172,7 +174,7 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
 @by_name
 def test_the_width_needed_reaches_past_what_stands_between_the_fingers(gripper: Any) -> None:
     point = np.array([[0.0, 0.01, gripper.contact_z]], np.float32)
-    view = hand_views(Cloud(point, point), np.eye(4, dtype=np.float32)[None], gripper)
+    view = hand_views(Cloud(point, point), HAND, reach_of(gripper))
     assert 0.02 < widths_needed(view, gripper)[0] <= gripper.max_opening
 
 

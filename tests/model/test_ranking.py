@@ -13,6 +13,20 @@ def test_collision_free_grasps_come_first_then_the_score_decides() -> None:
     assert ranked(score, free).tolist() == [3, 1, 2, 0]
 
 
+def test_the_highest_of_the_sure_grasps_comes_first_then_the_others_by_score() -> None:
+    score = np.array([0.95, 0.5, 0.91, 0.89, 0.99])
+    height = np.array([0.1, 0.9, 0.3, 0.8, 0.2])
+    free = np.array([True, True, True, True, False])
+    assert ranked(score, free, "highest", height=height).tolist() == [2, 0, 3, 1, 4]
+    assert ranked(score, free, "highest", height=-height).tolist() == [0, 2, 3, 1, 4]
+
+
+def test_the_widest_clearance_comes_first_then_the_score_decides() -> None:
+    score, clearance = np.array([0.1, 0.2, 0.9, 0.8]), np.array([0.01, 0.02, 0.01, 0.05])
+    free = np.array([True, True, True, False])
+    assert ranked(score, free, "clearance", clearance=clearance).tolist() == [1, 2, 0, 3]
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 def test_rotation_distance_is_the_angle_or_that_of_the_flipped_hand(seed: int) -> None:
     one, other = Rotation.random(2, rng=np.random.default_rng(seed))
@@ -28,7 +42,10 @@ def test_near_duplicates_fall_to_the_better_one() -> None:
     T_cloud_tcp[2, 0, 3] = 0.05  # elsewhere
     T_cloud_tcp[3, :3, :3] = Rotation.from_euler("x", 1.0).as_matrix()  # turned away
     rule = Suppression(translation=0.01, rotation=0.5)
-    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), rule, 10).tolist() == [1, 2, 3]
-    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), rule, 2).tolist() == [1, 2]
+    order = np.array([1, 0, 2, 3])
+    kept, dropped = suppress(T_cloud_tcp, order, rule, 10)
+    assert (kept.tolist(), dropped.tolist()) == ([1, 2, 3], [0])
+    assert suppress(T_cloud_tcp, order, rule, 2)[0].tolist() == [1, 2]
     none = Suppression(translation=0.0, rotation=0.0)
-    assert suppress(T_cloud_tcp, np.array([1, 0, 2, 3]), none, 10).tolist() == [1, 0, 2, 3]
+    kept, dropped = suppress(T_cloud_tcp, order, none, 10)
+    assert (kept.tolist(), dropped.tolist()) == ([1, 0, 2, 3], [])

@@ -1,0 +1,96 @@
+"""Score the edges and hand poses that a caller gives, ball by ball."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.assembly import grasps_in_cloud
+from edgegrasp_model.ball_batch import BallBatch, BallCrop, crop_balls
+from edgegrasp_model.candidates import Candidates
+from edgegrasp_model.collision import UP, clearances, collides, collision_reach, widths_needed
+from edgegrasp_model.given_grasps import Given
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_view import hand_views
+from edgegrasp_model.options import Collision
+from edgegrasp_model.results import Evaluation
+from edgegrasp_model.scene import Scene
+
+BALLS_AT_A_TIME = 64
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """A network as the evaluation sees it."""
+
+    probability: Callable[[BallBatch], NDArray[np.floating]]
+    crop_radius: float  # metres
+    k: int
+    described: bool  # whether it reads the hand-frame description
+
+
+def evaluate(
+    scene: Scene, given: Given, gripper: Gripper, request: Collision, scorer: Scorer
+) -> list[Evaluation]:
+    """Evaluate what a caller gives, in order.
+
+    Args:
+        scene: The scene.
+        given: Edges or hand poses as candidates.
+        gripper: The hand.
+        request: What collides.
+        scorer: The network.
+    """
+    candidates = given.candidates
+    view = hand_views(scene.cloud, candidates.T_cloud_hand, collision_reach(gripper, request))
+    description = None
+    if scorer.described:
+        description = describe_hands(scene.cloud, candidates, gripper, UP, scene.support, view)
+    score = np.empty(len(candidates))
+    balls = np.unique(candidates.approach_index)
+    for start in range(0, len(balls), BALLS_AT_A_TIME):
+        some = balls[start : start + BALLS_AT_A_TIME]
+        crop = crop_balls(scene.cloud.points, some, scorer.crop_radius, scorer.k)
+        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
+        here = candidates.take(rows)
+        score[rows] = scorer.probability(
+            BallBatch.from_cloud(
+                scene.cloud.points,
+                scene.cloud.normals,
+                some,
+                crop,
+                _contact_rows(here, some, crop, len(scene.cloud.points)),
+                here.approach,
+                here.depth,
+                None if description is None else description[rows],
+            )
+        )
+    if given.T_cloud_hand is not None:
+        candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
+    hands = candidates.T_cloud_hand
+    grasps = grasps_in_cloud(
+        scene,
+        candidates,
+        gripper,
+        score,
+        widths_needed(view, gripper),
+        ~collides(scene, view, given.candidates.T_cloud_hand, gripper, request),
+        clearances(scene, hands, gripper),
+    )
+    evaluations = [Evaluation(None, reason) for reason in given.reason]
+    for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
+        evaluations[number] = Evaluation(grasp, None)
+    return evaluations
+
+
+def _contact_rows(
+    candidates: Candidates, balls: NDArray[np.int64], crop: BallCrop, size: int
+) -> NDArray[np.int64]:
+    """Rows (E,) of the crop that hold the candidates' contacts, each in its own ball."""
+    keys = crop.ball_of_point * size + crop.ball_rows  # ascending
+    ball = np.searchsorted(balls, candidates.approach_index)
+    return np.searchsorted(keys, ball * size + candidates.contact_index).astype(np.int64)
