@@ -29,8 +29,8 @@ def _value(name: str, text: str) -> object:
     field = DetectOptions.model_fields.get(name)
     if field is not None and field.annotation is str:
         return text  # weights may be named 7 or null
-    if name == "gripper" and not text.startswith("{") and text != "null":
-        return text
+    if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
+        return text  # as may grippers
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

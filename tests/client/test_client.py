@@ -164,7 +164,7 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
         ({"collision": "dodge"}, "options.collision"),
         ({"collision": {"margin": 1.0}}, "options.collision.margin"),
         ({"gripper": {"max_opening": 0.1}}, "options.gripper.tip_z"),
-        ({"gripper": 7}, "options.gripper"),
+        ({"gripper": [7]}, "options.gripper"),
         ({"viewpoint": [[0, 0, 1], [0, 0]]}, "options.viewpoint"),
         ({"order": "best"}, "options.order"),
         ({"suppression": {"rotation": -1.0}}, "options.suppression.rotation"),
