@@ -1,10 +1,10 @@
 """Turn depth images into one cloud."""
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field
 
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
@@ -19,6 +19,18 @@ ENCODINGS = {"32FC1": ("<f4", 1.0), "64FC1": ("<f8", 1.0), "16UC1": ("<u2", 0.00
 
 Pixels = Annotated[int, Field(ge=1, le=65536)]
 Row = tuple[Finite, Finite, Finite, Finite]
+
+
+def _rigid(pose: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    matrix = np.array(pose)
+    rotation = matrix[:3, :3]
+    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
+    return pose
+
+
+Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
 
 
 class Depth(Strict):
@@ -44,18 +56,7 @@ class DepthImage(Strict):
 
     depth: Any = Field(description="rows of metres, or an object as Depth")
     intrinsics: Intrinsics
-    T_cloud_camera: tuple[Row, Row, Row, Row] = Field(
-        description="maps camera coordinates to cloud coordinates, metres"
-    )
-
-    @model_validator(mode="after")
-    def _rigid(self) -> Self:
-        pose = np.array(self.T_cloud_camera)
-        rotation = pose[:3, :3]
-        turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        if not turned or np.linalg.det(rotation) < 0 or not np.allclose(pose[3], (0, 0, 0, 1)):
-            raise ValueError("T_cloud_camera must be a rotation and a translation, row-major")
-        return self
+    T_cloud_camera: Pose = Field(description="maps camera coordinates to cloud coordinates, metres")
 
 
 def fuse_depth_images(

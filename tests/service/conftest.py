@@ -36,9 +36,11 @@ class RawGrpc:
     def request(self, **fields: Any) -> Answer:
         return self.send(grasp_pb2.DetectGraspsRequest(**fields))
 
-    def send(self, message: grasp_pb2.DetectGraspsRequest) -> Answer:
+    def send(self, message: grasp_pb2.DetectGraspsRequest | grasp_pb2.ScoreGraspsRequest) -> Answer:
+        scores = isinstance(message, grasp_pb2.ScoreGraspsRequest)
+        call = self._stub.ScoreGrasps if scores else self._stub.DetectGrasps
         try:
-            body = self._stub.DetectGrasps(message, timeout=20)
+            body = call(message, timeout=20)
         except grpc.RpcError as error:
             trailers = dict(error.trailing_metadata())
             detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
@@ -60,8 +62,8 @@ class RawRest:
         headers = {"content-type": f"application/x-{file_format}"}
         return self.post(content=data, headers=headers, params=options)
 
-    def post(self, **request: Any) -> Answer:
-        response = self.http.post("/v1/grasps", **request)
+    def post(self, path: str = "/v1/grasps", **request: Any) -> Answer:
+        response = self.http.post(path, **request)
         body = response.json()
         if response.is_success:
             return Answer("200", "", "", "", "", "", body)
