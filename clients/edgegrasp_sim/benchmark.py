@@ -1,28 +1,37 @@
-"""Many rounds of clutter removal, and what they say about a planner."""
+"""Many rounds of clutter removal, in one process or several, resumable."""
 
 from __future__ import annotations
 
-import json
+import hashlib
 import multiprocessing
+import os
 import platform
-import time
-from collections import Counter
+import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from edgegrasp_sim import grasping, gripper, scene, trials, world
 from edgegrasp_sim.objects import ObjectSet, SceneKind
-from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
-from edgegrasp_sim.trials import NUM_OBJECTS, Planner, Round, run_round
+from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.trials import PATIENCE, Closes, Planner, Round, run_round
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
+
+    from edgegrasp_sim.results import ResultFolder
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
+Task: TypeAlias = tuple[int, int]  # seed and index of a round
+
+MAX_CRASHES = 3  # in a row without a finished round between them
+PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,31 +40,29 @@ class BenchmarkConfig:
 
     Attributes:
         scene: kind of the scenes.
-        rounds: how many.
-        seed: with a round's number it gives the round's scene, views and noise.
+        protocol: the constants.
+        rounds: how many for each seed.
+        seeds: with a round's number, a seed gives the round's scene, views and noise.
         objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
         split: of that folder.
-        num_objects: how many objects to try to place in each scene.
-        noise_std: of the points seen, metres.
-        start_contact_fails: see `ClutterSimulation`.
+        patience: seconds to go on asking a planner that is unavailable.
     """
 
     scene: SceneKind
     rounds: int
-    seed: int
+    seeds: tuple[int, ...] = (0,)
+    protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))
     objects: Path | None = None
     split: str = "test"
-    num_objects: int = NUM_OBJECTS
-    noise_std: float = NOISE_STD
-    start_contact_fails: bool = False
+    patience: float = PATIENCE
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
             raise ValueError(f"rounds is {self.rounds}; run at least 1")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}; pass 0 or more")
-        if not self.noise_std >= 0:
-            raise ValueError(f"noise_std is {self.noise_std}; pass 0 or more, in metres")
+        if not self.seeds or min(self.seeds) < 0:
+            raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise ValueError(f"seeds is {self.seeds}; pass each seed once")
 
     def object_set(self) -> ObjectSet:
         """The objects to draw scenes from.
@@ -67,86 +74,9 @@ class BenchmarkConfig:
             return ObjectSet.builtin(self.scene)
         return ObjectSet.from_folder(self.objects, self.scene, self.split)
 
-
-@dataclass(frozen=True, slots=True)
-class BenchmarkReport:
-    """What came of a benchmark.
-
-    Attributes:
-        config: what was run.
-        rounds: in order of their index.
-        seconds: wall-clock time of it all.
-    """
-
-    config: BenchmarkConfig
-    rounds: tuple[Round, ...]
-    seconds: float
-
-    @property
-    def attempts(self) -> int:
-        """Grasps executed."""
-        return sum(len(item.attempts) for item in self.rounds)
-
-    @property
-    def successes(self) -> int:
-        """Objects removed by grasping."""
-        return sum(item.successes for item in self.rounds)
-
-    @property
-    def objects(self) -> int:
-        """Objects present after the resets."""
-        return sum(item.objects for item in self.rounds)
-
-    @property
-    def grasp_success_rate(self) -> float | None:
-        """GSR: successes / attempts; None without attempts."""
-        return self.successes / self.attempts if self.attempts else None
-
-    @property
-    def declutter_rate(self) -> float | None:
-        """DR: successes / objects present after the reset; None without objects."""
-        return self.successes / self.objects if self.objects else None
-
-    def summary(self) -> dict[str, Any]:
-        """The figures, ready for JSON."""
-        attempts = [attempt for item in self.rounds for attempt in item.attempts]
-        failed = [attempt for attempt in attempts if attempt.object is None]
-        planning = [attempt.planning_seconds for attempt in attempts]
-        return {
-            "grasp_success_rate": self.grasp_success_rate,
-            "declutter_rate": self.declutter_rate,
-            "successes": self.successes,
-            "attempts": self.attempts,
-            "objects": self.objects,
-            "failures": {
-                **Counter(attempt.outcome.value for attempt in failed),
-                "no candidate": sum(item.no_grasp for item in self.rounds),
-            },
-            "round_ends": dict(Counter(item.end.value for item in self.rounds)),
-            "start_contacts": sum(attempt.start_contact for attempt in attempts),
-            "successes_without_start_contact": sum(
-                attempt.object is not None and not attempt.start_contact for attempt in attempts
-            ),
-            "planning_seconds_mean": sum(planning) / len(planning) if planning else None,
-            "seconds": self.seconds,
-        }
-
-    def to_json(self, planner: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Everything, ready for JSON.
-
-        Args:
-            planner: how the grasps were planned (model, options), to keep with the figures.
-        """
-        return {
-            "summary": self.summary(),
-            "manifest": {**manifest(self.config), "planner": planner or {}},
-            "rounds": [asdict(item) for item in self.rounds],
-        }
-
-    def write_json(self, path: Path, planner: dict[str, Any] | None = None) -> None:
-        """Write `to_json` to a file; makes its folder."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(self.to_json(planner), indent=1) + "\n")
+    def tasks(self) -> list[Task]:
+        """Seed and index of every round, in order."""
+        return [(seed, index) for seed in self.seeds for index in range(self.rounds)]
 
 
 def run_benchmark(
@@ -154,67 +84,126 @@ def run_benchmark(
     make_planner: PlannerFactory,
     *,
     workers: int = 1,
+    folder: ResultFolder | None = None,
     on_round: Callable[[Round], None] | None = None,
-) -> BenchmarkReport:
-    """Run all rounds; the outcomes do not depend on `workers`.
+    gui: bool = False,
+) -> list[Round]:
+    """Run all rounds that `folder` does not hold yet; outcomes do not depend on `workers`.
 
     Args:
         config: what to run.
         make_planner: called once in every process.
-        workers: processes; with 1 all runs in this one.
-        on_round: told of every round as it is done, in order.
+        workers: processes; with 1 all runs in this one. The rounds of a worker process that
+            dies are run again by another.
+        folder: keeps each round as it finishes; opened by the caller.
+        on_round: told of every round as it is done, in any order.
+        gui: show PyBullet's window; with one worker only.
+
+    Returns:
+        All rounds of `config`, by seed and index.
 
     Raises:
         ValueError: `workers` below 1, or the planner's pose is no rigid transform.
         FileNotFoundError: the object folder does not hold the scene.
+        PlannerUnavailableError: the planner stayed away for longer than the patience.
+        RuntimeError: worker processes keep dying.
     """
     if workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
     config.object_set()  # a wrong folder shall fail here, not in every worker
-    started = time.perf_counter()
-    rounds = []
+    tasks = config.tasks()
+    kept = folder.rounds() if folder is not None else []
+    rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
+    missing = [task for task in tasks if task not in rounds]
     run = (
-        _run_here(config, make_planner)
+        _run_here(config, make_planner, missing, gui)
         if workers == 1
-        else _run_pool(config, make_planner, workers)
+        else _run_pools(config, make_planner, missing, workers)
     )
-    for item in run:
-        rounds.append(item)
+    for done in run:
+        rounds[done.seed, done.index] = done
+        if folder is not None:
+            folder.add(done)
         if on_round is not None:
-            on_round(item)
-    return BenchmarkReport(config, tuple(rounds), time.perf_counter() - started)
+            on_round(done)
+    return [rounds[task] for task in tasks]
 
 
-def manifest(config: BenchmarkConfig) -> dict[str, Any]:
-    """What is needed to get the same figures again."""
-    settings = asdict(config)
-    settings["objects"] = config.objects.name if config.objects is not None else "builtin"
+def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:
+    """What is needed to get the same figures again.
+
+    Args:
+        config: what is run.
+        planner: how grasps are planned: its name, the weights' name and digest, options.
+    """
+    objects = config.object_set()
     return {
-        "config": settings,
-        "object_set": config.object_set().name,
-        "constants": {
-            "time_step": world.TIME_STEP,
-            "solver_iterations": world.SOLVER_ITERATIONS,
-            "workspace_size": scene.SIZE,
-            "table_height": scene.TABLE_HEIGHT,
-            "object_mass": scene.OBJECT_MASS,
-            "object_friction": scene.OBJECT_FRICTION,
-            "finger_friction": gripper.FINGER_FRICTION,
-            "gear_force": gripper.GEAR_FORCE,
-            "tool_force": gripper.TOOL_FORCE,
-            "pregrasp_distance": grasping.PREGRASP_DISTANCE,
-            "retreat_distance": grasping.RETREAT_DISTANCE,
-            "step_length": grasping.STEP_LENGTH,
-            "min_opening": grasping.MIN_OPENING,
-            "max_consecutive_failures": trials.MAX_CONSECUTIVE_FAILURES,
-            "max_no_grasp": trials.MAX_NO_GRASP,
-            "min_points": trials.MIN_POINTS,
+        "run": {
+            "scene": config.scene.value,
+            "protocol": config.protocol.to_json(),
+            "objects": {
+                "name": objects.name,
+                "models": len(objects.models),
+                "digest": objects_digest(objects),
+            },
+            "planner": planner,
+            "constants": constants(),
         },
+        "rounds": config.rounds,
+        "seeds": list(config.seeds),
+        "objects_folder": str(config.objects) if config.objects is not None else None,
+        "split": config.split,
         "versions": {
             "python": platform.python_version(),
-            **{name: _version(name) for name in ("edgegrasp", "numpy", "pybullet")},
+            **{name: _version(name) for name in PACKAGES},
+        },
+        "host": {
+            "name": platform.node(),
+            "platform": platform.platform(),
+            "machine": platform.machine(),
+            "processors": os.cpu_count(),
         },
     }
+
+
+def constants() -> dict[str, float]:
+    """The simulator's own constants, the same under every protocol."""
+    return {
+        "time_step": world.TIME_STEP,
+        "solver_iterations": world.SOLVER_ITERATIONS,
+        "gravity": world.GRAVITY,
+        "table_friction": scene.TABLE_FRICTION,
+        "object_mass": scene.OBJECT_MASS,
+        "object_friction": scene.OBJECT_FRICTION,
+        "packed_attempts": scene.PACKED_ATTEMPTS,
+        "pile_drop_height": scene.PILE_DROP_HEIGHT,
+        "rest_speed": scene.REST_SPEED,
+        "max_opening": gripper.MAX_OPENING,
+        "hand_mass": gripper.HAND_MASS,
+        "finger_friction": gripper.FINGER_FRICTION,
+        "finger_spinning_friction": gripper.FINGER_SPINNING_FRICTION,
+        "finger_force": gripper.FINGER_FORCE,
+        "gear_force": gripper.GEAR_FORCE,
+        "tool_force": gripper.TOOL_FORCE,
+        "close_seconds": gripper.CLOSE_SECONDS,
+        "collision_depth": gripper.COLLISION_DEPTH,
+        "pregrasp_distance": grasping.PREGRASP_DISTANCE,
+        "retreat_distance": grasping.RETREAT_DISTANCE,
+        "side_grasp_angle": grasping.SIDE_GRASP_ANGLE,
+        "step_length": grasping.STEP_LENGTH,
+        "min_opening": grasping.MIN_OPENING,
+        "min_points": trials.MIN_POINTS,
+    }
+
+
+def objects_digest(objects: ObjectSet) -> str:
+    """SHA-256 of the names, scales and descriptions of a set's objects."""
+    digest = hashlib.sha256()
+    for model in objects.models:
+        digest.update(f"{model.name} {model.scale}".encode())
+        for file in sorted(model.urdf.parent.glob(f"{model.urdf.stem}*")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def _version(distribution: str) -> str | None:
@@ -227,32 +216,42 @@ def _version(distribution: str) -> str | None:
 class _Runner:
     """A simulation with a planner, for one process."""
 
-    def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
+    def __init__(
+        self, config: BenchmarkConfig, make_planner: PlannerFactory, gui: bool = False
+    ) -> None:
         self.config = config
-        self.simulation = ClutterSimulation(
-            {config.scene: config.object_set()}, start_contact_fails=config.start_contact_fails
-        )
         self.planner = make_planner()
+        self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
 
-    def run(self, index: int) -> Round:
+    def run(self, task: Task) -> Round:
+        seed, index = task
         config = self.config
         return run_round(
             self.simulation,
             self.planner,
             config.scene,
-            seed=config.seed,
+            config.protocol,
+            seed=seed,
             index=index,
-            num_objects=config.num_objects,
-            noise_std=config.noise_std,
+            patience=config.patience,
         )
 
+    def close(self) -> None:
+        self.simulation.close()
+        if isinstance(self.planner, Closes):
+            self.planner.close()
 
-def _run_here(config: BenchmarkConfig, make_planner: PlannerFactory) -> Iterator[Round]:
-    runner = _Runner(config, make_planner)
+
+def _run_here(
+    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], gui: bool
+) -> Iterator[Round]:
+    if not tasks:
+        return
+    runner = _Runner(config, make_planner, gui)
     try:
-        yield from map(runner.run, range(config.rounds))
+        yield from map(runner.run, tasks)
     finally:
-        runner.simulation.close()
+        runner.close()
 
 
 _worker: _Runner | None = None  # one in each worker process, made by its initialiser
@@ -260,20 +259,47 @@ _worker: _Runner | None = None  # one in each worker process, made by its initia
 
 def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
     global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
     _worker = _Runner(config, make_planner)
 
 
-def _run_in_worker(index: int) -> Round:
+def _run_in_worker(task: Task) -> Round:
     assert _worker is not None
-    return _worker.run(index)
+    return _worker.run(task)
+
+
+def _run_pools(
+    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
+) -> Iterator[Round]:
+    """Run rounds in processes; where one dies, the pool breaks and another takes its place."""
+    missing, crashes = list(tasks), 0
+    while missing:
+        finished = 0
+        try:
+            for done in _run_pool(config, make_planner, missing, workers):
+                finished += 1
+                missing.remove((done.seed, done.index))
+                yield done
+        except BrokenProcessPool:
+            crashes = 1 if finished else crashes + 1
+            if crashes >= MAX_CRASHES:
+                raise RuntimeError(
+                    f"worker processes died {crashes} times in a row with {len(missing)} rounds "
+                    "left; run with one worker to see why"
+                ) from None
 
 
 def _run_pool(
-    config: BenchmarkConfig, make_planner: PlannerFactory, workers: int
+    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
     # Forked children would share the parent's physics servers and threads.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(
+    pool = ProcessPoolExecutor(
         workers, context, initializer=_start_worker, initargs=(config, make_planner)
-    ) as pool:
-        yield from pool.map(_run_in_worker, range(config.rounds))
+    )
+    try:
+        futures = [pool.submit(_run_in_worker, task) for task in tasks]
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -46,14 +46,21 @@ class ViewRange:
 
     def sample(self, rng: np.random.Generator) -> Matrix:
         """Draw one pose `T_world_camera`, uniform in each coordinate: (4, 4)."""
+        return self.sample_ring(rng, 1)[0]
+
+    def sample_ring(self, rng: np.random.Generator, views: int) -> list[Matrix]:
+        """Draw one pose as `sample` does, and others spread evenly over a full turn from it."""
         radius = rng.uniform(*self.radius)
         polar = rng.uniform(*self.polar_angle)
-        azimuth = rng.uniform(*self.azimuth)
-        direction = np.array(
-            [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
-        )
+        first = rng.uniform(*self.azimuth)
         target = np.asarray(self.target)
-        return look_at(target + radius * direction, target)
+        poses = []
+        for azimuth in first + 2 * np.pi * np.arange(views) / views:
+            direction = np.array(
+                [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+            )
+            poses.append(look_at(target + radius * direction, target))
+        return poses
 
 
 # The views of the reference evaluation, and the wider ones to draw training views from.

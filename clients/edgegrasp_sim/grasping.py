@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgegrasp_sim.gripper import MAX_OPENING
+from edgegrasp_sim.gripper import FINGERTIP, MAX_OPENING
 from edgegrasp_sim.poses import Matrix, translation
 
 if TYPE_CHECKING:
@@ -23,6 +23,8 @@ SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand l
 # The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
 MIN_OPENING = 0.1 * MAX_OPENING
+# Depths in the hand at which to look for the object between the fingers, most telling first.
+_TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
 
 
 class GraspOutcome(StrEnum):
@@ -31,6 +33,16 @@ class GraspOutcome(StrEnum):
     SUCCESS = "success"
     PREGRASP = "pregrasp"
     AFTER = "after"
+
+
+class FailureCause(StrEnum):
+    """Why a grasp failed: the first of these that applies."""
+
+    START_COLLISION = "collision at pre-grasp"
+    APPROACH_COLLISION = "collision on approach"
+    MISSED = "missed"
+    WRONG_OBJECT = "wrong object"
+    SLIPPED = "slipped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +55,16 @@ class GraspResult:
         opening: metres between the fingers at the end.
         start_contact: whether the open hand overlapped something at its start pose.
         held: the object held, None if nothing is.
+        target: the object between the fingers before the hand came, None if there was none.
+        cause: why it failed, None if it did not.
     """
 
     outcome: GraspOutcome
     opening: float
     start_contact: bool
     held: SceneObject | None
+    target: SceneObject | None = None
+    cause: FailureCause | None = None
 
     @property
     def success(self) -> bool:
@@ -77,22 +93,54 @@ def run_grasp(
     gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
+    target = _object_between_fingers(gripper, T_world_hand, objects)
     if start_contact and start_contact_fails:
-        return GraspResult(GraspOutcome.PREGRASP, gripper.opening, start_contact, None)
+        return GraspResult(
+            GraspOutcome.PREGRASP,
+            gripper.opening,
+            start_contact,
+            None,
+            target,
+            FailureCause.START_COLLISION,
+        )
 
-    gripper.move_to(T_world_hand, step_length=STEP_LENGTH)
+    collided = gripper.move_to(T_world_hand, step_length=STEP_LENGTH)
     gripper.close()
-    opening = gripper.opening
-    if opening <= MIN_OPENING and not retreat_empty:
-        return GraspResult(GraspOutcome.AFTER, opening, start_contact, None)
-    gripper.move_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
+    missed = gripper.opening <= MIN_OPENING
+    caught = _touched(gripper, objects)
+    if not missed or retreat_empty:
+        gripper.move_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
+        held = next(iter(_touched(gripper, objects)), None)
+        if held is not None and gripper.opening > MIN_OPENING:
+            return GraspResult(GraspOutcome.SUCCESS, gripper.opening, start_contact, held, target)
+    applies = {
+        FailureCause.START_COLLISION: start_contact,
+        FailureCause.APPROACH_COLLISION: collided,
+        FailureCause.MISSED: missed or not caught,
+        FailureCause.WRONG_OBJECT: target is not None and target not in caught,
+        FailureCause.SLIPPED: True,
+    }
+    cause = next(cause for cause, holds in applies.items() if holds)
+    return GraspResult(GraspOutcome.AFTER, gripper.opening, start_contact, None, target, cause)
 
-    touched = [contact.other_uid for contact in gripper.body.contacts()]
-    held = next((objects[uid] for uid in touched if uid in objects), None)
-    opening = gripper.opening
-    if held is not None and opening > MIN_OPENING:
-        return GraspResult(GraspOutcome.SUCCESS, opening, start_contact, held)
-    return GraspResult(GraspOutcome.AFTER, opening, start_contact, None)
+
+def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:
+    """The objects in contact with the hand, in the order of the contacts."""
+    uids = [contact.other_uid for contact in gripper.body.contacts()]
+    return [objects[uid] for uid in dict.fromkeys(uids) if uid in objects]
+
+
+def _object_between_fingers(
+    gripper: Gripper, T_world_hand: Matrix, objects: Mapping[int, SceneObject]
+) -> SceneObject | None:
+    """What the fingers would close on, were the hand at the grasp: what rays across it meet."""
+    half = 0.5 * MAX_OPENING
+    ends = np.array([[0.0, side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
+    across = np.array([[0.0, -side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
+    hits = gripper.world.first_hits(
+        (ends @ T_world_hand.T)[:, :3], (across @ T_world_hand.T)[:, :3]
+    )
+    return next((objects[uid] for uid in hits if uid in objects), None)
 
 
 def retreat_pose(T_world_hand: Matrix) -> Matrix:

@@ -33,6 +33,7 @@ GEAR_FORCE = 30.0  # N
 GEAR_ERP = 0.1
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
+COLLISION_DEPTH = 0.001  # metres; a finger that slides along what it grasps stays above it
 # Far above the table and out of the camera's sight.
 _PARKED = translation(0.15, 0.15, 5.0)
 
@@ -82,18 +83,27 @@ class Gripper:
             finger.reset(0.5 * MAX_OPENING)
             finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
 
-    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> None:
-        """Drag the hand in a straight line, `step_length` metres in each time step."""
+    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> bool:
+        """Drag the hand in a straight line, `step_length` metres in each time step.
+
+        Returns:
+            Whether the hand cut into something by more than `COLLISION_DEPTH` on the way.
+        """
         T_world_com = T_world_hand @ T_HAND_HANDCOM
         quaternion = quaternion_xyzw(T_world_com)
         position = self.body.position
         way = T_world_com[:3, 3] - position
         distance = float((way @ way) ** 0.5)
         steps = max(1, int(distance / step_length))
+        collided = False
         for _ in range(steps):
             position = position + way / steps
             self._anchor.move(position, quaternion)
             self.world.step()
+            collided = collided or any(
+                contact.distance < -COLLISION_DEPTH for contact in self.body.contacts()
+            )
+        return collided
 
     def close(self) -> None:
         """Close the fingers with full force for half a second."""

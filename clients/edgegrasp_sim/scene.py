@@ -76,7 +76,11 @@ def load_object(
 
 
 def make_packed(
-    world: World, objects: ObjectSet, rng: np.random.Generator, num_objects: int
+    world: World,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float] = PACKED_SCALE,
 ) -> list[SceneObject]:
     """Stand objects upright on the table, each where it touches no other.
 
@@ -90,7 +94,7 @@ def make_packed(
         model = objects.sample(rng)
         x, y = rng.uniform(*PACKED_RANGE, size=2)
         quaternion = yaw_quaternion_xyzw(rng.uniform(0.0, 2.0 * np.pi))
-        scale = float(rng.uniform(*PACKED_SCALE))
+        scale = float(rng.uniform(*scales))
         new = load_object(world, model, (x, y, 1.0), quaternion, scale)
         x, y, z = new.body.position
         lowest = new.body.bounds[0, 2]
@@ -106,7 +110,11 @@ def make_packed(
 
 
 def make_pile(
-    world: World, objects: ObjectSet, rng: np.random.Generator, num_objects: int
+    world: World,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float] = PILE_SCALE,
 ) -> list[SceneObject]:
     """Drop objects into an open box one after another, then take the box away."""
     walls = _add_box_walls(world)
@@ -115,7 +123,7 @@ def make_pile(
         model = objects.sample(rng)
         quaternion = Rotation.random(rng=rng).as_quat().tolist()
         x, y = rng.uniform(SIZE / 3, 2 * SIZE / 3, size=2)
-        scale = float(rng.uniform(*PILE_SCALE))
+        scale = float(rng.uniform(*scales))
         position = (x, y, TABLE_HEIGHT + PILE_DROP_HEIGHT)
         dropped.append(load_object(world, model, position, quaternion, scale))
         wait_for_rest(world, dropped, DROP_SECONDS)

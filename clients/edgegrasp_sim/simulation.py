@@ -14,6 +14,8 @@ from edgegrasp_sim.gripper import Gripper
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import require_pose
 from edgegrasp_sim.scene import (
+    PACKED_SCALE,
+    PILE_SCALE,
     SIZE,
     TABLE_HEIGHT,
     SceneObject,
@@ -32,24 +34,31 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from edgegrasp_sim.noise import DepthNoise
     from edgegrasp_sim.poses import Matrix
 
 # Lowest and highest corner of what an observation keeps; the table itself is cut off.
 WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
+# The same with the table left in, for planners that have to find it.
+WORKSPACE_WITH_TABLE = np.array([[0.02, 0.02, TABLE_HEIGHT - 0.01], WORKSPACE[1]])
 NOISE_STD = 0.001  # metres
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What one depth image shows of the workspace.
+    """What one or several depth images show of the workspace.
 
     Attributes:
-        cloud: (N, 3) float32, world frame, metres; no table, order of the pixels.
-        T_world_camera: (4, 4) pose of the camera (z along the line of sight, y down).
-        camera_position: (3,) float32, world frame, metres.
+        cloud: (N, 3) float32, world frame, metres; without the table unless `has_table`; order
+            of the pixels, one image after another.
+        T_world_camera: (4, 4) pose of the first camera (z along the line of sight, y down).
+        camera_position: (3,) float32, that of the first camera, world frame, metres.
         workspace: (2, 3) float32, lowest and highest corner of the crop.
-        table_height: metres.
+        table_height: metres; not to be used where `has_table`.
+        camera_positions: (V, 3) float32, every camera, world frame, metres.
+        view_ids: (N,) int32, which camera saw each point.
+        has_table: whether the cloud holds the table, which then has to be found.
     """
 
     cloud: NDArray[np.float32]
@@ -57,6 +66,9 @@ class Observation:
     camera_position: NDArray[np.float32]
     workspace: NDArray[np.float32]
     table_height: float
+    camera_positions: NDArray[np.float32]
+    view_ids: NDArray[np.int32]
+    has_table: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +142,11 @@ class ClutterSimulation:
         return len(self._objects)
 
     @property
+    def object_names(self) -> list[str]:
+        """Names of the objects that are left."""
+        return [item.model.name for item in self._objects]
+
+    @property
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [
@@ -143,13 +160,20 @@ class ClutterSimulation:
             for x, y, z in [item.body.position]
         ]
 
-    def reset(self, scene: SceneKind | str, rng: np.random.Generator, num_objects: int = 5) -> int:
+    def reset(
+        self,
+        scene: SceneKind | str,
+        rng: np.random.Generator,
+        num_objects: int = 5,
+        scales: tuple[float, float] | None = None,
+    ) -> int:
         """Make a new scene at rest.
 
         Args:
             scene: `packed` or `pile`.
             rng: the scene's own stream.
             num_objects: how many to try to place.
+            scales: range of the factor on the objects' size; by default the scene's own.
 
         Returns:
             How many objects are there.
@@ -164,8 +188,10 @@ class ClutterSimulation:
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
         self._clear()
-        make = make_packed if kind is SceneKind.PACKED else make_pile
-        self._objects = make(self.world, objects, rng, num_objects)
+        make, own_scales = (
+            (make_packed, PACKED_SCALE) if kind is SceneKind.PACKED else (make_pile, PILE_SCALE)
+        )
+        self._objects = make(self.world, objects, rng, num_objects, scales or own_scales)
         self._add_gripper()
         return self.num_objects
 
@@ -192,35 +218,59 @@ class ClutterSimulation:
         rng_noise: np.random.Generator,
         *,
         views: ViewRange = EVALUATION_VIEWS,
+        num_views: int = 1,
         noise_std: float = NOISE_STD,
+        depth_noise: DepthNoise | None = None,
+        with_table: bool = False,
     ) -> Observation:
-        """Look at the scene once, from a random viewpoint.
+        """Look at the scene from a random viewpoint, or several around it.
 
         Args:
             rng_camera: stream of the viewpoint.
             rng_noise: stream of the noise.
             views: where the camera may stand.
+            num_views: images, spread evenly over a full turn from the random one.
             noise_std: standard deviation of the noise in each coordinate of each point, metres.
+            depth_noise: noise of the images.
+            with_table: leave the table in the cloud.
         """
-        return self.observe_from(views.sample(rng_camera), rng_noise, noise_std=noise_std)
+        return self.observe_from(
+            views.sample_ring(rng_camera, num_views),
+            rng_noise,
+            noise_std=noise_std,
+            depth_noise=depth_noise,
+            with_table=with_table,
+        )
 
     def observe_from(
         self,
-        T_world_camera: Matrix,
+        T_world_cameras: Sequence[Matrix],
         rng_noise: np.random.Generator,
         *,
         noise_std: float = NOISE_STD,
+        depth_noise: DepthNoise | None = None,
+        with_table: bool = False,
     ) -> Observation:
-        """Look at the scene once from `T_world_camera`, (4, 4)."""
-        depth = self.camera.render_depth(T_world_camera)
-        points = _crop(self.camera.points(depth, T_world_camera), _CROP_MARGIN)
-        points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
+        """Look at the scene from each of the given poses, (4, 4) each; see `observe`."""
+        box = WORKSPACE_WITH_TABLE if with_table else WORKSPACE
+        clouds = []
+        for T_world_camera in T_world_cameras:
+            depth = self.camera.render_depth(T_world_camera)
+            if depth_noise is not None:
+                depth = depth_noise.apply(depth, rng_noise)
+            points = _crop(self.camera.points(depth, T_world_camera), box, _CROP_MARGIN)
+            points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
+            clouds.append(_crop(points, box, 0.0).astype(np.float32))
+        positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
-            cloud=_crop(points, 0.0).astype(np.float32),
-            T_world_camera=T_world_camera,
-            camera_position=T_world_camera[:3, 3].astype(np.float32),
-            workspace=WORKSPACE.astype(np.float32),
+            cloud=np.concatenate(clouds),
+            T_world_camera=T_world_cameras[0],
+            camera_position=positions[0],
+            workspace=box.astype(np.float32),
             table_height=TABLE_HEIGHT,
+            camera_positions=positions,
+            view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
+            has_table=with_table,
         )
 
     def save_state(self) -> int:
@@ -318,7 +368,7 @@ def _scene_kind(scene: SceneKind | str) -> SceneKind:
     raise ValueError(f"scene is {scene!r}; choose one of {', '.join(SceneKind)}")
 
 
-def _crop(points: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
-    inside = (points >= WORKSPACE[0] - margin) & (points <= WORKSPACE[1] + margin)
+def _crop(points: NDArray[np.float64], box: Matrix, margin: float) -> NDArray[np.float64]:
+    inside = (points >= box[0] - margin) & (points <= box[1] + margin)
     kept: NDArray[np.float64] = points[inside.all(axis=1)]
     return kept

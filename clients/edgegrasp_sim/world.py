@@ -11,7 +11,7 @@ import pybullet
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
     from types import TracebackType
 
@@ -45,6 +45,7 @@ class World:
     """
 
     def __init__(self, *, gui: bool = False) -> None:
+        self.on_step: Callable[[], None] | None = None  # called after every time step
         self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self.client < 0:
             raise RuntimeError("PyBullet did not start a physics server; close unused worlds")
@@ -83,6 +84,13 @@ class World:
         """Advance the world by `steps` time steps of 1/80 s."""
         for _ in range(steps):
             pybullet.stepSimulation(physicsClientId=self.client)
+            if self.on_step is not None:
+                self.on_step()
+
+    def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+        """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
+        hits = pybullet.rayTestBatch(starts.tolist(), ends.tolist(), physicsClientId=self.client)
+        return [hit[0] for hit in hits]
 
     def detect_collisions(self) -> None:
         """Refresh the contact points without advancing time."""

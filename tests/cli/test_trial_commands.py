@@ -1,5 +1,6 @@
 """The commands that need the simulator or the trainer, end to end and small."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -63,13 +64,17 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data: Path, tmp_
     assert load_checkpoint(weights)[1].training["steps"] == 4
     assert (tmp_path / "edgegrasp-plus.md").is_file()
 
-    result = tmp_path / "result.json"
+    result = tmp_path / "result"
     output = run(
         "benchmark",
         "--scene",
         "packed",
         "--rounds",
         1,
+        "--seed",
+        0,
+        "--num-candidates",
+        200,
         "--weights",
         weights,
         "--model",
@@ -78,18 +83,12 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data: Path, tmp_
         result,
     )
     assert "GSR" in output
-    report = json.loads(result.read_text())
-    assert report["manifest"]["planner"]["digest"] == load_checkpoint(weights)[1].digest
-    assert len(report["rounds"]) == 1
-    attempts = sum(len(one["attempts"]) for one in report["rounds"])
-    assert report["summary"]["attempts"] == attempts
-
-
-def test_benchmark_over_an_address_uses_that_server(dummy_server) -> None:
-    for address in (dummy_server.http_url, dummy_server.grpc_address):
-        assert "dummy: GSR" in run(
-            "benchmark", "--scene", "packed", "--rounds", 1, "--server", address
-        )
+    planner = json.loads((result / "manifest.json").read_text())["run"]["planner"]
+    assert planner["digest"] == load_checkpoint(weights)[1].digest
+    assert planner["options"]["num_candidates"] == 200
+    summary = json.loads((result / "summary.json").read_text())
+    with (result / "attempts.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == summary["attempts"]
 
 
 def test_the_authors_checkpoint_becomes_one_file(shared_dir: Path, tmp_path: Path) -> None:
@@ -106,4 +105,8 @@ def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None
     assert "shelf" in refused("benchmark", "--scene", "shelf")
     assert "urdf" in refused("benchmark", "--scene", "pile", "--objects", tmp_path)
     assert "rounds is 0" in refused("benchmark", "--rounds", 0)
+    assert "edgegrasp, giga, robot, vgn" in refused("benchmark", "--protocol", "paper")
+    assert "edge-sample" in refused("benchmark", "--planner", "guess")
+    assert "cannot be loaded" in refused("benchmark", "--planner", "no_such:planner")
+    assert "workers is 2" in refused("benchmark", "--gui", "--workers", 2)
     assert "UNAVAILABLE" in refused("benchmark", "--server", "127.0.0.1:1")

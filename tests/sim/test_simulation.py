@@ -151,7 +151,7 @@ def test_saved_state_comes_back(simulation: ClutterSimulation) -> None:
 def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
-    seen = simulation.observe_from(T_world_camera, np.random.default_rng(0), noise_std=0.0)
+    seen = simulation.observe_from([T_world_camera], np.random.default_rng(0), noise_std=0.0)
     assert seen.cloud.dtype == np.float32
     assert (seen.cloud >= WORKSPACE[0].astype(np.float32)).all()
     assert seen.cloud.max(axis=0) == pytest.approx((0.175, 0.175, 0.1), abs=2e-3)
@@ -167,7 +167,7 @@ def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:
 
     def top(noise_std: float, seed: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        cloud = simulation.observe_from(T_world_camera, rng, noise_std=noise_std).cloud
+        cloud = simulation.observe_from([T_world_camera], rng, noise_std=noise_std).cloud
         inner = (np.abs(cloud[:, :2] - 0.15) < 0.02).all(axis=1) & (cloud[:, 2] > 0.09)
         return cloud[inner, 2]
 

@@ -1,0 +1,249 @@
+"""Protocols: everything besides planner and objects that decides what a benchmark's figures mean.
+
+A protocol is a data file in `protocols/`, named and versioned; its constants go into every result.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from edgegrasp_sim import scene
+from edgegrasp_sim.camera import ViewRange
+from edgegrasp_sim.noise import DepthNoise
+
+if TYPE_CHECKING:
+    from edgegrasp_sim.objects import SceneKind
+
+FOLDER = Path(__file__).parent / "protocols"
+TABLES = ("known", "ransac")
+SELECTIONS = ("best", "highest")
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneRules:
+    """What stands on the table.
+
+    Attributes:
+        workspace_size: edge of the cube, metres.
+        table_height: metres.
+        num_objects: how many objects to try to place, in turn from round to round.
+        packed_scale: range of the factor on the objects' size in packed scenes.
+        pile_scale: the same for piles.
+    """
+
+    workspace_size: float
+    table_height: float
+    num_objects: tuple[int, ...]
+    packed_scale: Range
+    pile_scale: Range
+
+    def __post_init__(self) -> None:
+        # The simulated workspace is built to this size; a protocol states it for the record.
+        if (self.workspace_size, self.table_height) != (scene.SIZE, scene.TABLE_HEIGHT):
+            raise ValueError(
+                f"workspace_size is {self.workspace_size} and table_height {self.table_height}; "
+                f"the simulator has {scene.SIZE} and {scene.TABLE_HEIGHT}"
+            )
+
+    def scale(self, kind: SceneKind) -> Range:
+        """The range of scales of a kind of scene."""
+        return self.packed_scale if kind.value == "packed" else self.pile_scale
+
+
+@dataclass(frozen=True, slots=True)
+class RoundRules:
+    """What ends a round, and what fails a grasp.
+
+    Attributes:
+        max_consecutive_failures: failed grasps in a row that end a round.
+        max_no_grasp: views without any grasp that end a round.
+        start_contact_fails: see `ClutterSimulation`.
+    """
+
+    max_consecutive_failures: int
+    max_no_grasp: int
+    start_contact_fails: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRules:
+    """Where the camera stands; ranges are drawn from uniformly before every grasp.
+
+    Attributes:
+        views: images before every grasp, spread evenly over a full turn from the first.
+        radius: metres from `target`.
+        polar_degrees: from world z.
+        azimuth_degrees: from world x.
+        target: the point looked at, world frame, metres.
+    """
+
+    views: int
+    radius: Range
+    polar_degrees: Range
+    azimuth_degrees: Range
+    target: tuple[float, float, float]
+
+    def view_range(self) -> ViewRange:
+        """The same in radians, to sample from."""
+        low_polar, high_polar = np.deg2rad(self.polar_degrees).tolist()
+        low_azimuth, high_azimuth = np.deg2rad(self.azimuth_degrees).tolist()
+        return ViewRange(
+            self.radius, (low_polar, high_polar), (low_azimuth, high_azimuth), self.target
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseRules:
+    """Noise of the depth image and of the points made from it; see `DepthNoise`.
+
+    Attributes:
+        point_std: standard deviation of each coordinate of each point, metres.
+        gamma_shape: of one factor per image; 0: no factor.
+        gamma_scale: of the same.
+        correlated_std: of smooth Gaussian noise on the image, metres.
+        correlated_pixels: between its independent values.
+        correlated_share: of the images.
+    """
+
+    point_std: float
+    gamma_shape: float
+    gamma_scale: float
+    correlated_std: float
+    correlated_pixels: int
+    correlated_share: float
+
+    def depth_noise(self) -> DepthNoise | None:
+        """The noise of the images; None where they have none."""
+        if self.gamma_shape == 0 and self.correlated_std == 0:
+            return None
+        values = asdict(self)
+        del values["point_std"]
+        return DepthNoise(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanningRules:
+    """What a planner is given and how many candidates it may look at.
+
+    Attributes:
+        table: `known`: the cloud is cut off above it and its plane is told; `ransac`: it is in
+            the cloud and has to be found.
+        voxel_size: metres; network weights carry their own.
+        num_approach_points: approach points sampled.
+        num_candidates: candidates scored at most.
+        selection: `best` score, or the `highest` grasp among those of `min_score` and more.
+        min_score: for `highest`.
+    """
+
+    table: str
+    voxel_size: float
+    num_approach_points: int
+    num_candidates: int
+    selection: str
+    min_score: float
+
+    def __post_init__(self) -> None:
+        for name, known in (("table", TABLES), ("selection", SELECTIONS)):
+            value = getattr(self, name)
+            if value not in known:
+                raise ValueError(f"{name} is {value!r}; choose one of {', '.join(known)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """A named and versioned way to run the benchmark.
+
+    Attributes:
+        name: of the protocol.
+        version: raised whenever a constant changes.
+        source: where the constants come from.
+        rounds: how many rounds for each seed make a full run.
+        seeds: of a full run.
+        scene: what stands on the table.
+        round: what ends a round.
+        camera: where the camera stands.
+        noise: of what it sees.
+        planning: what a planner is given.
+    """
+
+    name: str
+    version: int
+    source: str
+    rounds: int
+    seeds: tuple[int, ...]
+    scene: SceneRules
+    round: RoundRules
+    camera: CameraRules
+    noise: NoiseRules
+    planning: PlanningRules
+
+    def num_objects(self, index: int) -> int:
+        """How many objects to try to place in a round."""
+        return self.scene.num_objects[index % len(self.scene.num_objects)]
+
+    def to_json(self) -> dict[str, Any]:
+        """Every constant, ready for JSON."""
+        return asdict(self)
+
+
+def protocol_names() -> list[str]:
+    """The protocols that ship, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load_protocol(name: str) -> Protocol:
+    """Read a protocol that ships, or a file in the same format.
+
+    Args:
+        name: of a shipped protocol, or the path of a `.toml` file.
+
+    Raises:
+        FileNotFoundError: there is neither.
+        ValueError: the file lacks a constant, has an unknown one, or one that makes no sense.
+    """
+    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no protocol {name!r}; choose one of {', '.join(protocol_names())}, "
+            "or pass a .toml file"
+        )
+    try:
+        table = tomllib.loads(path.read_text())
+        return protocol_from(table)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"protocol {name}: {error}") from error
+
+
+def protocol_from(table: dict[str, Any]) -> Protocol:
+    """Build a protocol from its tables, as read from TOML or a result's manifest.
+
+    Raises:
+        ValueError: a constant is missing, unknown or makes no sense.
+    """
+    parts: dict[str, type[Any]] = {
+        "scene": SceneRules,
+        "round": RoundRules,
+        "camera": CameraRules,
+        "noise": NoiseRules,
+        "planning": PlanningRules,
+    }
+    plain = {name: value for name, value in table.items() if name not in parts}
+    built = {name: _build(kind, table.get(name, {}), name) for name, kind in parts.items()}
+    protocol: Protocol = _build(Protocol, plain | built, "protocol")
+    return protocol
+
+
+def _build(kind: type[Any], table: dict[str, Any], where: str) -> Any:
+    known = {field.name for field in fields(kind)}
+    if missing := known - table.keys():
+        raise ValueError(f"{where} lacks {', '.join(sorted(missing))}; add it")
+    if unknown := table.keys() - known:
+        raise ValueError(f"{where} has unknown {', '.join(sorted(unknown))}; remove it")
+    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in table.items()})

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protocol_names
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_the_named_protocols_differ_where_they_should() -> None:
+    assert protocol_names() == ["edgegrasp", "giga", "robot", "vgn"]
+    paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
+    assert (paper.rounds, paper.seeds) == (100, (0, 1, 2, 3, 4))
+    assert paper.noise.point_std == 0.001
+    assert paper.planning.voxel_size == 0.004
+    assert (paper.planning.num_approach_points, paper.planning.num_candidates) == (64, 4000)
+    assert paper.round.max_consecutive_failures == 2
+    assert giga.camera.polar_degrees == (60.0, 60.0)
+    assert giga.camera.azimuth_degrees == (-90.0, -90.0)
+    assert giga.noise.depth_noise() is not None
+    assert vgn.camera.views == 6
+    assert [robot.num_objects(index) for index in range(3)] == [8, 10, 8]
+    assert (robot.planning.num_approach_points, robot.planning.num_candidates) == (40, 2000)
+    assert (robot.planning.selection, robot.planning.min_score) == ("highest", 0.9)
+    assert robot.planning.table == "ransac"
+
+
+def test_a_protocol_comes_back_from_a_manifest() -> None:
+    for name in protocol_names():
+        protocol = load_protocol(name)
+        assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == protocol
+
+
+def test_the_side_view_is_where_giga_has_it() -> None:
+    view = load_protocol("giga").camera.view_range().sample(np.random.default_rng(0))
+    expected = [0.15, 0.15 - 0.6 * np.sin(np.pi / 3), 0.10 + 0.6 * np.cos(np.pi / 3)]
+    np.testing.assert_allclose(view[:3, 3], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("views = 1", "", "camera lacks views"),
+        ("views = 1", "views = 1\nzoom = 2", "camera has unknown zoom"),
+        ('table = "known"', 'table = "guess"', "table is 'guess'; choose one of known, ransac"),
+        ("workspace_size = 0.30", "workspace_size = 0.5", "workspace_size is 0.5"),
+        ("version = 1", "version = ", "protocol .*toml"),
+    ],
+)
+def test_a_wrong_file_is_told(tmp_path: Path, old: str, new: str, message: str) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text((FOLDER / "edgegrasp.toml").read_text().replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        load_protocol(str(file))
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(FileNotFoundError, match="edgegrasp, giga, robot, vgn"):
+        load_protocol("paper")
+
+
+def test_depth_noise_has_the_strength_asked_for() -> None:
+    noise = load_protocol("giga").noise.depth_noise()
+    assert noise is not None
+    flat = np.ones((480, 640))
+    rng = np.random.default_rng(0)
+    images = [noise.apply(flat, rng) for _ in range(60)]
+    factors = np.array([image.mean() for image in images])
+    assert np.std(factors) == pytest.approx(1000**-0.5, rel=0.3)
+    rough = np.array([image.std() > 1e-9 for image in images])
+    assert 0.3 < rough.mean() < 0.7
+    smooth = replace(noise, gamma_shape=0.0, correlated_share=1.0).apply(flat, rng) - 1
+    assert 0.002 < smooth.std() < 0.005
+    neighbours = np.corrcoef(smooth[:, :-1].ravel(), smooth[:, 1:].ravel())[0, 1]
+    distant = np.corrcoef(smooth[:, :-16].ravel(), smooth[:, 16:].ravel())[0, 1]
+    assert neighbours > 0.8 > 0.1 > abs(distant)

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from edgegrasp_sim.gate import below_gate
+from edgegrasp_sim.grasping import FailureCause, GraspOutcome
+from edgegrasp_sim.intervals import paired_difference, wilson
+from edgegrasp_sim.results import ResultFolder, attempts_digest, round_from_json, summarise
+from edgegrasp_sim.trials import Attempt, Round, RoundEnd
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HELD = Attempt(
+    GraspOutcome.SUCCESS, None, "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25,
+    [[0.0] * 4] * 4,
+)  # fmt: skip
+MISSED = replace(
+    HELD, outcome=GraspOutcome.AFTER, cause=FailureCause.MISSED, object=None, planning_seconds=0.35
+)
+WRONG = replace(HELD, object="cube", wrong_object=True, start_contact=True)
+ROUNDS = [
+    Round(0, 0, ("mug", "mug", "cube", "duck", "duck"), (HELD, MISSED, WRONG, MISSED, MISSED),
+          0, RoundEnd.FAILURES),
+    Round(1, 0, ("mug", "cube", "duck"), (HELD,), 3, RoundEnd.NO_GRASP, 2, 1.5),
+]  # fmt: skip
+
+
+def test_figures_count_as_the_reference_does() -> None:
+    summary = summarise(ROUNDS)
+    assert (summary["successes"], summary["attempts"], summary["objects"]) == (3, 6, 8)
+    gsr, dr = summary["grasp_success_rate"], summary["declutter_rate"]
+    assert gsr["value"] == pytest.approx(0.5)
+    assert gsr["by_seed"] == {"0": pytest.approx(0.4), "1": 1.0}
+    assert gsr["mean_over_seeds"] == pytest.approx(0.7)
+    assert gsr["std_over_seeds"] == pytest.approx(0.3 * 2**0.5)
+    assert dr["value"] == pytest.approx(3 / 8)
+    assert summary["failures"]["missed"] == 3
+    assert summary["failures"]["no candidate"] == 3
+    assert sum(summary["failures"].values()) == 6
+    assert summary["wrong_object_successes"] == 1
+    assert summary["round_ends"] == {"consecutive failures": 1, "no grasp found": 1}
+    assert (summary["planner_retries"], summary["planner_waited_seconds"]) == (2, 1.5)
+    assert summary["planning_seconds"]["mean"] == pytest.approx(0.3)
+    objects = summary["objects_by_name"]
+    assert objects["mug"] == {"present": 3, "removed": 2, "attempts": 6, "successes": 2}
+    assert objects["cube"] == {"present": 2, "removed": 1, "attempts": 0, "successes": 0}
+
+
+def test_figures_of_nothing_are_none() -> None:
+    summary = summarise([Round(0, 0, (), (), 0, RoundEnd.CLEARED)])
+    assert summary["grasp_success_rate"]["value"] is None
+    assert summary["declutter_rate"]["wilson_95"] is None
+    assert summary["planning_seconds"] is None
+
+
+def test_times_do_not_change_the_digest_and_outcomes_do() -> None:
+    slower = replace(ROUNDS[1], retries=9, attempts=(replace(HELD, planning_seconds=9.0),))
+    assert attempts_digest([slower, ROUNDS[0]]) == attempts_digest(ROUNDS)
+    failed = replace(ROUNDS[1], attempts=(MISSED,))
+    assert attempts_digest([ROUNDS[0], failed]) != attempts_digest(ROUNDS)
+
+
+def test_a_round_comes_back_from_its_file() -> None:
+    for done in ROUNDS:
+        assert round_from_json(json.loads(json.dumps(asdict(done)))) == done
+
+
+def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
+    folder = ResultFolder(tmp_path / "new")
+    with pytest.raises(FileNotFoundError, match="holds no benchmark"):
+        folder.rounds()
+    protocol = {"name": "edgegrasp", "version": 1}
+    folder.open({"run": {"scene": "pile", "protocol": protocol, "planner": {}}})
+    for done in ROUNDS:
+        folder.add(done)
+    summary = folder.finish(folder.rounds())
+    assert json.loads(json.dumps(summary)) == json.loads((folder.path / "summary.json").read_text())
+    with (folder.path / "attempts.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    assert [row["cause"] for row in rows[:3]] == ["", "missed", ""]
+    assert json.loads(rows[0]["T_world_hand"]) == HELD.T_world_hand
+    assert not list(folder.path.rglob("*.tmp"))
+
+
+def test_wilson_intervals_are_the_known_ones() -> None:
+    assert wilson(8, 10) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
+    assert wilson(0, 10) == (0.0, pytest.approx(0.2775, abs=1e-4))
+    assert wilson(0, 0) is None
+
+
+def test_pairing_by_scene_finds_a_small_difference() -> None:
+    rng = np.random.default_rng(0)
+    hard = rng.random(200) < 0.5  # half of the scenes are hard for both
+    first = np.where(hard, 1, 4)
+    second = first + (rng.random(200) < 0.3)
+    five = np.full(200, 5)
+    found = paired_difference([first, second], [five, five], np.random.default_rng(1))
+    assert found is not None
+    difference, (low, high) = found
+    assert difference == pytest.approx((second.sum() - first.sum()) / 1000)
+    assert 0.03 < low < difference < high < 0.09
+    assert paired_difference([first, second], [five, 0 * five], rng) is None
+
+
+def gate_file(path: Path, successes: int, attempts: int) -> Path:
+    rate = {"value": successes / attempts, "wilson_95": wilson(successes, attempts)}
+    file = path / "gate.json"
+    file.write_text(json.dumps(summary_with(rate)))
+    return file
+
+
+def summary_with(rate: dict[str, object]) -> dict[str, object]:
+    return {
+        "scene": "pile",
+        "protocol": "edgegrasp",
+        "protocol_version": 1,
+        "grasp_success_rate": rate,
+        "declutter_rate": rate,
+    }
+
+
+def test_the_gate_lets_chance_pass_and_stops_a_fall(tmp_path: Path) -> None:
+    gate = gate_file(tmp_path, 90, 100)
+    assert below_gate(summary_with({"value": 0.85}), gate) == []
+    below = below_gate(summary_with({"value": 0.80}), gate)
+    assert [text.split()[0] for text in below] == ["GSR", "DR"]
+    assert below_gate(summary_with({"value": None}), gate)
+    with pytest.raises(ValueError, match="scene 'pile', not 'packed'"):
+        below_gate(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
+    gate.write_text("{}")
+    with pytest.raises(ValueError, match=r"no summary\.json"):
+        below_gate(summary_with({"value": 0.9}), gate)
