@@ -291,3 +291,105 @@ def test_compressed_pcd_with_false_sizes(sizes: tuple[int, int]) -> None:
     data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
     with pytest.raises(InvalidRequest):
         decode_file("pcd", data[0] + data[1] + struct.pack("<II", *sizes) + bytes(4), MANY)
+
+
+NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
+COLORS = np.random.default_rng(3).integers(0, 256, (40, 3)).astype(np.uint8)
+IDS = np.arange(40, dtype=np.int32) % 5
+
+
+def test_what_stands_beside_points_in_an_npz_file() -> None:
+    arrays = {"normals": NORMALS, "colors": COLORS, "segment_ids": IDS, "view_ids": IDS}
+    cloud = decode_file("npz", npz(points=POINTS, **arrays), MANY)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(getattr(cloud, name), array)
+    with pytest.raises(PayloadTooLarge) as caught:
+        decode_file("npz", npz(points=POINTS, segment_ids=np.zeros(1001, np.int32)), MANY)
+    assert caught.value.field == "segment_ids"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_normals_and_colours_of_a_ply_file(encoding: str) -> None:
+    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+    kinds = ["float"] * 6 + ["uchar"] * 3
+    header = f"ply\nformat {encoding} 1.0\nelement vertex 40\n"
+    header += "".join(f"property {k} {n}\n" for k, n in zip(kinds, names, strict=True))
+    table = np.concatenate([POINTS, NORMALS, COLORS], axis=1)
+    if encoding == "ascii":
+        body = "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
+    else:
+        rows = [POINTS[i].tobytes() + NORMALS[i].tobytes() + COLORS[i].tobytes() for i in range(40)]
+        body = b"".join(rows)
+    cloud = decode_file("ply", header.encode() + b"end_header\n" + body, MANY)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_array_equal(cloud.normals, NORMALS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+
+
+@pytest.mark.parametrize("kind", ["F", "U"])
+@pytest.mark.parametrize("height", [1, 4])
+def test_normals_and_colours_of_a_pcd_file(kind: str, height: int) -> None:
+    header = (
+        "VERSION 0.7\nFIELDS x y z normal_x normal_y normal_z rgb\nSIZE 4 4 4 4 4 4 4\n"
+        f"TYPE F F F F F F {kind}\nCOUNT 1 1 1 1 1 1 1\nWIDTH {40 // height}\nHEIGHT {height}\n"
+        "POINTS 40\nDATA binary\n"
+    )
+    packed = (COLORS.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=1)
+    rows = np.concatenate([POINTS, NORMALS, packed.astype("<u4").view("<f4")[:, None]], axis=1)
+    cloud = decode_file("pcd", header.encode() + rows.astype("<f4").tobytes(), MANY)
+    assert cloud.points.shape == ((40, 3) if height == 1 else (4, 10, 3))
+    np.testing.assert_array_equal(cloud.points.reshape(-1, 3), POINTS)
+    np.testing.assert_array_equal(cloud.normals, NORMALS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_normals_and_colours_written_by_open3d(suffix: str, compressed: bool, tmp_path) -> None:
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
+    cloud.normals = open3d.utility.Vector3dVector(NORMALS.astype(np.float64))
+    cloud.colors = open3d.utility.Vector3dVector(COLORS / 255)
+    path = tmp_path / f"cloud.{suffix}"
+    open3d.io.write_point_cloud(path, cloud, compressed=compressed)
+    found = decode_file(suffix, path.read_bytes(), MANY)
+    np.testing.assert_allclose(found.points, POINTS, atol=1e-7)
+    if suffix == "xyz":
+        assert found.normals is found.colors is None
+        return
+    np.testing.assert_allclose(found.normals, NORMALS, atol=1e-6)
+    scale = 255 if found.colors.dtype.kind == "f" else 1
+    np.testing.assert_allclose(found.colors * scale, COLORS, atol=1.0)
+
+
+def test_organised_clouds() -> None:
+    organised = POINTS.reshape(5, 8, 3).copy()
+    organised[2, 3] = np.nan
+    rows = organised.astype(object)
+    rows[2, 3] = None
+    for points in (
+        decode_file("npy", npy(organised), MANY).points,
+        decode_file("npz", npz(points=organised), MANY).points,
+        decode_list(rows.tolist(), MANY),
+    ):
+        np.testing.assert_array_equal(np.asarray(points, np.float32), organised)
+    with pytest.raises(PayloadTooLarge):
+        decode_file("npy", npy(organised), 39)
+    with pytest.raises(PayloadTooLarge):
+        decode_list(organised.tolist(), 39)
+
+
+@pytest.mark.parametrize(
+    ("data", "value"),
+    [
+        (b"", "0 bytes without a line"),
+        (b"# only\n", "without a line"),
+        (b"0 0 0\n0 0\n", "line 2 with 2 words"),
+        (b"0 0 0 1 0 0\n", "line 1 with 6 words"),
+        (b"0 0 a\n", "text among the numbers"),
+    ],
+)
+def test_bad_xyz_files(data: bytes, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_file("xyz", data, MANY)
+    assert value in caught.value.value

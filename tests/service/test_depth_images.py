@@ -1,0 +1,153 @@
+import base64
+
+import numpy as np
+import pytest
+
+from edgegrasp_model.cloud_input import check_cloud
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_service.depth_images import fuse_depth_images
+from edgegrasp_service.errors import PayloadTooLarge
+from edgegrasp_service.sent_arrays import ListArray
+from edgegrasp_service.sent_cloud import DepthCloud, SentCloud, decode_cloud
+
+MANY = 100_000
+FX, FY, CX, CY = 60.0, 50.0, 15.5, 11.5
+
+
+def pose(seed: int) -> np.ndarray:
+    """A random camera pose, from the QR decomposition of random numbers."""
+    random = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    T_cloud_camera = np.eye(4)
+    T_cloud_camera[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    T_cloud_camera[:3, 3] = random.normal(size=3)
+    return T_cloud_camera
+
+
+def depth_of(shape: tuple[int, int] = (24, 32), seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.3, 0.9, shape)
+
+
+def image(depth: np.ndarray, T_cloud_camera: np.ndarray, encoding: str = "64FC1") -> dict:
+    dtype = {"64FC1": "<f8", "32FC1": "<f4", "16UC1": "<u2"}[encoding]
+    pixels = {"height": depth.shape[0], "width": depth.shape[1], "encoding": encoding}
+    return {
+        "depth": pixels | {"data": depth.astype(dtype).tobytes()},
+        "intrinsics": {"fx": FX, "fy": FY, "cx": CX, "cy": CY},
+        "T_cloud_camera": T_cloud_camera.tolist(),
+    }
+
+
+def test_points_project_back_onto_their_pixels() -> None:
+    depth, T_cloud_camera = depth_of(), pose(1)
+    cloud, cameras = fuse_depth_images([image(depth, T_cloud_camera)], MANY)
+    assert cloud.points.shape == (24, 32, 3)
+    homogeneous = np.concatenate([cloud.points, np.ones((24, 32, 1))], axis=-1)
+    x, y, z = np.moveaxis((homogeneous @ np.linalg.inv(T_cloud_camera).T)[..., :3], -1, 0)
+    np.testing.assert_allclose(z, depth, atol=1e-6)
+    row, column = np.indices(depth.shape)
+    np.testing.assert_allclose(FX * x / z + CX, column, atol=1e-4)
+    np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
+    np.testing.assert_array_equal(cameras, [T_cloud_camera[:3, 3]])
+
+
+def test_z_is_forward_and_y_down() -> None:
+    cloud, _ = fuse_depth_images([image(np.full((24, 32), 0.5), np.eye(4))], MANY)
+    assert (cloud.points[..., 2] == 0.5).all()
+    assert (cloud.points[0, :, 1] < 0).all()
+    assert (cloud.points[-1, :, 1] > 0).all()
+    assert (cloud.points[:, -1, 0] > 0).all()
+
+
+@pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
+def test_encodings_say_the_same(encoding: str) -> None:
+    millimetres = np.round(depth_of() * 1000)
+    expected, _ = fuse_depth_images([image(millimetres / 1000, pose(2))], MANY)
+    sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
+    packed, _ = fuse_depth_images([sent], MANY)
+    np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
+    sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
+    in_json, _ = fuse_depth_images([sent], MANY)
+    np.testing.assert_array_equal(in_json.points, packed.points)
+
+
+def test_rows_of_metres() -> None:
+    depth = depth_of((3, 4))
+    expected, _ = fuse_depth_images([image(depth, pose(3))], MANY)
+    rows = depth.tolist()
+    rows[1][2] = None
+    listed, _ = fuse_depth_images([image(depth, pose(3)) | {"depth": rows}], MANY)
+    assert np.isnan(listed.points[1, 2]).all()
+    expected.points[1, 2] = np.nan
+    np.testing.assert_array_equal(listed.points, expected.points)
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
+def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
+    depth = depth_of()
+    depth[5, 7] = nothing
+    cloud, _ = fuse_depth_images([image(depth, pose(4))], MANY)
+    checked = check_cloud(cloud)
+    assert len(checked.points) == 24 * 32 - 1
+    assert 5 * 32 + 7 not in checked.row
+
+
+def test_views_are_fused() -> None:
+    depths = [depth_of(seed=seed) for seed in range(3)]
+    poses = [pose(seed) for seed in range(3)]
+    depths[0][0, 0] = np.nan
+    images = [image(depth, at) for depth, at in zip(depths, poses, strict=True)]
+    sent = SentCloud(DepthCloud(images), {"segment_ids": ListArray(list(range(3 * 24 * 32)))})
+    cloud, options = decode_cloud(sent, DetectOptions(), MANY)
+    np.testing.assert_allclose(options.viewpoint, [at[:3, 3] for at in poses])
+    assert parse_again(options) == options
+    checked = check_cloud(cloud)
+    np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
+    for view, single in enumerate(images):
+        alone, _ = fuse_depth_images([single], MANY)
+        seen = checked.points[checked.view_ids == view]
+        np.testing.assert_array_equal(seen, check_cloud(alone).points)
+
+
+def parse_again(options: DetectOptions) -> DetectOptions:
+    return DetectOptions.model_validate(options.model_dump())
+
+
+def test_one_view_is_one_viewpoint() -> None:
+    sent = SentCloud(DepthCloud([image(depth_of(), pose(5))]))
+    _, options = decode_cloud(sent, DetectOptions(), MANY)
+    assert options.viewpoint == tuple(pose(5)[:3, 3].tolist())
+
+
+def test_pixels_of_all_images_are_counted() -> None:
+    images = [image(depth_of(), pose(0))] * 3
+    with pytest.raises(PayloadTooLarge) as caught:
+        fuse_depth_images(images, 2 * 24 * 32)
+    assert caught.value.field == "depth_images"
+
+
+@pytest.mark.parametrize(
+    ("images", "field", "value"),
+    [
+        (None, "depth_images", "None"),
+        ([], "depth_images", "0 images"),
+        ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
+        ([{}], "depth_images.0.depth", "nothing"),
+        ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
+        ([image(depth_of(), pose(0)) | {"depth": [[1], [1, 2]]}], "depth_images.0.depth", "length"),
+        ([image(depth_of(), pose(0)) | {"depth": [[]]}], "depth_images.0.depth", "(1, 0)"),
+        ([image(depth_of(), pose(0)) | {"depth": [["a"]]}], "depth_images.0.depth", "['a']"),
+        ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", "(("),
+        (
+            [image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "32FC1",
+                                                    "data": "no base64!"}}],
+            "depth_images.0.depth.data", "no base64",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_images(images: object, field: str, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        fuse_depth_images(images, MANY)
+    assert caught.value.field == field
+    assert value.replace("((", "") in caught.value.value
