@@ -1,0 +1,229 @@
+"""What may be sent besides an array of points, and scoring: the same over both transports."""
+
+import base64
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from edgegrasp_client import InvalidRequestError
+from edgegrasp_client.results import Detection
+
+
+def contacts(detection: Detection) -> list[list[float]]:
+    return [grasp.contact_point.tolist() for grasp in detection.grasps]
+
+
+def ros_message(cloud: np.ndarray, data: Any = None) -> SimpleNamespace:
+    fields = [
+        SimpleNamespace(name=name, offset=4 * row, datatype=7, count=1)
+        for row, name in enumerate("xyz")
+    ]
+    height, width = cloud.shape[:-1] if cloud.ndim == 3 else (1, len(cloud))
+    return SimpleNamespace(
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * width,
+        data=cloud.tobytes() if data is None else data,
+        is_dense=True,
+        header=None,
+    )
+
+
+def depth_image(**changes: Any) -> Any:
+    depth = np.random.default_rng(0).uniform(0.3, 0.4, (20, 30)).astype(np.float32)
+    camera = {"fx": 60.0, "fy": 60.0, "cx": 14.5, "cy": 9.5}
+    return {"depth": depth, "intrinsics": camera, "T_cloud_camera": np.eye(4)} | changes
+
+
+def test_arrays_beside_the_cloud(client, cloud) -> None:
+    ids = np.arange(500)
+    beside = {"normals": cloud, "colors": cloud.astype(np.float64), "segment_ids": ids}
+    found = client.detect(cloud, view_ids=ids % 2, viewpoint=[[0, 0, 1], [1, 0, 1]], **beside)
+    assert contacts(found) == contacts(client.detect(cloud))
+    for name in (*beside, "view_ids"):
+        with pytest.raises(InvalidRequestError, match="500 points") as caught:
+            client.detect(cloud, **{name: (beside | {"view_ids": ids})[name][1:]})
+        assert caught.value.field == name
+
+
+def test_organised_clouds(client, cloud) -> None:
+    organised = cloud.reshape(20, 25, 3).copy()
+    assert contacts(client.detect(organised)) == contacts(client.detect(cloud))
+    organised[3, 4] = np.nan
+    found = client.detect(organised, segment_ids=np.zeros((20, 25), np.int64))
+    assert found.counts["points"] == 499
+
+
+def test_point_cloud2(client, cloud) -> None:
+    expected = contacts(client.detect(cloud))
+    assert contacts(client.detect(ros_message(cloud))) == expected
+    listed = ros_message(cloud, list(cloud.tobytes()))
+    assert contacts(client.detect(listed)) == expected
+    assert contacts(client.detect(ros_message(cloud.reshape(20, 25, 3)))) == expected
+    short = ros_message(cloud, b"")
+    with pytest.raises(InvalidRequestError) as caught:
+        client.detect(short)
+    assert caught.value.field == "point_cloud2.data"
+
+
+def test_depth_images(client) -> None:
+    one = client.detect(depth_images=[depth_image()])
+    assert one.counts["points"] == 600
+    millimetres = np.round(depth_image()["depth"] * 1000).astype(np.uint16)
+    assert client.detect(depth_images=[depth_image(depth=millimetres)]).grasps
+    views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
+    ids = np.arange(1200)
+    assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
+    with pytest.raises(InvalidRequestError) as caught:
+        client.detect(depth_images=views, view_ids=ids)
+    assert caught.value.field == "view_ids"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [
+        ({}, "cloud"),
+        ({"cloud": np.zeros((40, 3)), "depth_images": [depth_image()]}, "cloud"),
+        ({"depth_images": []}, ""),
+        ({"depth_images": [3]}, "depth_images.0"),
+        ({"depth_images": [depth_image(more=1)]}, "depth_images.0"),
+        ({"depth_images": [depth_image(depth=[[1.0]])]}, "depth_images.0.depth"),
+        ({"depth_images": [depth_image(depth=np.zeros((3, 4), int))]}, "depth_images.0.depth"),
+        ({"depth_images": [depth_image(depth=np.zeros(4))]}, "depth_images.0.depth"),
+        ({"depth_images": [depth_image(intrinsics={"fx": 1.0})]}, "depth_images.0.intrinsics"),
+        ({"depth_images": [depth_image(T_cloud_camera=1)]}, "depth_images.0.T_cloud_camera"),
+        ({"cloud": np.zeros((40, 3)), "normals": np.zeros((40, 2))}, "normals"),
+        ({"cloud": np.zeros((40, 3)), "normals": [[0, 0, 1]]}, "normals"),
+        ({"cloud": np.zeros((40, 3)), "segment_ids": np.zeros(40)}, "segment_ids"),
+        ({"cloud": np.zeros((40, 3)), "view_ids": np.full(40, 2**40)}, "view_ids"),
+    ],
+)
+def test_bad_inputs(arguments: dict[str, Any], field: str, client) -> None:
+    with pytest.raises(InvalidRequestError) as caught:
+        client.detect(**arguments)
+    assert caught.value.field == field or not field
+    assert caught.value.value
+    assert caught.value.fix
+
+
+def test_edges_are_scored_in_their_order(client, cloud) -> None:
+    edges = np.array([[0, 1], [7, 7], [499, 3]])
+    scoring = client.score(cloud, edges=edges, seed=2, collision={"mode": "ignore"})
+    assert [evaluation.reason for evaluation in scoring.evaluations] == [None, "too-short", None]
+    first, none, last = (evaluation.grasp for evaluation in scoring.evaluations)
+    assert none is None
+    np.testing.assert_array_equal(first.contact_point, cloud[1])
+    np.testing.assert_array_equal(last.contact_point, cloud[3])
+    assert (scoring.counts["scored"], scoring.model) == (2, "dummy")
+    assert scoring.warnings
+    assert scoring.seconds["total"] >= 0
+
+
+def test_hand_poses_are_scored(client, cloud) -> None:
+    found = client.detect(cloud, top_k=4)
+    poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
+    scoring = client.score(cloud, hand_poses=poses)
+    for evaluation, grasp in zip(scoring.evaluations, found.grasps, strict=True):
+        assert evaluation.grasp is not None
+        np.testing.assert_allclose(evaluation.grasp.T_cloud_tcp, grasp.T_cloud_tcp, atol=1e-6)
+
+
+def test_scoring_over_any_cloud(client, cloud) -> None:
+    edges = np.array([[0, 1], [2, 3]])
+    expected = [e.grasp.score for e in client.score(cloud, edges=edges).evaluations]
+    for given in (cloud.reshape(20, 25, 3), ros_message(cloud)):
+        scoring = client.score(given, edges=edges, segment_ids=np.arange(500))
+        assert [evaluation.grasp.score for evaluation in scoring.evaluations] == expected
+    assert client.score(depth_images=[depth_image()], edges=edges).evaluations
+
+
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [
+        ({}, "edges"),
+        ({"edges": np.zeros((1, 2), int), "hand_poses": np.eye(4)[None]}, "edges"),
+        ({"edges": [[0, 1]]}, "edges"),
+        ({"edges": np.zeros((3, 3), int)}, "edges"),
+        ({"edges": np.zeros((3, 2))}, "edges"),
+        ({"edges": np.array([[0, 500]])}, "edges"),
+        ({"edges": np.zeros((0, 2), int)}, "edges"),
+        ({"hand_poses": np.eye(4)}, "hand_poses"),
+        ({"hand_poses": np.full((2, 4, 4), np.nan)}, "hand_poses"),
+        ({"edges": np.array([[0, 1]]), "seed": -1}, "options.seed"),
+    ],
+)
+def test_bad_scoring(given: dict[str, Any], field: str, client, cloud) -> None:
+    with pytest.raises(InvalidRequestError) as caught:
+        client.score(cloud, **given)
+    error = caught.value
+    assert error.field in (field, "hand_poses" if field == "edges" else field)
+    assert error.fix
+
+
+def test_debug(client, cloud) -> None:
+    assert client.detect(cloud).debug is None
+    debug = client.detect(cloud, debug=True).debug
+    assert debug is not None
+    assert debug.points.shape == debug.normals.shape == (500, 3)
+    assert debug.T_cloud_hand.shape == (32, 4, 4)
+    for array in (debug.points, debug.normals, debug.T_cloud_hand, debug.score):
+        assert array.dtype == np.float32
+    assert debug.approach_index.dtype == debug.contact_index.dtype == np.int32
+    assert np.isnan(debug.score).sum() == 22
+    assert (debug.outcome.count("returned"), debug.outcome.count("not-scored")) == (10, 22)
+    assert debug.support_plane is None
+
+
+def test_options_too_long_for_an_address(client, cloud) -> None:
+    mask = np.ones(500, bool)
+    indices = np.arange(499)
+    options: dict[str, Any] = {
+        "approach_region": {"include": [{"kind": "mask", "mask": mask}]},
+        "contact_region": {"include": [{"kind": "indices", "indices": indices}] * 10},
+    }
+    assert contacts(client.detect(cloud, **options)) == contacts(client.detect(cloud))
+
+
+def test_json_bodies(dummy_server, cloud) -> None:
+    """What a client of REST without numpy sends."""
+    url = f"{dummy_server.http_url}/v1/grasps"
+    message = vars(ros_message(cloud))
+    ros = {name: message[name] for name in ("height", "width", "is_bigendian", "point_step")}
+    ros |= {"row_step": message["row_step"], "data": base64.b64encode(message["data"]).decode()}
+    ros["fields"] = [vars(field) for field in message["fields"]]
+    image = depth_image() | {"T_cloud_camera": np.eye(4).tolist()}
+    image["depth"] = image["depth"].tolist()
+    ids = list(range(500))
+    bodies = [
+        {"points": cloud.tolist(), "segment_ids": ids, "normals": cloud.tolist()},
+        {"points": cloud.reshape(20, 25, 3).tolist(), "colors": cloud.tolist()},
+        {"point_cloud2": ros, "segment_ids": ids},
+        {"depth_images": [image], "options": {"top_k": 3}},
+    ]
+    for body in bodies:
+        assert httpx.post(url, json=body).json()["grasps"]
+    body = bodies[0] | {"edges": [[0, 1], [2, 2]]}
+    scored = httpx.post(f"{url}:score", json=body).json()
+    assert [evaluation["reason"] for evaluation in scored["evaluations"]] == [None, "too-short"]
+    assert scored["evaluations"][1]["grasp"] is None
+    form = {name: (None, json.dumps(value)) for name, value in body.items() if name != "points"}
+    form["cloud"] = ("cloud.xyz", "\n".join(" ".join(map(repr, row)) for row in cloud.tolist()))
+    assert httpx.post(f"{url}:score", files=form).json()["evaluations"] == scored["evaluations"]
+    answer = httpx.post(f"{url}:score", content=b"", headers={"content-type": "application/x-npy"})
+    assert answer.status_code == 415
+
+
+def test_a_file_and_its_own_normals_are_not_sent_twice(client, cloud, tmp_path) -> None:
+    path = tmp_path / "cloud.npz"
+    np.savez(path, points=cloud, normals=cloud, segment_ids=np.arange(500))
+    assert client.detect(path).grasps
+    with pytest.raises(InvalidRequestError) as caught:
+        client.detect(path, normals=cloud)
+    assert caught.value.field == "normals"
