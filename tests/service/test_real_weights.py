@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -87,3 +88,134 @@ def test_every_way_in_gives_the_detectors_grasps(
 
 def _parameters(catalogue: Any) -> int:
     return next(row["parameters"] for row in catalogue.describe() if row["name"] == "untrained")
+
+
+# Many options at once, with the weights that ship.
+MANY: dict[str, Any] = {
+    "gripper": "robotiq-2f-140",
+    "seed": 11,
+    "num_approach_points": 8,
+    "num_candidates": 120,
+    "sampling": "uniform",
+    "viewpoint": [[0.3, 0.1, 0.6], [-0.4, 0.2, 0.5]],
+    "up": [0.0, 0.0, 2.0],
+    "support": {"kind": "ransac", "distance": 0.004, "max_tilt": 0.2},
+    "workspace": {"min": [-0.3, -0.3, -0.05], "max": [0.3, 0.3, 0.4]},
+    "approach_region": {
+        "include": [
+            {"kind": "sphere", "center": [0.0, 0.0, 0.08], "radius": 0.1},
+            {"kind": "half_space", "normal": [0.0, 0.0, 1.0], "offset": 0.02},
+        ],
+        "exclude": [{"kind": "segments", "ids": [1]}],
+    },
+    "contact_region": {"exclude": [{"kind": "indices", "indices": [0, 5, 17]}]},
+    "approach_direction": {
+        "cones": [{"direction": [0.2, 0.0, -1.0], "max_angle": 0.9}],
+        "preset": "top-down",
+    },
+    "collision": {
+        "mode": "penalise",
+        "margin": 0.001,
+        "approach_length": 0.08,
+        "retreat_length": 0.05,
+        "retreat_direction": "up",
+        "obstacles": [{"kind": "box", "min": [0.15, -0.2, 0.0], "max": [0.2, 0.2, 0.2]}],
+    },
+    "min_score": 0.01,
+    "top_k": 12,
+    "suppression": {"translation": 0.005, "rotation": 0.2},
+    "order": "clearance",
+    "debug": True,
+}
+
+
+@pytest.fixture(scope="module")
+def scene(box: np.ndarray) -> dict[str, np.ndarray]:
+    """The box on a table, as the arrays of an .npz file."""
+    rng = np.random.default_rng(1)
+    table = np.column_stack([rng.uniform(-0.2, 0.2, (6000, 2)), rng.normal(0.0, 5e-4, 6000)])
+    points = np.concatenate([box, table]).astype(np.float32)
+    return {
+        "points": points,
+        "segment_ids": np.repeat(np.array([0, 1], np.int32), 6000),
+        "view_ids": (points[:, 0] < 0).astype(np.int32),
+    }
+
+
+def test_many_options_give_the_same_grasps_everywhere(
+    scene: dict[str, np.ndarray], start_server, tmp_path: Path
+) -> None:
+    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.cloud_input import CloudInput
+    from edgegrasp_model.options import parse_options
+
+    expected = ModelCatalogue.load().get().detect(CloudInput(**scene), parse_options(MANY))
+    assert expected.grasps
+    assert expected.debug is not None
+
+    file, options = tmp_path / "scene.npz", tmp_path / "options.json"
+    np.savez_compressed(file, **scene)
+    options.write_text(json.dumps(MANY))
+    flags = ["detect", str(file), "--json"]
+    for name, value in MANY.items():
+        words = [] if name == "debug" else [value if isinstance(value, str) else json.dumps(value)]
+        flags += [f"--{name.replace('_', '-')}", *words]
+    printed = [CliRunner().invoke(main.app, flags)]
+    beside = {name: array for name, array in scene.items() if name != "points"}
+    found: list[Detection] = []
+    with start_server() as server:
+        with GraspClient(server.grpc_address) as client:
+            found.append(client.detect(file, **MANY))
+        with GraspClient(server.http_url) as client:
+            found.append(client.detect(scene["points"], **beside, **MANY))
+        remote = ["--server", server.http_url]
+        printed.append(CliRunner().invoke(main.app, [*flags, *remote]))
+        body = {name: array.tolist() for name, array in scene.items()} | {"options": MANY}
+        answer = httpx.post(f"{server.http_url}/v1/grasps", json=body, timeout=60).json()
+        words = ["detect", str(file), "--json", "--options", str(options)]
+        printed.append(CliRunner().invoke(main.app, [*words, "--server", server.grpc_address]))
+    for detection in found:
+        assert as_lists(detection) == as_lists(expected)
+        assert detection.counts == expected.counts
+        assert detection.warnings == expected.warnings
+        assert detection.debug is not None
+        for name, value in vars(expected.debug).items():
+            np.testing.assert_array_equal(getattr(detection.debug, name), value)
+    for document in (answer, *(json.loads(result.stdout) for result in printed)):
+        assert [list(grasp.values()) for grasp in document["grasps"]] == as_lists(expected)
+        assert document["counts"] == expected.counts
+        assert document["debug"]["outcome"] == expected.debug.outcome
+
+
+def test_scores_are_the_same_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
+    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.options import parse_options
+
+    options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
+    points = scene["points"]
+    edges = np.random.default_rng(2).integers(0, 6000, (40, 2))
+    detector = ModelCatalogue.load().get()
+    poses = np.stack(
+        [g.T_cloud_hand for g in detector.detect(points, parse_options(options)).grasps]
+    )
+    by_edges = detector.score(points, parse_options(options), edges=edges)
+    by_poses = detector.score(points, parse_options(options), hand_poses=poses)
+    assert any(evaluation.grasp for evaluation in by_edges.evaluations)
+    assert any(evaluation.grasp for evaluation in by_poses.evaluations)
+    with start_server() as server:
+        for address in (server.grpc_address, server.http_url):
+            with GraspClient(address) as client:
+                assert evaluated(client.score(points, edges=edges, **options)) == evaluated(
+                    by_edges
+                )
+                scoring = client.score(points, hand_poses=poses, **options)
+                assert evaluated(scoring) == evaluated(by_poses)
+                assert scoring.counts == by_poses.counts
+
+
+def evaluated(scoring: Any) -> list[Any]:
+    return [
+        evaluation.reason
+        or [np.asarray(value, np.float32).tolist() for value in vars(evaluation.grasp).values()]
+        for evaluation in scoring.evaluations
+    ]
