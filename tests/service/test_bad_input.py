@@ -117,6 +117,23 @@ JSON_CASES = {
         {"points": [], "options": {"sead": 1}}, "options.sead", "unknown", "seed"
     ),
     "options no object": ({"points": [], "options": [1]}, "options", "[1]", "object"),
+    "unknown field of a shape": (
+        {"points": [], "options": {"contact_region": {"include": [{"kind": "sphere", "r": 1}]}}},
+        "options.contact_region.include.0.center", "nothing", "required",
+    ),
+    "unknown kind of shape": (
+        {"points": [], "options": {"contact_region": {"exclude": [{"kind": "cube"}]}}},
+        "options.contact_region.exclude.0", "cube", "kind",
+    ),
+    "two clouds": (
+        {"points": GOOD.tolist(), "point_cloud2": {}}, "point_cloud2", "beside points", "one cloud"
+    ),
+    "text for segments": (
+        {"points": GOOD.tolist(), "segment_ids": "a"}, "segment_ids", "'a'", "list"
+    ),
+    "fractions for segments": (
+        {"points": GOOD.tolist(), "segment_ids": [0.5] * 500}, "segment_ids", "float64", "integers"
+    ),
     "no object": ([1, 2], "body", "[1, 2]", "object"),
 }  # fmt: skip
 
@@ -231,11 +248,22 @@ def test_message_without_a_cloud(raw_grpc) -> None:
     assert (answer.code, answer.field, answer.value) == ("INVALID_ARGUMENT", "cloud", "nothing")
 
 
-@pytest.mark.parametrize("field", ["request", "request.options"])
+UNKNOWN = {
+    "request": lambda message: message,
+    "request.options": lambda message: message.options,
+    "request.options.collision": lambda message: message.options.collision,
+    "request.options.viewpoint.0": lambda message: message.options.viewpoint.add(),
+    "request.options.contact_region.exclude.0": (
+        lambda message: message.options.contact_region.exclude.add()
+    ),
+}
+
+
+@pytest.mark.parametrize("field", UNKNOWN)
 def test_unknown_fields_in_a_message(field: str, raw_grpc) -> None:
     unknown = b"\xfa\x3f\x01a"  # number 1023, one byte
     message = grasp_pb2.DetectGraspsRequest(points=GOOD.tobytes())
-    (message if field == "request" else message.options).MergeFromString(unknown)
+    UNKNOWN[field](message).MergeFromString(unknown)
     answer = raw_grpc.send(message)
     assert (answer.code, answer.field) == ("INVALID_ARGUMENT", field)
     assert "1023" in answer.value
