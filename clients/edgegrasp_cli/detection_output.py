@@ -39,7 +39,9 @@ def print_table(detection: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("#", "score", "TCP x y z (m)", "approach direction", "width (m)", "free")
+    table = Table(
+        "#", "score", "TCP x y z (m)", "approach direction", "width (m)", "clearance (m)", "free"
+    )
     for rank, grasp in enumerate(detection.grasps, start=1):
         table.add_row(
             str(rank),
@@ -47,6 +49,7 @@ def print_table(detection: Any) -> None:
             _numbers(grasp.T_cloud_tcp[:3, 3]),
             _numbers(grasp.approach_direction),
             f"{grasp.width:.3f}",
+            f"{grasp.clearance:+.3f}",
             "yes" if grasp.collision_free else "no",
         )
     console = Console()

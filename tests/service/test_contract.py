@@ -12,7 +12,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.http_bodies import DetectionBody, ModelsBody
+from edgegrasp_service.http_bodies import DetectionBody, ModelsBody, ScoringBody
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 
@@ -72,6 +72,17 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, raw_grpc, raw_res
     expected = grasps_of(answers[0])
     assert len(expected) == 7
     assert all(grasps_of(answer) == expected for answer in answers)
+
+
+def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, raw_rest) -> None:
+    body = {"points": cloud.tolist(), "options": {"debug": True}}
+    debug = DetectionBody.model_validate(raw_rest.post(json=body).body).debug
+    assert debug is not None
+    assert len(debug.outcome) == len(debug.score) == len(debug.T_cloud_hand) == 32
+    assert debug.score[-1] is None
+    body = {"points": cloud.tolist(), "edges": [[0, 1], [3, 3]]}
+    scoring = ScoringBody.model_validate(raw_rest.post("/v1/grasps:score", json=body).body)
+    assert [evaluation.grasp is None for evaluation in scoring.evaluations] == [False, True]
 
 
 def test_seed_matters_and_zero_is_one(cloud: np.ndarray, raw) -> None:
