@@ -62,12 +62,14 @@ def meets_cloud(
     boxes = _grown_boxes(gripper, request)
     for low, high in _lengthened(boxes, request):
         hit |= ((position > low) & (position < high)).all(axis=1)
-    if request.retreat_direction == "up" and request.retreat_length > 0:
-        lift = request.retreat_length * (UP @ T_cloud_hand[view.candidate, :3, :3])  # (P, 3)
-        for low, high in boxes:
-            hit |= _passed_over(position, lift, low, high)
     result = np.zeros(view.num_candidates, dtype=bool)
     result[view.candidate[hit]] = True
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        left = np.flatnonzero(~result[view.candidate])  # points seen from hands still free
+        candidate, position = view.candidate[left], position[left]
+        lift = request.retreat_length * (UP @ T_cloud_hand[candidate, :3, :3])
+        for low, high in boxes:
+            result[candidate[_passed_over(position, lift, low, high)]] = True
     return result
 
 
@@ -94,7 +96,7 @@ def meets_obstacles(
     if request.retreat_direction == "up" and request.retreat_length > 0:
         hands = SolidBoxes.of_hands(T_cloud_hand, grown)
         hit |= _meets_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
-    return np.asarray(hit.reshape(len(T_cloud_hand), -1).any(axis=1))
+    return np.asarray(hit.reshape(len(T_cloud_hand), len(grown)).any(axis=1))
 
 
 def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
@@ -121,7 +123,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
         near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
         distance = np.full(len(hands), np.inf)
         distance[near] = signed_distance(hands.take(near), box.take(near))
-        nearest = np.minimum(nearest, distance.reshape(-1, len(boxes)).min(axis=1))
+        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
     return nearest.astype(np.float32)
 
 

@@ -88,7 +88,8 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
         edges = np.concatenate([edges, sweep[:, None] / 2], axis=1)
         center = center + sweep / 2
     own = [np.cross(edges[:, i], edges[:, j]) for i in range(edges.shape[1]) for j in range(i)]
-    crossed = np.cross(edges[:, :, None], theirs.half[:, None]).reshape(len(center), -1, 3)
+    crossed = np.cross(edges[:, :, None], theirs.half[:, None])
+    crossed = crossed.reshape(len(center), 3 * edges.shape[1], 3)
     axes = np.concatenate([np.stack(own, axis=1), theirs.half, crossed], axis=1)  # (M, A, 3)
     length = np.linalg.norm(axes, axis=2)
     scale = np.where(length > 1e-12, 1.0 / np.maximum(length, 1e-12), 0.0)

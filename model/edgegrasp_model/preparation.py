@@ -92,7 +92,8 @@ def sample_candidates(
         free = ~collides(scene, view, candidates.T_cloud_hand, gripper, options.collision)
         ignored = options.collision.mode == "ignore"
         this.outcome[row] = CODE[Outcome.NOT_SCORED]
-        this.outcome[row[~free & ~ignored]] = CODE[Outcome.COLLISION]
+        if not ignored:
+            this.outcome[row[~free]] = CODE[Outcome.COLLISION]
         _add(counts, "checked", len(row))
         _add(counts, "collision_free", int(free.sum()))
         found = len(row) > 0 if ignored else free.any()

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.option_types import Finite, Strict, UnitVector
 
@@ -14,7 +15,9 @@ Float64 = NDArray[np.float64]
 
 SUPPORT_MARGIN = 0.005  # metres above a given plane below which points belong to it
 TRIALS = 5000  # planes through three points
-SAMPLE = 3000  # points that planes are judged by
+JUDGED = 1000  # planes of the right tilt that are judged at most
+SAMPLE = 2000  # points that planes are judged by
+CROWD_RADIUS = 0.02  # metres around a point in which others share its surface
 REFINEMENTS = 3  # least squares over the plane's points
 
 
@@ -32,7 +35,7 @@ class SupportPlane(Strict):
 
 
 class RansacPlane(Strict):
-    """Look for the plane in the cloud: the one of most points among those near the level.
+    """Look for the plane in the cloud: the largest of those near the level.
 
     Found by RANSAC from the request's seed, within the workspace. Its points are removed before
     anything else; the plane stays as an obstacle. None found: a warning, and no support plane.
@@ -46,14 +49,14 @@ class RansacPlane(Strict):
         default=0.35, description="radians between its normal and up; a quarter turn: any plane"
     )
     min_share: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
-        default=0.1, description="share of the cloud's points it must hold"
+        default=0.1, description="share of the seen surface it must hold"
     )
 
 
 def find_support_plane(
     points: Float32, request: RansacPlane, up: ArrayLike, rng: np.random.Generator
 ) -> SupportPlane | None:
-    """Find the plane of most points by RANSAC, then fit it to them by least squares.
+    """Find the largest plane by RANSAC, then fit it to its points by least squares.
 
     Args:
         points: (N, 3) metres.
@@ -62,7 +65,7 @@ def find_support_plane(
         rng: Source of the trials.
 
     Returns:
-        The plane; None where none holds enough of the points.
+        The plane; None where none holds enough of the seen surface.
     """
     if len(points) < 3:
         return None
@@ -75,16 +78,21 @@ def find_support_plane(
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where((normals @ upward < 0)[:, None], -normals, normals)
     level = normals @ upward >= math.cos(min(request.max_tilt, math.pi / 2)) - 1e-9
-    normals, corners = normals[level], corners[level]
+    normals, corners = normals[level][:JUDGED], corners[level][:JUDGED]
     if len(normals) == 0:
         return None
     offsets = np.einsum("td,td->t", normals, corners[:, 0])
     held = np.abs(judged @ normals.T - offsets) < request.distance  # (S, T)
-    best = int(held.sum(axis=0).argmax())
+    # What is near the camera has more points: each counts for the surface it stands for.
+    crowd = cKDTree(judged).query_ball_point(judged, CROWD_RADIUS, return_length=True)
+    share = (1.0 / crowd) @ held / (1.0 / crowd).sum()  # (T,)
+    best = int(share.argmax())
+    if share[best] < request.min_share:
+        return None
     normal, offset = normals[best], float(offsets[best])
     for _ in range(REFINEMENTS):
         near = np.abs(points @ normal - offset) < request.distance
-        if near.sum() < max(3, request.min_share * len(points)):
+        if near.sum() < 3:
             return None
         normal, offset = _fitted(points[near], upward)
     if normal @ upward < math.cos(min(request.max_tilt, math.pi / 2)) - 1e-3:

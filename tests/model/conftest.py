@@ -1,4 +1,4 @@
-"""Random clouds with candidate edge grasps, as the networks take them."""
+"""Random clouds with candidate edge grasps, as the networks take them; a small detector."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -9,6 +9,11 @@ import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.ball_batch import BallBatch, crop_balls
+from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import NetworkConfig
 
 RADIUS = 0.05
@@ -97,3 +102,41 @@ def tiny_config() -> NetworkConfig:
         global_widths_2=(28, 32),
         classifier_widths=(24, 16),
     )
+
+
+@pytest.fixture(scope="session")
+def plus() -> GraspDetector:
+    """A quick detector that reads the hand description; its random weights spread the scores."""
+    config = NetworkConfig(
+        architecture="edgegrasp",
+        conv_widths=(8, 8, 8),
+        global_widths_1=(8, 8, 8),
+        global_widths_2=(8, 8),
+        classifier_widths=(8, 8),
+        hand_description_size=HAND_DESCRIPTION_SIZE,
+        crop_radius=0.04,
+    )
+    metadata = CheckpointMetadata(
+        "tiny", config, voxel_size=0.0045, gripper="panda", temperature=0.01
+    )
+    network = build_network(config, torch.Generator().manual_seed(3))
+    return GraspDetector(network, metadata, load_gripper("panda"))
+
+
+def _box_on_table(seed: int = 0, count: int = 4000, table: bool = False) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.5, 0.5, (2, count))
+    top = np.stack([u, v, np.full(count, 0.5)], axis=1)
+    front = np.stack([np.full(count, 0.5), u, v], axis=1)
+    side = np.stack([u, np.full(count, 0.5), v], axis=1)
+    points = np.concatenate([top, front, side]) * (0.04, 0.06, 0.08) + (0, 0, 0.04)
+    if table:
+        flat = np.stack([u * 0.5, v * 0.5, np.zeros(count)], axis=1)
+        points = np.concatenate([points, flat])
+    return (points + rng.normal(0, 0.0003, points.shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="session")
+def box_on_table() -> Callable[..., NDArray[np.float32]]:
+    """Makes the top and two sides of a 40 x 60 x 80 mm box on z = 0, with its table if wanted."""
+    return _box_on_table

@@ -1,0 +1,136 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.cloud import voxelise
+from edgegrasp_model.cloud_input import CheckedCloud, CloudInput, check_cloud
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.regions import (
+    Box,
+    HalfSpace,
+    Indices,
+    Mask,
+    OrientedBox,
+    Region,
+    Segments,
+    Sphere,
+    check_region,
+    inside_region,
+    inside_shape,
+)
+
+SIZE = 0.01  # edge of a voxel, metres
+
+
+def rows(count: int = 40, seed: int = 0, **fields: object) -> CheckedCloud:
+    points = np.random.default_rng(seed).uniform(0, 0.03, (count, 3)).astype(np.float32)
+    return check_cloud(CloudInput(points, **fields))
+
+
+def inside(region: Region | None, cloud: CheckedCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Which voxels a region holds, and the voxel of each point."""
+    voxels = voxelise(cloud.points, SIZE)
+    return inside_region(region, voxels.mean(cloud.points), voxels, cloud), voxels.voxel
+
+
+@pytest.mark.parametrize(
+    ("shape", "within", "outside"),
+    [
+        (Box(min=(0, 0, 0), max=(1, 2, 3)), (1, 2, 3), (1.01, 2, 3)),
+        (
+            OrientedBox(
+                center=(1, 0, 0),
+                half_extents=(0.5, 0.1, 0.1),
+                # A quarter turn about z: the long side along the cloud's y.
+                quaternion=(0, 0, np.sqrt(0.5), np.sqrt(0.5)),
+            ),
+            (1.05, 0.45, 0),
+            (1.45, 0.05, 0),
+        ),
+        (Sphere(center=(0, 1, 0), radius=0.5), (0, 1.4, 0.2), (0.4, 1.4, 0)),
+        (HalfSpace(normal=(0, 0, -1), offset=-2), (9, 9, 1.9), (0, 0, 2.1)),
+    ],
+)
+def test_shapes_hold_what_they_should(
+    shape: Box | OrientedBox | Sphere | HalfSpace,
+    within: tuple[float, float, float],
+    outside: tuple[float, float, float],
+) -> None:
+    points = np.array([within, outside], dtype=np.float32)
+    assert inside_shape(shape, points).tolist() == [True, False]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_an_oriented_box_is_an_aligned_one_turned(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    turn, half = Rotation.random(rng=rng), rng.uniform(0.1, 1, 3)
+    points = rng.uniform(-1.5, 1.5, (200, 3))
+    aligned = Box(min=tuple(-half), max=tuple(half))
+    turned = OrientedBox(
+        center=(1, 2, 3), half_extents=tuple(half), quaternion=tuple(turn.as_quat())
+    )
+    moved = turn.apply(points) + np.array([1, 2, 3])
+    np.testing.assert_array_equal(inside_shape(turned, moved), inside_shape(aligned, points))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_rows_hold_a_voxel_by_half_of_its_points_however_they_are_named(seed: int) -> None:
+    chosen = np.random.default_rng(seed).random(40) < 0.5
+    cloud = rows(seed=seed, segment_ids=np.where(chosen, 7, -2))
+    regions = [
+        Region(include=(Mask(mask=tuple(chosen.tolist())),)),
+        Region(include=(Indices(indices=tuple(np.flatnonzero(chosen).tolist())),)),
+        Region(include=(Segments(ids=(7,)),)),
+    ]
+    for region in regions:
+        held, voxel = inside(region, cloud)
+        for number, found in enumerate(held):
+            assert found == (chosen[voxel == number].mean() >= 0.5)
+
+
+def test_a_region_is_what_is_included_and_not_excluded() -> None:
+    cloud = rows(200)
+    low = HalfSpace(normal=(0, 0, -1), offset=-0.015)
+    left = HalfSpace(normal=(-1, 0, 0), offset=-0.015)
+    (in_low, _), (in_left, _) = (inside(Region(include=(one,)), cloud) for one in (low, left))
+    assert in_low.any()
+    assert (in_low & in_left).any()
+    np.testing.assert_array_equal(
+        inside(Region(include=(low,), exclude=(left,)), cloud)[0], in_low & ~in_left
+    )
+    np.testing.assert_array_equal(inside(Region(include=(low, left)), cloud)[0], in_low | in_left)
+    np.testing.assert_array_equal(inside(Region(exclude=(left,)), cloud)[0], ~in_left)
+    assert inside(Region(), cloud)[0].all()
+    assert inside(None, cloud)[0].all()
+
+
+def test_rows_are_those_of_the_cloud_as_sent_when_points_were_dropped() -> None:
+    organised = np.full((4, 5, 3), np.nan, dtype=np.float32)
+    organised[1:3] = np.arange(30, dtype=np.float32).reshape(2, 5, 3) / 2
+    cloud = check_cloud(organised)
+    assert cloud.row.tolist() == list(range(5, 15))
+    later = cloud.take(cloud.points[:, 0] > 5)
+    region = Region(include=(Indices(indices=(9, 12)),))
+    held, voxel = inside(region, later)
+    assert later.row[held[voxel]].tolist() == [9, 12]
+
+
+@pytest.mark.parametrize(
+    ("shape", "field"),
+    [
+        (Indices(indices=(3, 40)), "options.contact_region.exclude.0.indices"),
+        (Mask(mask=(True,) * 39), "options.contact_region.exclude.0.mask"),
+        (Segments(ids=(1,)), "segment_ids"),
+    ],
+)
+def test_rows_that_the_cloud_does_not_have_are_refused(
+    shape: Indices | Mask | Segments, field: str
+) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        check_region(Region(exclude=(shape,)), rows(), "contact_region")
+    assert caught.value.field == field
+    assert "Send" in caught.value.fix

@@ -1,0 +1,146 @@
+"""Nothing is assumed of the cloud's frame: a turned scene has the same grasps, turned."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.canonical_frame import CanonicalFrame
+from edgegrasp_model.cloud_input import CloudInput
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.options import DetectOptions
+
+VIEW = np.array([0.4, 0.15, 0.45])
+
+
+class Turned:
+    """A rigid motion of a scene and of everything a request says about it."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.turn = Rotation.random(rng=rng)
+        self.shift = rng.uniform(-0.4, 0.4, 3)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        return self.turn.apply(np.asarray(points, np.float64)) + self.shift
+
+    def point(self, *xyz: float) -> list[float]:
+        return self.points(np.array([xyz]))[0].tolist()
+
+    def direction(self, *xyz: float) -> list[float]:
+        return self.turn.apply(np.array(xyz)).tolist()
+
+    def plane(self, normal: list[float], offset: float) -> dict[str, object]:
+        turned = self.turn.apply(normal)
+        return {"normal": turned.tolist(), "offset": offset + float(turned @ self.shift)}
+
+
+def constraints(turned: Turned) -> dict[str, object]:
+    """Every kind of constraint that is not bound to the frame's axes."""
+    box = {
+        "kind": "oriented_box",
+        "center": turned.point(0.0, 0.0, 0.05),
+        "half_extents": [0.05, 0.05, 0.045],
+        "quaternion": turned.turn.as_quat().tolist(),
+    }
+    hole = {"kind": "sphere", "center": turned.point(0.02, 0.0, 0.08), "radius": 0.01}
+    far = {"kind": "half_space", **turned.plane([0.0, 1.0, 0.0], -0.02)}
+    wall = {**box, "center": turned.point(-0.2, 0.0, 0.1), "half_extents": [0.02, 0.2, 0.1]}
+    return {
+        "viewpoint": turned.point(*VIEW),
+        "up": turned.direction(0.0, 0.0, 2.0),
+        "support": turned.plane([0.0, 0.0, 1.0], 0.0),
+        "approach_region": {"include": [box], "exclude": [hole]},
+        "contact_region": {"include": [far]},
+        "approach_direction": {
+            "cones": [{"direction": turned.direction(-0.2, 0.1, -1.0), "max_angle": 0.9}],
+            "preset": "top-down",
+        },
+        "collision": {
+            "obstacles": [wall],
+            "margin": 0.001,
+            "retreat_length": 0.06,
+            "retreat_direction": "up",
+        },
+        "num_approach_points": 16,
+    }
+
+
+def frame_only(turned: Turned) -> dict[str, object]:
+    return {"up": turned.direction(0.0, 0.0, 1.0), "num_approach_points": 16}
+
+
+def found_plane(turned: Turned) -> dict[str, object]:
+    return {
+        "viewpoint": turned.point(*VIEW),
+        "up": turned.direction(0.0, 0.0, 1.0),
+        "support": {"kind": "ransac"},
+        "order": "highest",
+        "num_approach_points": 16,
+    }
+
+
+@pytest.mark.parametrize("request_of", [constraints, frame_only, found_plane])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_turned_scene_has_the_same_grasps_turned(
+    request_of: Callable[[Turned], dict[str, object]],
+    seed: int,
+    plus: GraspDetector,
+    box_on_table: Callable[..., np.ndarray],
+) -> None:
+    still, turned = Turned(0), Turned(seed)
+    still.turn, still.shift = Rotation.identity(), np.zeros(3)
+    cloud = box_on_table(table=request_of is found_plane)
+    here = plus.detect(
+        CloudInput(cloud.astype(np.float64)), DetectOptions.model_validate(request_of(still))
+    )
+    there = plus.detect(
+        CloudInput(turned.points(cloud)), DetectOptions.model_validate(request_of(turned))
+    )
+    assert len(here.grasps) >= 5
+    assert there.counts == here.counts
+    for a, b in zip(here.grasps, there.grasps, strict=True):
+        np.testing.assert_allclose(b.score, a.score, atol=1e-3)
+        np.testing.assert_allclose(b.clearance, a.clearance, atol=1e-4)
+        np.testing.assert_allclose(b.width, a.width, atol=1e-4)
+        np.testing.assert_allclose(
+            b.T_cloud_hand[:3, :3], turned.turn.as_matrix() @ a.T_cloud_hand[:3, :3], atol=1e-4
+        )
+        for mine, theirs in (
+            (a.T_cloud_hand[:3, 3], b.T_cloud_hand[:3, 3]),
+            (a.T_cloud_tcp[:3, 3], b.T_cloud_tcp[:3, 3]),
+            (a.approach_point, b.approach_point),
+            (a.contact_point, b.contact_point),
+        ):
+            np.testing.assert_allclose(theirs, turned.points(mine), atol=1e-4)
+
+
+@pytest.mark.parametrize("viewpoint", [None, (0.1, 0.2, 9.0), (3.0, 1.0, 0.5)])
+def test_the_frame_stands_upright_amid_the_points_and_goes_both_ways(
+    viewpoint: tuple[float, float, float] | None,
+) -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-0.1, 0.3, (50, 3)).astype(np.float32)
+    up = np.array([0.0, 1.0, 2.0])
+    frame = CanonicalFrame.of_scene(points, up, viewpoint)
+    turn = frame.T_canonical_cloud[:3, :3]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) > 0
+    np.testing.assert_allclose(frame.directions(up), [0, 0, np.sqrt(5)], atol=1e-12)
+    np.testing.assert_allclose(frame.points(points).mean(axis=0), 0.0, atol=1e-7)
+    if viewpoint is not None:
+        seen = frame.points(viewpoint)
+        assert abs(seen[1]) < 1e-9
+        assert seen[0] > 0
+    np.testing.assert_allclose(frame.points_in_cloud(frame.points(points)), points, atol=1e-6)
+    np.testing.assert_allclose(frame.directions_in_cloud(frame.directions(up)), up, atol=1e-6)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.random(rng=rng).as_matrix(), [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(frame.poses_in_cloud(frame.poses(pose)), pose, atol=1e-5)
+
+
+def test_points_on_a_vertical_line_still_have_a_frame() -> None:
+    points = np.float32([[0, 0, 0.1], [0, 0, 0.2], [0, 0, 0.3]])
+    frame = CanonicalFrame.of_scene(points, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
+    assert np.linalg.det(frame.T_canonical_cloud) == pytest.approx(1.0)
