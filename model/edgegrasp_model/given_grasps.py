@@ -43,12 +43,11 @@ def check_edges(edges: object, rows: int) -> Int64:
     Raises:
         InvalidRequest: Another type or shape, too many, or a row that the cloud does not have.
     """
-    if not isinstance(edges, np.ndarray) or edges.dtype.kind not in "iu" or edges.ndim != 2:
-        value = f"a {type(edges).__name__}"
-        raise InvalidRequest("edges", value, "Send integers of shape (M, 2): rows of the cloud.")
-    if edges.shape[1] != 2:
-        fix = "Send (M, 2): the rows of an approach and a contact point each."
-        raise InvalidRequest("edges", f"shape {edges.shape}", fix)
+    fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
+    if not isinstance(edges, np.ndarray):
+        raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
+    if edges.dtype.kind not in "iu" or edges.shape[1:] != (2,):
+        raise InvalidRequest("edges", f"dtype {edges.dtype}, shape {edges.shape}", fix)
     _check_number("edges", len(edges))
     low, high = int(edges.min(initial=0)), int(edges.max(initial=0))
     if low < 0 or high >= rows:
@@ -63,13 +62,16 @@ def check_hand_poses(poses: object) -> Float32:
     Raises:
         InvalidRequest: Another type or shape, too many, or one that is no rigid transform.
     """
-    if not isinstance(poses, np.ndarray) or poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
-        value = f"shape {poses.shape}" if isinstance(poses, np.ndarray) else "no array"
-        raise InvalidRequest("hand_poses", value, "Send floats of shape (M, 4, 4): T_cloud_hand.")
+    fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
+    if not isinstance(poses, np.ndarray):
+        raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
+    if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
+        raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
     _check_number("hand_poses", len(poses))
-    turn = poses[:, :3, :3].astype(np.float64)
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
     off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid = (off < 1e-3) & (np.linalg.det(turn) > 0) & np.isfinite(poses).all(axis=(1, 2))
+    rigid = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
     rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."

@@ -1,3 +1,4 @@
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import torch
 
 from edgegrasp_model.catalogue import ModelCatalogue
 from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidRequest, UnknownModel
 from edgegrasp_model.gripper import load_gripper
@@ -14,7 +16,7 @@ from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
-from edgegrasp_model.results import Detection
+from edgegrasp_model.results import Detection, Outcome
 
 TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (8, 8), crop_radius=0.04)
 PLUS = replace(TINY, hand_description_size=HAND_DESCRIPTION_SIZE)
@@ -186,3 +188,84 @@ def test_a_catalogue_needs_weights_and_a_default_that_exists(tmp_path: Path) -> 
         ModelCatalogue.load([tmp_path], default="other")
     with pytest.raises(InvalidCheckpoint):
         ModelCatalogue({})
+
+
+def test_debug_returns_the_cloud_and_every_candidate_with_what_became_of_it() -> None:
+    options = ask(debug=True, min_score=0.3, top_k=5, num_candidates=200)
+    found = detector().detect(box_on_table(), options)
+    debug, counts = found.debug, found.counts
+    assert debug is not None
+    assert len(debug.points) == len(debug.normals) == counts["kept"]
+    np.testing.assert_allclose(np.linalg.norm(debug.normals, axis=1), 1.0, atol=1e-5)
+    assert len(debug.outcome) == len(debug.score) == len(debug.T_cloud_hand)
+    assert len(debug.outcome) == counts["candidates"]
+    np.testing.assert_allclose(debug.support_plane, [0, 0, 1, 0], atol=1e-6)
+    tally = Counter(debug.outcome)
+    assert tally[Outcome.RETURNED] == counts["returned"] == 5
+    assert tally[Outcome.SUPPRESSED] == counts["suppressed"]
+    assert tally[Outcome.LOW_SCORE] == counts["scored"] - counts["above_min_score"]
+    assert tally[Outcome.COLLISION] == counts["checked"] - counts["collision_free"]
+    assert tally[Outcome.NOT_SCORED] == counts["collision_free"] - counts["scored"]
+    assert tally[Outcome.NOT_CHECKED] == counts["clear_of_support"] - counts["checked"]
+    assert tally[Outcome.SUPPORT] == counts["in_direction"] - counts["clear_of_support"]
+    assert tally[Outcome.DIRECTION] == counts["candidates"] - counts["in_direction"]
+    scored = np.isfinite(debug.score)
+    assert scored.sum() == counts["scored"]
+    unscored = {Outcome.COLLISION, Outcome.DIRECTION, Outcome.SUPPORT, Outcome.NOT_CHECKED}
+    for row, outcome in enumerate(debug.outcome):
+        assert not (scored[row] and outcome in unscored)
+        assert outcome != Outcome.LOW_SCORE or debug.score[row] < 0.3
+    returned = {grasp.T_cloud_hand.tobytes(): grasp for grasp in found.grasps}
+    for row in np.flatnonzero([outcome == Outcome.RETURNED for outcome in debug.outcome]):
+        grasp = returned[debug.T_cloud_hand[row].tobytes()]
+        np.testing.assert_allclose(debug.score[row], grasp.score, atol=1e-6)
+        np.testing.assert_array_equal(debug.points[debug.approach_index[row]], grasp.approach_point)
+        np.testing.assert_array_equal(debug.points[debug.contact_index[row]], grasp.contact_point)
+    assert detector().detect(box_on_table(), ask()).debug is None
+
+
+def test_debug_tells_of_every_round_of_sampling_and_of_none() -> None:
+    wall = {"kind": "box", "min": [-1, -1, -1], "max": [1, 1, 1]}
+    options = ask(debug=True, collision={"obstacles": [wall]}, num_approach_points=4)
+    blocked = detector().detect(box_on_table(), options)
+    assert blocked.grasps == []
+    assert blocked.counts["approach_points"] == 16  # four further rounds, and no more
+    assert blocked.debug is not None
+    assert len(blocked.debug.outcome) == blocked.counts["candidates"]
+    assert Counter(blocked.debug.outcome)[Outcome.COLLISION] == blocked.counts["checked"]
+    nowhere = ask(
+        debug=True,
+        approach_region={"include": [{"kind": "sphere", "center": [1, 1, 1], "radius": 0.1}]},
+    )
+    empty = detector().detect(box_on_table(), nowhere)
+    assert empty.debug is not None
+    assert empty.debug.outcome == []
+    assert empty.counts["in_approach_region"] == 0
+    assert any("approach region" in warning for warning in empty.warnings)
+    cropped = detector().detect(
+        box_on_table(), ask(debug=True, workspace=Workspace(min=(1, 1, 1), max=(2, 2, 2)))
+    )
+    assert cropped.debug is None
+
+
+def test_where_every_hand_collides_only_penalise_returns_some_and_marks_them() -> None:
+    wall = {"kind": "box", "min": [-1, -1, -1], "max": [1, 1, 1]}
+    for mode, returned in (("avoid", False), ("penalise", True), ("ignore", True)):
+        options = ask(collision={"mode": mode, "obstacles": [wall]}, num_approach_points=4)
+        found = detector().detect(box_on_table(), options)
+        assert bool(found.grasps) == returned
+        assert not any(grasp.collision_free for grasp in found.grasps)
+        assert all(grasp.clearance < 0 for grasp in found.grasps)
+
+
+def test_a_cloud_with_all_that_can_come_with_it_is_taken() -> None:
+    cloud = box_on_table(count=1200)
+    organised = np.full((40, 100, 3), np.nan, np.float32)
+    organised.reshape(-1, 3)[: len(cloud)] = cloud
+    sent = CloudInput(
+        organised,
+        colors=np.zeros((40, 100, 3), np.uint8),
+        segment_ids=np.zeros((40, 100), int),
+        view_ids=np.zeros(4000, int),
+    )
+    assert same(detector().detect(sent, ask()), detector().detect(cloud, ask()))

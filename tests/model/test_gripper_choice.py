@@ -1,74 +1,99 @@
-"""A detection with each gripper that ships, and with one sent inline."""
-
-import tomllib
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-import torch
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.gripper import GRIPPER_FOLDER, gripper_from_fields, gripper_names, load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_model.options import parse_options
+from edgegrasp_model.gripper import gripper_names, load_gripper
+from edgegrasp_model.gripper_choice import chosen_gripper
+from edgegrasp_model.options import DetectOptions
 
-TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (8, 8), crop_radius=0.04)
-TABLE = {"normal": [0.0, 0.0, 1.0], "offset": 0.0}
+PANDA = load_gripper("panda")
 
 
-def narrow_panda() -> dict[str, Any]:
-    fields = tomllib.loads((GRIPPER_FOLDER / "panda.toml").read_text())
-    return fields | {"name": "narrow", "max_opening": 0.05}
+def choose(own: dict[str, object] | None = None, **fields: object) -> object:
+    return chosen_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
 
 
-CHOICES = [*gripper_names(), narrow_panda()]
+def test_none_is_the_default_a_name_a_file_and_an_object_itself() -> None:
+    assert choose() is PANDA
+    assert choose(gripper="wsg-50") == load_gripper("wsg-50")
+    mine = load_gripper("robotiq-2f-85")
+    assert choose({"panda": mine}, gripper="panda") is mine
+    fields = {
+        "max_opening": 0.05,
+        "tip_z": 0.1,
+        "contact_z": 0.09,
+        "tcp_z": 0.09,
+        "hand": {"boxes": [[[-0.03, -0.05, 0.0], [0.03, 0.05, 0.06]]]},
+        "finger": {"boxes": [[[-0.01, 0.0, 0.06], [0.01, 0.02, 0.1]]]},
+    }
+    custom = choose(gripper=fields)
+    assert (custom.name, custom.max_opening, custom.palm_z) == ("custom", 0.05, 0.06)
 
 
-def post() -> np.ndarray:
-    """The outside of a 30 x 36 x 80 mm box that stands on z = 0."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (6000, 3))
-    face = rng.integers(3, size=len(points))
-    points[np.arange(len(points)), face] = np.where(rng.random(len(points)) < 0.5, -0.5, 0.5)
-    points[:, 2] = np.where((face == 2) & (points[:, 2] < 0), 0.5, points[:, 2])
-    return (points * (0.03, 0.036, 0.08) + (0.0, 0.0, 0.04)).astype(np.float32)
+@pytest.mark.parametrize(
+    ("fields", "field", "fix"),
+    [
+        ({"gripper": "hook"}, "options.gripper", "robotiq-2f-85"),
+        ({"gripper": "../grippers/panda.toml"}, "options.gripper", "Use one of"),
+        ({"collision": {"opening": 0.081}}, "options.collision.opening", "at most 0.08"),
+    ],
+)
+def test_what_there_is_not_is_refused(fields: dict[str, object], field: str, fix: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        choose(**fields)
+    assert caught.value.field == field
+    assert fix in caught.value.fix
 
 
-@pytest.mark.parametrize("choice", CHOICES, ids=[*gripper_names(), "inline"])
-def test_grasps_fit_the_gripper_that_was_asked_for(choice: Any) -> None:
-    gripper = load_gripper(choice) if isinstance(choice, str) else gripper_from_fields(choice)
-    network = build_network(TINY, torch.Generator().manual_seed(3))
-    metadata = CheckpointMetadata("tiny", TINY, voxel_size=0.0045, gripper="panda")
-    options = {"gripper": choice, "support": TABLE, "viewpoint": [0.2, 0.1, 0.5], "top_k": 30}
-    detector = GraspDetector(network, metadata, load_gripper("panda"))
-    cloud = post()
-    found = detector.detect(cloud, parse_options(options))
-    assert len(found.grasps) >= 5, found.counts
-    assert any("trained for" in each for each in found.warnings) == (gripper.name != "panda")
+@pytest.mark.parametrize("name", gripper_names())
+@pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+def test_a_gripper_that_opens_less_is_the_same_one_half_closed(name: str, share: float) -> None:
+    full = load_gripper(name)
+    opening = share * full.max_opening
+    part = choose(gripper=name, collision={"opening": opening})
+    for narrower in (opening, 0.5 * opening, 0.0):
+        np.testing.assert_allclose(part.boxes(narrower), full.boxes(narrower), atol=1e-9)
+        np.testing.assert_allclose(part.contact_z_at(narrower), full.contact_z_at(narrower))
+    np.testing.assert_allclose(part.tip_z, part.boxes(opening)[:, 1, 2].max())
+
+
+@pytest.mark.parametrize("name", gripper_names())
+def test_grasps_fit_the_gripper_that_was_asked_for(
+    name: str, plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
+) -> None:
+    options = DetectOptions(
+        viewpoint=(0.3, 0.2, 0.5), gripper=name, num_approach_points=12, suppression=None
+    )
+    found = plus.detect(box_on_table(count=2000), options)
+    gripper = load_gripper(name)
+    assert found.grasps
     for grasp in found.grasps:
-        pose = grasp.T_cloud_hand.astype(np.float64)
-        x, y, z = (grasp.contact_point - pose[:3, 3]) @ pose[:3, :3]
-        assert abs(y) < gripper.max_opening / 2
-        assert abs(x) < gripper.pad_half_width
-        # Hands may be drawn back from the table until the contact is near the tips.
-        inside = gripper.contact_z_at(2 * abs(y)) + gripper.tip_z - gripper.contact_z - z
-        assert 0.002 - 1e-4 < inside < gripper.tip_z - gripper.contact_z + 1e-4
-        assert grasp.width <= gripper.max_opening + 1e-6
-        np.testing.assert_allclose(grasp.T_cloud_tcp, pose @ gripper.T_hand_tcp, atol=1e-6)
-        seen = (cloud - pose[:3, 3]) @ pose[:3, :3]
-        for low, high in gripper.boxes(gripper.max_opening):
-            deep = ((seen > low + 0.006) & (seen < high - 0.006)).all(axis=1)
-            assert not deep.any()  # nothing of the cloud, a voxel's size aside, is in the hand
-            corners = np.array(np.meshgrid(*np.stack([low, high]).T)).reshape(3, -1)
-            assert (pose[2, :3] @ corners + pose[2, 3]).min() > -1e-5  # nor is the table
+        np.testing.assert_allclose(
+            np.linalg.inv(grasp.T_cloud_hand) @ grasp.T_cloud_tcp, gripper.T_hand_tcp, atol=1e-5
+        )
+        contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
+        np.testing.assert_allclose(contact[2], gripper.contact_z_at(2 * contact[1]), atol=1e-5)
+        assert grasp.width <= np.float32(gripper.max_opening)
+    told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
+    assert told == (name != "panda")
 
 
-def test_a_name_that_nobody_has_is_refused() -> None:
-    network = build_network(TINY, torch.Generator().manual_seed(3))
-    metadata = CheckpointMetadata("tiny", TINY, voxel_size=0.0045, gripper="panda")
-    detector = GraspDetector(network, metadata, load_gripper("panda"))
-    with pytest.raises(InvalidRequest, match=r"options\.gripper.*wsg-50"):
-        detector.detect(post(), parse_options({"gripper": "../panda"}))
+def test_a_wider_gripper_reaches_further_contacts(
+    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
+) -> None:
+    def longest(name: str) -> float:
+        options = DetectOptions(
+            viewpoint=(0.3, 0.2, 0.5),
+            gripper=name,
+            collision="ignore",
+            suppression=None,
+            top_k=2000,
+        )
+        grasps = plus.detect(box_on_table(count=2000), options).grasps
+        return max(float(np.linalg.norm(g.approach_point - g.contact_point)) for g in grasps)
+
+    assert longest("panda") < 0.038
+    assert longest("robotiq-2f-140") > 0.045  # beyond the ball the weights were trained on
