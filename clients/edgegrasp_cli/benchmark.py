@@ -54,6 +54,7 @@ def benchmark(
         Path | None,
         Option(help="Folder for manifest, attempts, figures, report. The same again resumes."),
     ] = None,
+    report: Annotated[bool, Option(help="Write report.html, which takes a while.")] = True,
     gate: Annotated[
         Path | None, Option(help="summary.json of a result that this one must not fall below.")
     ] = None,
@@ -127,6 +128,8 @@ def benchmark(
     summary |= summarise(done)
     if folder is not None:
         folder.finish(done)
+        if report:
+            _write_report(folder)
     _print_summary(summary, description.get("model") or planner)
     if gate is not None:
         _check_gate(lambda: below_gate(summary, gate))
@@ -279,6 +282,12 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
             f"the planner was unavailable and asked again {summary['planner_retries']} times, "
             f"waiting {summary['planner_waited_seconds']:.1f} s"
         )
+
+
+def _write_report(folder: "ResultFolder") -> None:
+    from edgegrasp_sim.report import write_report
+
+    print(f"report: {write_report(folder)}")
 
 
 def _check_gate(compare: "Callable[[], list[str]]") -> None:

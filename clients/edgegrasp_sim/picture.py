@@ -85,11 +85,12 @@ def draw_grasps(
     for rank, lines in reversed(list(enumerate(forks))):
         colour = colours.to_rgba(scores[rank])
         for axes, dimensions in ((perspective, 3), (above, 2)):
-            _draw_fork(axes, lines[..., :dimensions], colour, rank)
+            _draw_fork(axes, lines[..., :dimensions], colour, rank, labelled=len(forks) > 1)
     figure.text(0.5, 0.015, CAPTION, fontsize=12, ha="center")
-    bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.14, 0.014, 0.68)))
-    bar.set_label("score: probability that the grasp holds", fontsize=13)
-    bar.ax.tick_params(labelsize=12)
+    if len(forks) > 1:
+        bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.14, 0.014, 0.68)))
+        bar.set_label("score: probability that the grasp holds", fontsize=13)
+        bar.ax.tick_params(labelsize=12)
     figure.savefig(path)
 
 
@@ -166,7 +167,7 @@ def _draw_above(axes: Any, points: Points, low: Points, high: Points) -> None:
     axes.set_axisbelow(True)
 
 
-def _draw_fork(axes: Any, lines: Points, colour: Any, rank: int) -> None:
+def _draw_fork(axes: Any, lines: Points, colour: Any, rank: int, *, labelled: bool) -> None:
     best = rank == 0
     layer = 1000 - rank
     for width, shade in (
@@ -174,7 +175,7 @@ def _draw_fork(axes: Any, lines: Points, colour: Any, rank: int) -> None:
     ):
         for piece in lines:
             axes.plot(*piece.T, color=shade, linewidth=width, solid_capstyle="round", zorder=layer)
-    if rank < LABELLED:
+    if labelled and rank < LABELLED:
         axes.text(
             *lines[0, 0],
             "1 (best)" if best else str(rank + 1),

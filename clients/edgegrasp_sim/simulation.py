@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from edgegrasp_sim.noise import DepthNoise
     from edgegrasp_sim.poses import Matrix
+    from edgegrasp_sim.world import Body
 
 # Lowest and highest corner of what an observation keeps; the table itself is cut off.
 WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
@@ -120,6 +121,8 @@ class ClutterSimulation:
         self._objects: list[SceneObject] = []
         self._gripper: Gripper | None = None
         self._rest_state: int | None = None
+        self._copy: ClutterSimulation | None = None
+        self._copied: list[ObjectPlacement] = []
 
     def __enter__(self) -> Self:
         return self
@@ -135,6 +138,8 @@ class ClutterSimulation:
     def close(self) -> None:
         """Stop the physics server. Safe to call twice."""
         self.world.close()
+        if self._copy is not None:
+            self._copy.close()
 
     @property
     def num_objects(self) -> int:
@@ -145,6 +150,11 @@ class ClutterSimulation:
     def object_names(self) -> list[str]:
         """Names of the objects that are left."""
         return [item.model.name for item in self._objects]
+
+    @property
+    def object_bodies(self) -> list[Body]:
+        """Bodies of the objects that are left, to paint or to measure."""
+        return [item.body for item in self._objects]
 
     @property
     def placements(self) -> list[ObjectPlacement]:
@@ -294,6 +304,27 @@ class ClutterSimulation:
         result = self._run(T_world_hand, retreat_empty=False)
         self._restore_rest()
         return result
+
+    def try_in_copy(self, T_world_hand: ArrayLike) -> GraspResult:
+        """See what would come of a grasp, in another world with the objects where they are here.
+
+        Unlike after `try_grasp`, not even the engine's hidden state changes here, so that what
+        follows is the same with and without the try. The two may disagree on a close call.
+
+        Args:
+            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+
+        Raises:
+            ValueError: `T_world_hand` is no rigid transform.
+        """
+        if self._copy is None:
+            self._copy = ClutterSimulation(self.object_sets)
+        placements = self.placements
+        if self._copied != placements:
+            self._copy.reset_from_poses(placements)
+            self._copied = placements
+        self._copy.start_contact_fails = self.start_contact_fails
+        return self._copy.try_grasp(T_world_hand)
 
     def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
         """Grasp: what is held leaves the scene, the rest comes to rest.

@@ -58,7 +58,7 @@ class TriesGrasps(Protocol):
     """A planner that also wants to try grasps in a copy of the scene it is asked about."""
 
     def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
-        """Take what tries `T_world_hand`, (4, 4); the scene stays as it is."""
+        """Take what tries `T_world_hand`, (4, 4), in a copy of the scene as it is then."""
 
 
 @runtime_checkable
@@ -313,7 +313,7 @@ def run_round(
 ) -> Round:
     """Run one round with a planner; see `RoundDriver` for arguments and errors."""
     if isinstance(planner, TriesGrasps):
-        planner.use_trial(simulation.try_grasp)
+        planner.use_trial(simulation.try_in_copy)
     driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
     while driver.end is None:
         observation = driver.look()

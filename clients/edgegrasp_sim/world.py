@@ -183,6 +183,13 @@ class Body:
         """Put the base's centre-of-mass frame there, at rest."""
         self.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
+    def paint(self, colour: str) -> None:
+        """Give every link a colour, `#rrggbb`; seen by people only, depth stays the same."""
+        rgba = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [1.0]
+        links = pybullet.getNumJoints(self.uid, physicsClientId=self.client)
+        for link in range(-1, links):
+            pybullet.changeVisualShape(self.uid, link, rgbaColor=rgba, physicsClientId=self.client)
+
     @property
     def speed(self) -> float:
         """Length of linear (m/s) and angular (rad/s) velocity taken together."""

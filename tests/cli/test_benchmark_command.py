@@ -1,6 +1,7 @@
 """`edgegrasp benchmark` and what reads its results, end to end and small."""
 
 import contextlib
+import csv
 import json
 import re
 import socket
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 
 from edgegrasp_cli.main import app
 
+SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 OWN_PLANNER = """
 from edgegrasp_sim.top_down import plan_top_down
 
@@ -33,9 +35,14 @@ def figures(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 
 
+def attempts(folder: Path) -> list[dict[str, str]]:
+    with (folder / "attempts.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def benchmark(folder: Path, planner: str, *flags: object, rounds: int = 2) -> dict:
     where = ("--scene", "packed", "--seed", 0, "--rounds", rounds, "--output", folder)
-    run("benchmark", "--planner", planner, *where, *flags)
+    run("benchmark", "--no-report", "--planner", planner, *where, *flags)
     return figures(folder)
 
 
@@ -61,6 +68,77 @@ def test_a_planner_of_one_s_own_needs_only_its_name(
     as_class = benchmark(tmp_path / "class", "my_planner:MyPlanner", rounds=1)
     as_function = benchmark(tmp_path / "function", "edgegrasp_sim.top_down:plan_top_down", rounds=1)
     assert as_class["attempts_digest"] == as_function["attempts_digest"]
+
+
+def test_the_shipped_weights_are_not_below_the_gate() -> None:
+    few = ("--num-approach-points", 16, "--num-candidates", 400)
+    where = ("--scene", "packed", "--seed", 0, "--rounds", 4)
+    assert "not below the gate" in run(
+        "benchmark", "--planner", "in-process", *where, *few, "--gate", SMOKE_GATE
+    )
+
+
+def test_a_result_below_the_gate_fails(oracle: Path, tmp_path: Path) -> None:
+    gate = figures(oracle)
+    for name in ("grasp_success_rate", "declutter_rate"):
+        gate[name] |= {"value": 0.99, "wilson_95": [0.98, 1.0]}
+    (tmp_path / "gate.json").write_text(json.dumps(gate))
+    where = ("--scene", "packed", "--seed", 0, "--rounds", 2, "--gate", tmp_path / "gate.json")
+    result = CliRunner().invoke(
+        app, [str(part) for part in ("benchmark", "--planner", "edge-sample", *where)]
+    )
+    assert result.exit_code == 1
+    assert "below the gate: GSR" in result.output
+
+
+def test_the_report_shows_tables_plots_pictures_and_a_film(tmp_path: Path, oracle: Path) -> None:
+    benchmark(tmp_path, "edge-sample", "--report", rounds=1)
+    page = (tmp_path / "report.html").read_text()
+    failed = sum(bool(row["cause"]) for row in attempts(tmp_path))
+    assert page.count("data:image/png") >= 3  # plots
+    assert page.count("data:image/gif") == 1
+    assert page.count("data:image/jpeg") == min(failed, 6) > 0
+    assert "Edge Grasp Network, ICRA 2023" in page
+    assert all(name in page for name in figures(tmp_path)["objects_by_name"])
+
+
+def test_a_recorded_attempt_comes_out_the_same(oracle: Path, tmp_path: Path) -> None:
+    last = attempts(oracle)[-1]
+    where = ("--round", last["round"], "--attempt", last["attempt"])
+    film, picture = tmp_path / "round.gif", tmp_path / "attempt.png"
+    output = run("replay", oracle, *where, "--film", film, "--picture", picture)
+    assert "it came out the same" in output
+    assert film.read_bytes()[:4] == b"GIF8"
+    assert picture.read_bytes()[1:4] == b"PNG"
+
+
+def test_wrong_replays_and_comparisons_end_with_a_sentence(oracle: Path, tmp_path: Path) -> None:
+    def refused(*arguments: object) -> str:
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        assert result.exit_code == 1
+        return result.output
+
+    assert "attempt is 99" in refused("replay", oracle, "--attempt", 99)
+    assert "round is 7" in refused("replay", oracle, "--round", 7)
+    assert "holds no benchmark" in refused("replay", tmp_path)
+    assert "holds no benchmark" in refused("compare", oracle, tmp_path)
+    benchmark(tmp_path, "edge-sample", "--protocol", "giga", rounds=1)
+    assert "differ in protocol" in refused("compare", oracle, tmp_path)
+
+
+def test_two_planners_are_compared_scene_by_scene(oracle: Path, tmp_path: Path) -> None:
+    benchmark(tmp_path / "baseline", "edge-sample")
+    output = run("compare", tmp_path / "baseline", oracle, "--output", tmp_path / "compared.json")
+    assert "2 scenes" in output
+    compared = json.loads((tmp_path / "compared.json").read_text())
+    for name in ("grasp_success_rate", "declutter_rate"):
+        ceiling, base = (
+            figures(oracle)[name]["value"],
+            figures(tmp_path / "baseline")[name]["value"],
+        )
+        assert compared[name]["difference"] == pytest.approx(ceiling - base)
+        low, high = compared[name]["difference_95"]
+        assert low <= compared[name]["difference"] <= high
 
 
 def test_both_transports_give_the_same_attempts(dummy_server, tmp_path: Path) -> None:

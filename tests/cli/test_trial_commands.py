@@ -79,6 +79,7 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data: Path, tmp_
         weights,
         "--model",
         "edgegrasp-plus",
+        "--no-report",
         "--output",
         result,
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 from edgegrasp_cli.planners.requests import choose, request_options
 from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.options import parse_options
 from edgegrasp_sim.protocol import PlanningRules
@@ -50,6 +51,8 @@ class InProcessPlanner:
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The best grasp; None where there is none."""
         options = request_options(observation, seed, self.rules, self.options)
-        detection = self.detector.detect(observation.cloud, parse_options(options))
+        several = len(observation.camera_positions) > 1
+        cloud = CloudInput(observation.cloud, view_ids=observation.view_ids if several else None)
+        detection = self.detector.detect(cloud, parse_options(options))
         best = choose(detection.grasps, self.rules)
         return PlannedGrasp(best.T_cloud_hand, best.score, best.width) if best else None

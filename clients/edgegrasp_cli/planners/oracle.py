@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_cli.planners.edge_sample import CandidateSampler
+from edgegrasp_cli.planners.edge_sample import CandidateSampler, Float32
 from edgegrasp_sim.grasping import GraspResult
 from edgegrasp_sim.gripper import MAX_OPENING
 from edgegrasp_sim.simulation import Observation
 from edgegrasp_sim.trials import PlannedGrasp
 
 MAX_TRIES = 300  # candidates tried in one view
+# Metres along the hand's x and y: a grasp that holds there as well is no close call.
+SHIFTS = ((0.002, 0.0), (-0.002, 0.0), (0.0, 0.002), (0.0, -0.002))
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,10 @@ class OracleFactory:
 
 
 class OraclePlanner:
-    """Takes the first random candidate that holds when tried, or any if none of them does."""
+    """Takes the first random candidate that holds when tried, and when tried a little aside.
+
+    Without one, it takes the first that holds at all; without that, any.
+    """
 
     def __init__(self, sampler: CandidateSampler) -> None:
         self.sampler = sampler
@@ -38,13 +43,27 @@ class OraclePlanner:
         self._try_grasp = try_grasp
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
-        """A candidate that holds; score 1 if it does, 0 if `MAX_TRIES` were tried in vain."""
-        if self._try_grasp is None:
-            raise RuntimeError("the oracle has no scene to try grasps in; call use_trial first")
-        poses = self.sampler(observation, np.random.default_rng(seed))
+        """A candidate that holds; score 1 if safely, 0.5 if barely, 0 if none did."""
+        poses = self.sampler(observation, np.random.default_rng(seed))[:MAX_TRIES]
         if len(poses) == 0:
             return None
-        for pose in poses[:MAX_TRIES]:
-            if self._try_grasp(pose).success:
+        fallback = PlannedGrasp(poses[0], 0.0, MAX_OPENING)
+        for pose in poses:
+            if not self._holds(pose):
+                continue
+            if all(self._holds(_shifted(pose, *shift)) for shift in SHIFTS):
                 return PlannedGrasp(pose, 1.0, MAX_OPENING)
-        return PlannedGrasp(poses[0], 0.0, MAX_OPENING)
+            if fallback.score == 0.0:
+                fallback = PlannedGrasp(pose, 0.5, MAX_OPENING)
+        return fallback
+
+    def _holds(self, pose: Float32) -> bool:
+        if self._try_grasp is None:
+            raise RuntimeError("the oracle has no scene to try grasps in; call use_trial first")
+        return self._try_grasp(pose).success
+
+
+def _shifted(pose: Float32, along_x: float, along_y: float) -> Float32:
+    shifted = pose.copy()
+    shifted[:3, 3] += along_x * pose[:3, 0] + along_y * pose[:3, 1]
+    return shifted
