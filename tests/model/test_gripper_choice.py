@@ -75,7 +75,7 @@ def test_grasps_fit_the_gripper_that_was_asked_for(
             np.linalg.inv(grasp.T_cloud_hand) @ grasp.T_cloud_tcp, gripper.T_hand_tcp, atol=1e-5
         )
         contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
-        np.testing.assert_allclose(contact[2], gripper.contact_z_at(2 * contact[1]), atol=1e-5)
+        np.testing.assert_allclose(contact[2], gripper.contact_z_at(2 * abs(contact[1])), atol=1e-5)
         assert grasp.width <= np.float32(gripper.max_opening)
     told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
     assert told == (name != "panda")

@@ -1,0 +1,125 @@
+"""Grasp the handle: both regions restricted to it, with the weights that ship, in simulation."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.catalogue import WEIGHTS_FOLDER, ModelCatalogue
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.options import DetectOptions
+
+pytest.importorskip("pybullet")
+
+from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
+
+TABLE = 0.05  # height, metres
+Bar = tuple[tuple[float, float, float], tuple[float, float, float], float]  # middle, size, yaw
+
+
+@dataclass(frozen=True)
+class Tool:
+    name: str
+    body: list[Bar]
+    handle: list[Bar]
+    height: float  # of the origin over the table, metres
+    region: tuple[tuple[float, float, float], tuple[float, float, float]]  # middle, half extents
+
+    def write(self, folder: Path) -> Path:
+        parts = "".join(
+            f'<{kind}><origin xyz="{x} {y} {z}" rpy="0 0 {yaw}"/>'
+            f'<geometry><box size="{a} {b} {c}"/></geometry></{kind}>'
+            for (x, y, z), (a, b, c), yaw in self.body + self.handle
+            for kind in ("visual", "collision")
+        )
+        inertia = '<mass value="0.3"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" '
+        path = folder / f"{self.name}.urdf"
+        path.write_text(
+            f'<robot name="{self.name}"><link name="base"><inertial>{inertia}izz="1e-4"/>'
+            f"</inertial>{parts}</link></robot>"
+        )
+        return path
+
+
+def mug() -> Tool:
+    """A cup of 16 staves with a bottom, and a handle of three bars."""
+    staves: list[Bar] = []
+    for angle in np.arange(16) * np.pi / 8:
+        x, y = 0.033 * np.cos(angle), 0.033 * np.sin(angle)
+        staves.append(((x, y, 0.0), (0.005, 0.0145, 0.08), float(angle)))
+    bottom: Bar = ((0, 0, -0.038), (0.045, 0.045, 0.004), 0.0)
+    handle: list[Bar] = [
+        ((0.049, 0, 0.022), (0.03, 0.012, 0.008), 0.0),
+        ((0.049, 0, -0.022), (0.03, 0.012, 0.008), 0.0),
+        ((0.064, 0, 0), (0.008, 0.012, 0.052), 0.0),
+    ]
+    return Tool("mug", [*staves, bottom], handle, 0.04, ((0.055, 0, 0), (0.016, 0.012, 0.03)))
+
+
+def hammer() -> Tool:
+    """A head on a shaft, lying on the table; the shaft's end props it up level."""
+    head: Bar = ((0.06, 0, 0), (0.03, 0.09, 0.03), 0.0)
+    foot: Bar = ((-0.085, 0, 0), (0.012, 0.02, 0.03), 0.0)
+    shaft: Bar = ((-0.02, 0, 0.004), (0.13, 0.02, 0.022), 0.0)
+    return Tool("hammer", [head, foot], [shaft], 0.015, ((-0.02, 0, 0.005), (0.055, 0.016, 0.016)))
+
+
+@pytest.fixture(scope="module")
+def shipped() -> GraspDetector:
+    if not any(WEIGHTS_FOLDER.glob("*.safetensors")):
+        pytest.skip("no weights ship with this checkout")
+    return ModelCatalogue.load().get()
+
+
+@pytest.mark.parametrize("tool", [mug(), hammer()], ids=lambda tool: tool.name)
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_restricted_to_the_handle_every_grasp_is_on_it_and_the_best_holds(
+    tool: Tool, yaw: float, shipped: GraspDetector, tmp_path: Path
+) -> None:
+    turn, middle = Rotation.from_euler("z", yaw), np.array([0.14, 0.14, TABLE + tool.height])
+    x, y, z, w = turn.as_quat().tolist()
+    with ClutterSimulation() as simulation:
+        simulation.reset_from_poses(
+            [ObjectPlacement(tool.write(tmp_path), 1.0, tuple(middle.tolist()), (x, y, z, w))]
+        )
+        eye = np.array([0.55, 0.35, 0.55])
+        noise = np.random.default_rng(3)
+        camera = look_at(eye, np.array([0.15, 0.15, 0.06]))
+        seen = simulation.observe_from([camera], noise)
+        center, half = tool.region
+        region = {
+            "include": [
+                {
+                    "kind": "oriented_box",
+                    "center": (turn.apply(center) + middle).tolist(),
+                    "half_extents": half,
+                    "quaternion": (x, y, z, w),
+                }
+            ]
+        }
+        asked = {
+            "viewpoint": seen.camera_position.tolist(),
+            "support": {"normal": (0, 0, 1), "offset": TABLE},
+            "num_approach_points": 48,
+        }
+        free = shipped.detect(seen.cloud, DetectOptions.model_validate(asked))
+        found = shipped.detect(
+            seen.cloud,
+            DetectOptions.model_validate(
+                asked | {"approach_region": region, "contact_region": region}
+            ),
+        )
+        assert len(found.grasps) >= 3
+        for grasp in found.grasps:
+            for point in (grasp.approach_point, grasp.contact_point):
+                own = turn.inv().apply(point - middle) - center
+                assert (np.abs(own) <= half).all()
+        # Without the restriction grasps lie elsewhere too: the test can fail.
+        elsewhere = [
+            turn.inv().apply(grasp.contact_point - middle) - center for grasp in free.grasps
+        ]
+        assert any((np.abs(own) > half).any() for own in elsewhere)
+        assert simulation.try_grasp(found.grasps[0].T_cloud_hand).success
