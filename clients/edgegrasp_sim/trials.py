@@ -272,7 +272,7 @@ class RoundDriver:
             cause=result.cause,
             object=result.held.model.name if result.held is not None else None,
             target=result.target.model.name if result.target is not None else None,
-            wrong_object=result.success and result.held is not result.target,
+            wrong_object=result.success and result.target not in (None, result.held),
             score=float(grasp.score),
             width=float(grasp.width),
             opening=result.opening,
