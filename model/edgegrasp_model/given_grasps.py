@@ -68,10 +68,10 @@ def check_hand_poses(poses: object) -> Float32:
     if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
         raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
     _check_number("hand_poses", len(poses))
-    finite = np.isfinite(poses).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
     off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
+    rigid: NDArray[np.bool_] = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
     rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
