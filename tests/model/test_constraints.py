@@ -418,6 +418,5 @@ def test_every_grasp_satisfies_every_constraint(
         seen["obstacles"] += bool(found.grasps) and bool(fields["collision"]["obstacles"])
 
     run()
-    print(seen)  # noqa: T201
     assert seen["cases"] >= CASES
     assert min(seen.values()) >= 50, seen  # none of them holds for want of grasps
