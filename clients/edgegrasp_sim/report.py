@@ -209,8 +209,9 @@ def _published_table(summary: dict[str, Any], published: Sequence[dict[str, Any]
         ("this run", "", _spread(gsr), _interval(gsr), _spread(dr), _interval(dr))
     ]
     for row in published:
-        value = " ± ".join(f"{number:.1f}" for number in row["grasp_success_rate"])
-        rows.append((row["method"], row["source"], value, "", "", ""))
+        rates = (row["grasp_success_rate"], row.get("declutter_rate", []))
+        values = [" ± ".join(f"{number:.1f}" for number in rate) for rate in rates]
+        rows.append((row["method"], row["source"], values[0], "", values[1], ""))
     head = ("", "source", "GSR %", "95 % interval", "DR %", "95 % interval")
     note = "" if published else "<p>No published figures are known for this scene and protocol.</p>"
     return _table(head, rows, 4) + note
