@@ -86,6 +86,13 @@ def describe_hands(
     return np.stack(columns, axis=1).astype(np.float32)
 
 
+def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The description (E, F) that the same hands have where the support plane is not known."""
+    unknown = description.copy()
+    unknown[:, -HEIGHTS:] = UNKNOWN_HEIGHT
+    return unknown
+
+
 def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:
     """Points inside the open hand, near its fingers, on its way in and beyond its tips."""
     hand, fingers = gripper.hand_boxes, gripper.finger_boxes
@@ -175,7 +182,7 @@ def _stance(
         np.abs(pose[:, :3, 1] @ up),
     ]
     if support is None:
-        return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * 3
+        return columns + [np.full(len(pose), UNKNOWN_HEIGHT, dtype=np.float32)] * HEIGHTS
     normal = np.asarray(support.normal)
     tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
     heights = [
@@ -187,3 +194,4 @@ def _stance(
 
 
 HAND_DESCRIPTION_SIZE = 44
+HEIGHTS = 3  # the last of them: heights over the support plane

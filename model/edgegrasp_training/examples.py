@@ -12,7 +12,7 @@ from edgegrasp_model.ball_batch import BallBatch, crop_balls
 from edgegrasp_model.candidates import Candidates, edge_grasps
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_description import describe_hands, without_support
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_training.views import LabelledView
@@ -27,24 +27,27 @@ class TriedGrasps:
 
     cloud: Cloud
     candidates: Candidates  # E of them
-    description: NDArray[np.float16] | None  # (E, F), half precision to keep many views in memory
+    description: NDArray[np.floating] | None  # (E, F), half precision to keep many views in memory
     label: NDArray[np.float32]  # (E,) 0 or 1
+
+    def without_support(self) -> "TriedGrasps":
+        """The same, described as for a request that does not name the support plane."""
+        if self.description is None:
+            return self
+        return replace(self, description=without_support(self.description))
 
     def balls(self) -> NDArray[np.int64]:
         """Rows of the cloud that are approach points of labelled candidates, ascending."""
         return np.unique(self.candidates.approach_index)
 
 
-def tried_grasps(
-    view: LabelledView, config: NetworkConfig, gripper: Gripper, support_known: bool = True
-) -> TriedGrasps:
+def tried_grasps(view: LabelledView, config: NetworkConfig, gripper: Gripper) -> TriedGrasps:
     """Build the tried candidates of a view, and describe them if the network wants that.
 
     Args:
         view: The view.
         config: The network to prepare for.
         gripper: The hand that tried them.
-        support_known: False: describe as for a request without a support plane.
     """
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
@@ -52,8 +55,7 @@ def tried_grasps(
     label = view.success[rows[candidates.pair]].astype(np.float32)
     description = None
     if config.hand_description_size:
-        support = SUPPORT if support_known else None
-        description = describe_hands(cloud, candidates, gripper, UP, support).astype(np.float16)
+        description = describe_hands(cloud, candidates, gripper, UP, SUPPORT).astype(np.float16)
     return TriedGrasps(cloud, candidates, description, label)
 
 

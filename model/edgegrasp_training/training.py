@@ -110,7 +110,7 @@ class Trainer:
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
-                grasps, _ = self._tried(path)
+                grasps = self._tried(path)
                 balls = grasps.balls()
                 if len(balls) == 0:
                     continue
@@ -136,7 +136,7 @@ class Trainer:
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
-            "training_labels": sum(len(self._tried(p)[0].label) for p in self.train_paths),
+            "training_labels": sum(len(self._tried(p).label) for p in self.train_paths),
             "validation_views": len(self.validation_paths),
             "validation_labels": len(evaluation.label),
             "steps": self.step,
@@ -165,8 +165,9 @@ class Trainer:
         count = min(self.options.views_per_step, len(self.train_paths))
         batches, labels = [], []
         for index in rng.choice(len(self.train_paths), count, replace=False):
-            known, unknown = self._tried(self.train_paths[index])
-            grasps = unknown if rng.random() < self.options.unknown_support else known
+            grasps = self._tried(self.train_paths[index])
+            if rng.random() < self.options.unknown_support:
+                grasps = grasps.without_support()
             balls = grasps.balls()
             if len(balls) == 0:
                 continue
@@ -179,19 +180,14 @@ class Trainer:
             labels.append(label)
         return BallBatch.concatenate(batches), torch.cat(labels)
 
-    def _read(self, path: Path) -> tuple[TriedGrasps, TriedGrasps]:
-        """The tried grasps of a view, described with and without its table."""
-        view, network = load_view(path), self.metadata.network
-        return (
-            tried_grasps(view, network, self.gripper),
-            tried_grasps(view, network, self.gripper, support_known=False),
-        )
+    def _read(self, path: Path) -> TriedGrasps:
+        return tried_grasps(load_view(path), self.metadata.network, self.gripper)
 
     def _standardise(self) -> None:
         """Fit the description's mean and spread to the training views."""
         if not self.metadata.network.hand_description_size:
             return
-        described = [self._tried(path)[0].description for path in self.train_paths]
+        described = [self._tried(path).description for path in self.train_paths]
         values = np.concatenate([d for d in described if d is not None]).astype(np.float32)
         for module in self.network.modules():
             if isinstance(module, HandDescription):

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.candidates import edge_grasps
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands, without_support
 from edgegrasp_model.options import SupportPlane
 
 PANDA = load_gripper()
@@ -64,3 +64,7 @@ def test_without_a_support_plane_heights_are_the_same_stand_in() -> None:
     cloud, a, c = scene(0)
     described = describe_hands(cloud, edge_grasps(cloud, a, c, PANDA), PANDA, UP, None)
     assert (described[:, -3:] == np.float32(0.10)).all()
+    table = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.03)
+    known = describe_hands(cloud, edge_grasps(cloud, a, c, PANDA), PANDA, UP, table)
+    assert not np.array_equal(known, described)
+    np.testing.assert_array_equal(without_support(known), described)
