@@ -23,6 +23,8 @@ SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand l
 # The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
 MIN_OPENING = 0.1 * MAX_OPENING
+SHAKE_DISTANCE = 0.03  # metres to either side, along the hand's x and then its y
+SHAKE_STEP = 0.005  # metres in each time step: 0.4 m/s
 # Depths in the hand at which to look for the object between the fingers, most telling first.
 _TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
 
@@ -57,6 +59,7 @@ class GraspResult:
         held: the object held, None if nothing is.
         target: the object between the fingers before the hand came, None if there was none.
         cause: why it failed, None if it did not.
+        held_after_shaking: whether it was still held then; None if the hand was not shaken.
     """
 
     outcome: GraspOutcome
@@ -65,6 +68,7 @@ class GraspResult:
     held: SceneObject | None
     target: SceneObject | None = None
     cause: FailureCause | None = None
+    held_after_shaking: bool | None = None
 
     @property
     def success(self) -> bool:
@@ -79,6 +83,7 @@ def run_grasp(
     *,
     start_contact_fails: bool,
     retreat_empty: bool,
+    shake: bool = False,
 ) -> GraspResult:
     """Run a grasp from its start pose to the end of the retreat; the hand stays there.
 
@@ -89,6 +94,7 @@ def run_grasp(
         start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
         retreat_empty: retreat even if the fingers closed on nothing, as what they push aside on
             the way matters to a scene that goes on.
+        shake: shake what is held, at the end of the retreat; the outcome is that before it.
     """
     gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
     gripper.world.detect_collisions()
@@ -112,7 +118,16 @@ def run_grasp(
         gripper.move_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
         held = next(iter(_touched(gripper, objects)), None)
         if held is not None and gripper.opening > MIN_OPENING:
-            return GraspResult(GraspOutcome.SUCCESS, gripper.opening, start_contact, held, target)
+            opening = gripper.opening
+            still = _holds_when_shaken(gripper, T_world_hand, held, objects) if shake else None
+            return GraspResult(
+                GraspOutcome.SUCCESS,
+                opening,
+                start_contact,
+                held,
+                target,
+                held_after_shaking=still,
+            )
     applies = {
         FailureCause.START_COLLISION: start_contact,
         FailureCause.APPROACH_COLLISION: collided,
@@ -122,6 +137,20 @@ def run_grasp(
     }
     cause = next(cause for cause, holds in applies.items() if holds)
     return GraspResult(GraspOutcome.AFTER, gripper.opening, start_contact, None, target, cause)
+
+
+def _holds_when_shaken(
+    gripper: Gripper,
+    T_world_hand: Matrix,
+    held: SceneObject,
+    objects: Mapping[int, SceneObject],
+) -> bool:
+    """Swing the hand from side to side where it is; whether it still holds the object then."""
+    T_world_lifted = retreat_pose(T_world_hand)
+    for along in np.eye(3)[:2]:
+        for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
+            gripper.move_to(T_world_lifted @ translation(*(way * along)), step_length=SHAKE_STEP)
+    return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

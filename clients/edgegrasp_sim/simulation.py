@@ -292,16 +292,17 @@ class ClutterSimulation:
         self._forget_rest_state()
         self._restore(state)
 
-    def try_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
+    def try_grasp(self, T_world_hand: ArrayLike, *, shake: bool = False) -> GraspResult:
         """See what would come of a grasp; the scene stays as it is.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+            shake: also shake what is held, see `GraspResult.held_after_shaking`.
 
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
         """
-        result = self._run(T_world_hand, retreat_empty=False)
+        result = self._run(T_world_hand, retreat_empty=False, shake=shake)
         self._restore_rest()
         return result
 
@@ -352,7 +353,9 @@ class ClutterSimulation:
             raise RuntimeError("there is no scene yet; call reset or reset_from_poses first")
         return self._gripper
 
-    def _run(self, T_world_hand: ArrayLike, *, retreat_empty: bool) -> GraspResult:
+    def _run(
+        self, T_world_hand: ArrayLike, *, retreat_empty: bool, shake: bool = False
+    ) -> GraspResult:
         T = require_pose(T_world_hand, "T_world_hand")
         self._restore_rest()
         return run_grasp(
@@ -361,6 +364,7 @@ class ClutterSimulation:
             {item.body.uid: item for item in self._objects},
             start_contact_fails=self.start_contact_fails,
             retreat_empty=retreat_empty,
+            shake=shake,
         )
 
     def _restore_rest(self) -> None:
