@@ -23,8 +23,8 @@ SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand l
 # The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
 MIN_OPENING = 0.1 * MAX_OPENING
-SHAKE_DISTANCE = 0.03  # metres to either side, along the hand's x and then its y
-SHAKE_STEP = 0.005  # metres in each time step: 0.4 m/s
+SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
+SHAKE_STEP = 0.0125  # metres in each time step: 1.0 m/s
 # Depths in the hand at which to look for the object between the fingers, most telling first.
 _TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
 
