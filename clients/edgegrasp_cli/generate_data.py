@@ -18,6 +18,9 @@ def generate_data(
     views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
     grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,
     seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 1,
+    weights: Annotated[
+        Path | None, Option(help="Network that chooses half of the grasps: its best, its unsure.")
+    ] = None,
     workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
@@ -28,7 +31,9 @@ def generate_data(
 
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
 
-    options = GenerationOptions(scenes, views_per_scene, grasps_per_view, seed=seed)
+    options = GenerationOptions(
+        scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights
+    )
     missing = len(missing_scenes(output, options))
     tried = held = 0
     try:

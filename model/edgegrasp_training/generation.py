@@ -3,17 +3,20 @@
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.cloud_input import check_cloud
+from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.preparation import Sample, sample_candidates
-from edgegrasp_model.scene import build_scene
+from edgegrasp_model.scene import Scene, build_scene
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
@@ -24,6 +27,8 @@ VOXEL_SIZE = 0.0045  # metres
 SAMPLED_RADIUS, SAMPLED_K = 0.04, 16  # balls that candidates are drawn from
 APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
+BEST_SHARE = 0.1  # of the candidates, by score: what a network would have executed
+UNSURE = 0.1, 0.8  # scores that leave the outcome open
 
 
 @dataclass(frozen=True)
@@ -33,9 +38,11 @@ class GenerationOptions:
     scenes: int = 100
     views_per_scene: int = 2
     grasps_per_view: int = 100
-    free_share: float = 0.75  # of the tried grasps, those the cloud says are free of collision
+    free_share: float = 0.75  # of those chosen at random, hands the cloud says are free
+    guided_share: float = 0.5  # of the tried grasps, where weights are given: best and unsure ones
     noise_std: float = 0.001  # metres
     seed: int = 1
+    weights: Path | None = None  # of the network that guides the choice
 
 
 def scene_name(index: int, seed: int) -> str:
@@ -81,7 +88,9 @@ def generate(
         for index in missing:
             yield index, *generate_scene(folder, objects, options, index)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        workers, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
         futures = {
             pool.submit(generate_scene, folder, objects, options, index): index for index in missing
         }
@@ -134,18 +143,21 @@ def _label(
     rng: np.random.Generator,
 ) -> LabelledView:
     """Sample candidates as the detector does and try some of them."""
-    gripper = load_gripper()
-    request = _request(observation, int(rng.integers(2**32)))
     if len(observation.cloud) == 0:
         return _empty(observation)
-    scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
-    if scene is None:
+    request = _request(observation, int(rng.integers(2**32)))
+    guide = None if options.weights is None else _detector(options.weights)
+    if guide is None:
+        scene, sample, score = *_sampled(observation, request), None
+    else:
+        prepared = guide.prepare(observation.cloud, request)
+        scene, sample = prepared.scene, prepared.sample
+        score = None if prepared.batch is None else guide.run(prepared.batch)
+    if scene is None or sample is None:
         return _empty(observation)
-    sample = sample_candidates(scene, request, gripper, SAMPLED_RADIUS, SAMPLED_K, {})
-    rows = _chosen(sample, options, rng)
-    candidates = sample.candidates.take(rows)
+    candidates = sample.candidates.take(_chosen(sample, score, options, rng))
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
-    outcomes = [simulation.try_grasp(pose).success for pose in T_world_hand]
+    results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     return LabelledView(
         points=scene.points_in_cloud,
         normals=scene.frame.directions_in_cloud(scene.cloud.normals),
@@ -153,19 +165,55 @@ def _label(
         approach_index=candidates.approach_index,
         contact_index=candidates.contact_index,
         T_world_hand=T_world_hand,
-        success=np.asarray(outcomes, dtype=np.int8),
+        success=np.asarray([result.success for result in results], dtype=np.int8),
+        firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
     )
 
 
+@lru_cache(maxsize=1)
+def _detector(weights: Path) -> GraspDetector:
+    return GraspDetector.load(weights)
+
+
+def _sampled(
+    observation: Observation, request: DetectOptions
+) -> tuple[Scene | None, Sample | None]:
+    """The scene and its candidates, as the detector makes them, without a network."""
+    scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
+    if scene is None:
+        return None, None
+    return scene, sample_candidates(scene, request, load_gripper(), SAMPLED_RADIUS, SAMPLED_K, {})
+
+
 def _chosen(
-    sample: Sample, options: GenerationOptions, rng: np.random.Generator
+    sample: Sample,
+    logit: NDArray[np.floating] | None,
+    options: GenerationOptions,
+    rng: np.random.Generator,
 ) -> NDArray[np.int64]:
-    """Ascending rows of the candidates to try: mostly hands that are free of collision."""
-    free = rng.permutation(np.flatnonzero(sample.collision_free))
-    hit = rng.permutation(np.flatnonzero(~sample.collision_free))
-    wanted = round(options.free_share * options.grasps_per_view)
-    free = free[: max(wanted, options.grasps_per_view - len(hit))]
-    return np.sort(np.concatenate([free, hit[: options.grasps_per_view - len(free)]]))
+    """Ascending rows of the candidates to try.
+
+    Some that a network would execute, as many whose outcome it leaves open, and the rest at
+    random: mostly hands that are free of collision.
+    """
+    left = np.ones(len(sample.candidates), dtype=bool)
+    guided = 0
+    if logit is not None:
+        each = round(options.guided_share * options.grasps_per_view / 2)
+        free = np.flatnonzero(sample.collision_free)
+        best = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
+        left[rng.permutation(best)[:each]] = False
+        score = 1.0 / (1.0 + np.exp(-logit))
+        unsure = np.flatnonzero(left & (score > UNSURE[0]) & (score < UNSURE[1]))
+        left[rng.permutation(unsure)[:each]] = False
+        guided = int((~left).sum())
+    count = options.grasps_per_view - guided
+    free = rng.permutation(np.flatnonzero(left & sample.collision_free))
+    hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
+    free = free[: max(round(options.free_share * count), count - len(hit))]
+    left[free] = False
+    left[hit[: count - len(free)]] = False
+    return np.flatnonzero(~left)
 
 
 def _empty(observation: Observation) -> LabelledView:

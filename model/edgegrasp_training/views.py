@@ -23,7 +23,8 @@ class LabelledView:
     approach_index: NDArray[np.int64]  # (E,) rows of `points`
     contact_index: NDArray[np.int64]  # (E,) rows of `points`
     T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: those of the paper's definition
-    success: NDArray[np.int8]  # (E,) 1 held, 0 not, UNTRIED
+    success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
+    firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
@@ -37,6 +38,8 @@ class LabelledView:
         }
         if self.T_world_hand is not None:
             arrays["T_world_hand"] = self.T_world_hand
+        if self.firm is not None:
+            arrays["firm"] = self.firm
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -58,6 +61,7 @@ def load_view(path: Path) -> LabelledView:
             contact_index=arrays["contact_index"].astype(np.int64),
             T_world_hand=arrays.get("T_world_hand"),
             success=arrays["success"].astype(np.int8),
+            firm=arrays.get("firm"),
         )
 
 
