@@ -6,6 +6,10 @@ EdgeGraspError                (edgegrasp_model.errors)
       + UnsupportedMediaType  a body in a format the server does not read
       + DecoderMissing        a format whose reader is not installed
       + NotReady              weights are still loading, or the server is stopping
+      + Overloaded            as many requests as the server takes are in it already
+      + DeadlineExceeded      the caller's deadline passed before there was an answer
+      + Cancelled             the caller is gone; nobody reads this
+      + WorkerLost            the network's thread died or ran out of memory, and was replaced
       + DetectorFailed        the detector failed on a good request
       + InvalidSettings       start-up: a setting is wrong
       + AddressInUse          start-up: a port cannot be bound
@@ -47,6 +51,31 @@ class NotReady(ServiceError):  # noqa: N818
     """Weights are still loading, or the server is stopping."""
 
 
+class Overloaded(ServiceError):  # noqa: N818
+    """As many requests as the server takes are in it already.
+
+    Args:
+        message: The whole sentence.
+        retry_after: Seconds until it is worth another try.
+    """
+
+    def __init__(self, message: str, retry_after: float = 1.0) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
+
+
+class DeadlineExceeded(ServiceError):  # noqa: N818
+    """The caller's deadline passed before there was an answer."""
+
+
+class Cancelled(ServiceError):  # noqa: N818
+    """The caller is gone; nobody reads this."""
+
+
+class WorkerLost(ServiceError):  # noqa: N818
+    """The network's thread died or ran out of memory, and was replaced."""
+
+
 class DetectorFailed(ServiceError):  # noqa: N818
     """The detector failed on a good request."""
 
@@ -66,6 +95,10 @@ STATUS: dict[type[Exception], tuple[grpc.StatusCode, int]] = {
     UnsupportedMediaType: (grpc.StatusCode.INVALID_ARGUMENT, 415),
     DecoderMissing: (grpc.StatusCode.UNIMPLEMENTED, 501),
     NotReady: (grpc.StatusCode.UNAVAILABLE, 503),
+    Overloaded: (grpc.StatusCode.RESOURCE_EXHAUSTED, 429),
+    DeadlineExceeded: (grpc.StatusCode.DEADLINE_EXCEEDED, 504),
+    Cancelled: (grpc.StatusCode.CANCELLED, 499),  # 499: as nginx logs it
+    WorkerLost: (grpc.StatusCode.UNAVAILABLE, 503),
     DetectorFailed: (grpc.StatusCode.INTERNAL, 500),
 }
 
@@ -81,6 +114,7 @@ class ErrorReport:
     fix: str
     code: grpc.StatusCode
     status: int
+    retry_after: float | None = None  # seconds
 
 
 def report(error: Exception) -> ErrorReport:
@@ -95,7 +129,9 @@ def report(error: Exception) -> ErrorReport:
     elif isinstance(error, InvalidRequest | _FieldError):
         field, value, fix = error.field, error.value, error.fix
     detail = f"{field}: got {value}. {fix}" if field else str(error)
-    return ErrorReport(kind_of(type(error)), detail, field, value, fix, code, status)
+    retry_after = error.retry_after if isinstance(error, Overloaded) else None
+    kind = kind_of(type(error))
+    return ErrorReport(kind, detail, field, value, fix, code, status, retry_after)
 
 
 def kind_of(error: type[Exception]) -> str:
