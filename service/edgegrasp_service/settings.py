@@ -1,20 +1,41 @@
-"""Settings of the server: defaults, then EDGEGRASP_* environment variables, then arguments."""
+"""Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
+import difflib
+import os
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field, ValidationError
-from pydantic_settings import BaseSettings, SettingsConfigDict, SettingsError
-
-from edgegrasp_service.errors import InvalidSettings
+from pydantic import Field, SecretStr, ValidationError, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+    TomlConfigSettingsSource,
+)
 
 MIB = 2**20
+PREFIX = "EDGEGRASP_"
+CONFIG_VARIABLE = PREFIX + "CONFIG"
+# No one may see these, nor give them as flags, which every user of a machine can see.
+SECRETS = ("tokens", "admin_tokens")
+CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
+
+Origins = dict[str, str]  # setting: "default", the file's name, a variable or a flag
 
 
 class Settings(BaseSettings):
-    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
+    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`.
 
-    model_config = SettingsConfigDict(env_prefix="EDGEGRASP_", extra="forbid", frozen=True)
+    Made directly, it takes arguments and defaults only; `load_settings` knows every source.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="EDGEGRASP_", env_ignore_empty=True, extra="forbid", frozen=True
+    )
 
     host: str = Field(default="127.0.0.1", description="address both transports bind to")
     http_port: int = Field(default=8000, ge=0, le=65535, description="0: any free port")
@@ -38,23 +59,166 @@ class Settings(BaseSettings):
     max_points: int = Field(
         default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
     )
-    grace_seconds: float = Field(
-        default=10.0, ge=0.0, description="time for requests in flight when stopping, seconds"
+    max_header_bytes: int = Field(
+        default=32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    tls_certificate: Path | None = Field(
+        default=None, description="PEM file: the server's certificate and those between it and a CA"
+    )
+    tls_key: Path | None = Field(default=None, description="PEM file: key of the certificate")
+    tls_client_ca: Path | None = Field(
+        default=None, description="PEM file: CAs of clients, which must then show a certificate"
+    )
+    tokens: tuple[SecretStr, ...] = Field(
+        default=(), description="bearer tokens, one of which a request must carry; none: no need"
+    )
+    token_file: Path | None = Field(default=None, description="file of further tokens, one a line")
+    admin_tokens: tuple[SecretStr, ...] = Field(
+        default=(), description="tokens that may reload weights too; none: SIGHUP only"
+    )
+    admin_token_file: Path | None = Field(
+        default=None, description="file of further admin tokens, one a line"
+    )
+    grace_seconds: float = Field(
+        default=10.0,
+        ge=0.0,
+        le=3600.0,
+        description="time for requests in flight when stopping, seconds",
+    )
+    otlp_endpoint: str = Field(
+        default="",
+        pattern=r"^(https?://[^@\s]+)?$",  # no password: it would be printed
+        description="URL that traces are posted to, e.g. http://127.0.0.1:4318/v1/traces",
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="least severe records logged"
+    )
+    log_format: Literal["auto", "json", "text"] = Field(
+        default="auto", description="auto: text on a terminal, JSON lines elsewhere"
+    )
+
+    @model_validator(mode="after")
+    def _check_tls(self) -> Self:
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together. Give both or neither")
+        if self.tls_client_ca is not None and self.tls_certificate is None:
+            raise ValueError("tls_client_ca needs tls_certificate and tls_key")
+        return self
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        **sources: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Arguments only; `load_settings` reads the file and the environment when it is called."""
+        return (init_settings,)
 
 
-def load_settings(**given: object) -> Settings:
-    """Settings from defaults, the environment and arguments, the latter winning.
+def load_settings(config: Path | None = None, **given: object) -> Settings:
+    """Settings from defaults, a TOML file, the environment and arguments, the latter winning.
+
+    Args:
+        config: The file; None: the one EDGEGRASP_CONFIG names, if it does.
+        given: Settings by name; in messages they are flags.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.
     """
+    return load_settings_and_origins(config, **given)[0]
+
+
+def load_settings_and_origins(
+    config: Path | None = None, **given: object
+) -> tuple[Settings, Origins]:
+    """As `load_settings`, and where each setting came from; raises as it does."""
+    from edgegrasp_service.errors import InvalidSettings  # it imports gRPC, `--help` should not
+
+    origins = dict.fromkeys(Settings.model_fields, "default")
     try:
-        return Settings(**given)  # type: ignore[arg-type]
+        path = config or _config_of_environment()
+        from_file = _read_file(path) if path else {}
+        from_environment = _read_environment()
+        _refuse_unknown(given, Settings.model_fields, lambda name: f"--{name.replace('_', '-')}")
+        origins |= dict.fromkeys(from_file, str(path))
+        origins |= {name: PREFIX + name.upper() for name in from_environment}
+        origins |= {name: f"--{name.replace('_', '-')}" for name in given}
+        return Settings(**{**from_file, **from_environment, **given}), origins
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise InvalidSettings(f"{name}: got {first['input']!r}. {first['msg']}.") from None
+        raise InvalidSettings(_sentence(error, origins)) from None
     except SettingsError as error:
         raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
+    except _BadSource as error:
+        raise InvalidSettings(str(error)) from None
+
+
+class _BadSource(Exception):  # noqa: N818
+    """A file that cannot be read, or a name in a source that is no setting."""
+
+
+def _config_of_environment() -> Path | None:
+    path = os.environ.get(CONFIG_VARIABLE, "")
+    return Path(path) if path else None
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """The settings in a file; its paths are relative to its own folder."""
+    if not path.is_file():
+        raise _BadSource(f"config: got {str(path)!r}. There is no such file.")
+    try:
+        fields = TomlConfigSettingsSource(Settings, path).toml_data
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise _BadSource(f"config: {path}: {error}.") from None
+    _refuse_unknown(fields, Settings.model_fields, lambda name: f"{path}: {name}")
+    return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
+
+
+def _located(name: str, value: Any, folder: Path) -> Any:
+    if "Path" not in str(Settings.model_fields[name].annotation):
+        return value
+    if isinstance(value, list):
+        return [folder / part if isinstance(part, str) else part for part in value]
+    return folder / value if isinstance(value, str) else value
+
+
+def _read_environment() -> dict[str, Any]:
+    ours = [
+        name.upper()
+        for name, value in os.environ.items()
+        if name.upper().startswith(PREFIX) and value
+    ]
+    known = [CONFIG_VARIABLE, *(PREFIX + name.upper() for name in Settings.model_fields)]
+    _refuse_unknown(
+        [name for name in ours if not name.startswith(CLIENT_PREFIX)], known, lambda name: name
+    )
+    return EnvSettingsSource(Settings)()
+
+
+def _refuse_unknown(
+    names: Iterable[str], known: Iterable[str], label: Callable[[str], str]
+) -> None:
+    choices = list(known)
+    for name in names:
+        if name not in choices:
+            nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
+            shown = label(nearest).rpartition(": ")[2]
+            raise _BadSource(f"{one_line(label(name))}: no such setting. Did you mean {shown}?")
+
+
+def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
+    """The first thing wrong; never the value of a secret."""
+    first = error.errors(include_url=False)[0]
+    message = first["msg"].removeprefix("Value error, ")
+    if not first["loc"]:
+        return f"{message}."
+    name = str(first["loc"][0])
+    origin = origins.get(name, "default")
+    got = "a secret" if name in SECRETS else repr(first["input"])
+    path = ".".join(str(part) for part in first["loc"])
+    return f"{path}: got {got}. {message}. It comes from {origin}."
+
+
+def one_line(text: str) -> str:
+    """A text from outside as it may stand in a message."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -1,9 +1,43 @@
+"""Defaults, then a file, then the environment, then flags; every mistake named with its source."""
+
+import os
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edgegrasp_service.errors import InvalidSettings
-from edgegrasp_service.settings import load_settings
+from edgegrasp_service.settings import SECRETS, Settings, load_settings, load_settings_and_origins
+from edgegrasp_service.settings_text import config_text
+
+TOKEN = "a-token-of-enough-letters"
+
+
+@pytest.fixture(autouse=True)
+def no_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in os.environ:
+        if name.startswith("EDGEGRASP_"):
+            monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    return tmp_path / "server.toml"
+
+
+def serve(*flags: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    program = "from edgegrasp_cli.main import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", program, "serve", *flags],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        timeout=60,
+    )
 
 
 def test_defaults() -> None:
@@ -12,24 +46,55 @@ def test_defaults() -> None:
     assert settings.max_body_bytes == 32 * 2**20
 
 
-def test_environment_wins_over_defaults_and_arguments_over_both(
-    monkeypatch: pytest.MonkeyPatch,
+def test_each_source_wins_over_the_one_before(
+    monkeypatch: pytest.MonkeyPatch, config: Path
 ) -> None:
-    monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "8001")
-    monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "8002")
+    config.write_text("http_port = 1\ngrpc_port = 1\nmax_points = 1\n")
+    monkeypatch.setenv("EDGEGRASP_CONFIG", str(config))
+    monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "2")
+    monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "2")
+    settings, origins = load_settings_and_origins(http_port=3)
+    assert (settings.http_port, settings.grpc_port, settings.max_points) == (3, 2, 1)
+    names = ("http_port", "grpc_port", "max_points", "host")
+    sources = ["--http-port", "EDGEGRASP_GRPC_PORT", str(config), "default"]
+    assert [origins[name] for name in names] == sources
+
+
+def test_the_file_given_wins_over_the_one_the_environment_names(
+    monkeypatch: pytest.MonkeyPatch, config: Path
+) -> None:
+    config.write_text("http_port = 1\n")
+    monkeypatch.setenv("EDGEGRASP_CONFIG", "none.toml")
+    assert load_settings(config).http_port == 1
+
+
+def test_paths_in_a_file_are_relative_to_it(config: Path) -> None:
+    config.write_text('weights = ["mine", "/there/yours"]\ntoken_file = "tokens"\n')
+    settings = load_settings(config)
+    assert settings.weights == (config.parent / "mine", Path("/there/yours"))
+    assert settings.token_file == config.parent / "tokens"
+
+
+def test_lists_in_the_environment_are_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDGEGRASP_WEIGHTS", '["a", "b.safetensors"]')
-    settings = load_settings(http_port=9000)
-    assert (settings.http_port, settings.grpc_port) == (9000, 8002)
-    assert settings.weights == (Path("a"), Path("b.safetensors"))
+    assert load_settings().weights == (Path("a"), Path("b.safetensors"))
+    monkeypatch.setenv("EDGEGRASP_WEIGHTS", "folder")
+    with pytest.raises(InvalidSettings, match="Write lists as JSON"):
+        load_settings()
 
 
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"http_port": -1}, "http_port: got -1"),
-        ({"htp_port": 1}, "htp_port: got 1. Extra inputs are not permitted"),
+        ({"http_port": -1}, "http_port: got -1. Input should be greater"),
+        ({"htp_port": 1}, "--htp-port: no such setting. Did you mean --http-port?"),
         ({"backend": "none"}, "backend: got 'none'"),
         ({"max_body_bytes": "many"}, "max_body_bytes: got 'many'"),
+        ({"tokens": [1]}, "tokens.0: got a secret"),
+        ({"tls_key": "key.pem"}, "tls_certificate and tls_key go together"),
+        ({"tls_client_ca": "ca.pem"}, "tls_client_ca needs tls_certificate"),
+        ({"grace_seconds": float("nan")}, "grace_seconds: got nan"),
+        ({"otlp_endpoint": "http://user:word@host"}, "otlp_endpoint: got"),
     ],
 )
 def test_bad_settings_are_named(given: dict[str, object], sentence: str) -> None:
@@ -38,7 +103,107 @@ def test_bad_settings_are_named(given: dict[str, object], sentence: str) -> None
     assert sentence in str(caught.value)
 
 
-def test_bad_environment_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EDGEGRASP_WEIGHTS", "folder")
-    with pytest.raises(InvalidSettings, match="Write lists as JSON"):
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("htttp_port = 1\n", "htttp_port: no such setting. Did you mean http_port?"),
+        ("[tls]\nkey = 1\n", "tls: no such setting. Did you mean tls_key?"),
+        ('http_port = "many"\n', "http_port: got 'many'"),
+        ("http_port 1\n", "server.toml: Expected '=' after a key"),
+        ("http_port = \xff\n", "server.toml:"),
+    ],
+)
+def test_bad_files_are_named(config: Path, text: str, sentence: str) -> None:
+    config.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InvalidSettings) as caught:
+        load_settings(config)
+    assert sentence in str(caught.value)
+    assert "server.toml" in str(caught.value)
+
+
+def test_a_missing_file_is_named(config: Path) -> None:
+    with pytest.raises(InvalidSettings, match=r"config: got .*server\.toml.*no such file"):
+        load_settings(config)
+
+
+@pytest.mark.parametrize(
+    ("variable", "nearest"),
+    [("EDGEGRASP_HTP_PORT", "EDGEGRASP_HTTP_PORT"), ("EDGEGRASP_TOKEN", "EDGEGRASP_TOKENS")],
+)
+def test_unknown_variables_are_named(
+    monkeypatch: pytest.MonkeyPatch, variable: str, nearest: str
+) -> None:
+    monkeypatch.setenv(variable, TOKEN)
+    with pytest.raises(InvalidSettings) as caught:
         load_settings()
+    assert str(caught.value) == f"{variable}: no such setting. Did you mean {nearest}?"
+
+
+def test_a_clients_variables_are_not_the_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EDGEGRASP_CLIENT_TOKEN", TOKEN)
+    monkeypatch.setenv("EDGEGRASP_HOST", "")  # as a compose file leaves what is not set
+    assert load_settings().host == "127.0.0.1"
+
+
+def test_made_directly_settings_read_no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "1")
+    assert Settings().http_port == 8000
+
+
+@given(
+    default_model=st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")),
+    names=st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))),
+    seconds=st.floats(0.0, 3600.0),
+)
+def test_printed_settings_are_a_file_that_gives_them_again(
+    tmp_path_factory: pytest.TempPathFactory, default_model: str, names: list[str], seconds: float
+) -> None:
+    given_settings = {
+        "default_model": default_model,
+        "weights": [f"/{name}" for name in names],
+        "grace_seconds": seconds,
+    }
+    settings, origins = load_settings_and_origins(**given_settings)
+    file = tmp_path_factory.mktemp("config") / "printed.toml"
+    file.write_text(config_text(settings, origins))
+    assert load_settings(file) == settings
+
+
+def test_every_setting_is_printed_with_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "7")
+    done = serve("--print-config", "--http-port", "9", "--weights", "/a", "--weights", "/b")
+    assert done.returncode == 0, done.stderr
+    printed = tomllib.loads(done.stdout)
+    assert (printed["http_port"], printed["grpc_port"]) == (9, 7)
+    assert printed["weights"] == ["/a", "/b"]
+    assert "http_port = 9  # --http-port\n" in done.stdout
+    assert "grpc_port = 7  # EDGEGRASP_GRPC_PORT\n" in done.stdout
+    assert 'host = "127.0.0.1"  # default\n' in done.stdout
+    for name in Settings.model_fields:
+        assert f"\n{name} = " in done.stdout or f"\n# {name}: " in done.stdout
+
+
+def test_secrets_are_not_printed() -> None:
+    done = serve("--print-config", EDGEGRASP_TOKENS=f'["{TOKEN}"]')
+    assert "# tokens: 1, hidden  # EDGEGRASP_TOKENS\n" in done.stdout
+    assert TOKEN not in done.stdout + done.stderr
+    wrong = serve("--print-config", EDGEGRASP_TOKENS=TOKEN)
+    assert wrong.returncode == 1
+    assert TOKEN not in wrong.stdout + wrong.stderr
+
+
+def test_everything_of_a_secret_kind_is_secret() -> None:
+    kinds = {name: str(field.annotation) for name, field in Settings.model_fields.items()}
+    assert {name for name, kind in kinds.items() if "Secret" in kind} == set(SECRETS)
+
+
+def test_an_unknown_flag_suggests_the_nearest() -> None:
+    done = serve("--htp-port", "1")
+    assert done.returncode != 0
+    assert "--http-port" in done.stderr
+
+
+def test_no_secret_is_a_flag() -> None:
+    done = serve("--tokens", TOKEN)
+    assert done.returncode != 0
+    assert "--token-file" in done.stderr
