@@ -5,6 +5,10 @@ EdgeGraspError                (edgegrasp_model.errors)
       + PayloadTooLarge       a body or a cloud over the server's limits
       + UnsupportedMediaType  a body in a format the server does not read
       + DecoderMissing        a format whose reader is not installed
+      + Unauthenticated       no token, or none that the server knows
+      + PermissionDenied      a token that is good for less than this
+      + HeadersTooLarge       HTTP headers or gRPC metadata over the server's limits
+      + ReloadFailed          new weights cannot be used; the old ones still serve
       + NotReady              weights are still loading, or the server is stopping
       + Overloaded            as many requests as the server takes are in it already
       + DeadlineExceeded      the caller's deadline passed before there was an answer
@@ -45,6 +49,22 @@ class UnsupportedMediaType(_FieldError):  # noqa: N818
 
 class DecoderMissing(_FieldError):  # noqa: N818
     """A format's reader is not installed on the server."""
+
+
+class Unauthenticated(_FieldError):  # noqa: N818
+    """There is no token, or none that the server knows; its value is in no message."""
+
+
+class PermissionDenied(_FieldError):  # noqa: N818
+    """A token is good for less than what is asked for."""
+
+
+class HeadersTooLarge(_FieldError):  # noqa: N818
+    """HTTP headers or gRPC metadata are over the server's limits."""
+
+
+class ReloadFailed(ServiceError):  # noqa: N818
+    """New weights cannot be used; the old ones still serve."""
 
 
 class NotReady(ServiceError):  # noqa: N818
@@ -94,6 +114,10 @@ STATUS: dict[type[Exception], tuple[grpc.StatusCode, int]] = {
     PayloadTooLarge: (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
     UnsupportedMediaType: (grpc.StatusCode.INVALID_ARGUMENT, 415),
     DecoderMissing: (grpc.StatusCode.UNIMPLEMENTED, 501),
+    Unauthenticated: (grpc.StatusCode.UNAUTHENTICATED, 401),
+    PermissionDenied: (grpc.StatusCode.PERMISSION_DENIED, 403),
+    HeadersTooLarge: (grpc.StatusCode.RESOURCE_EXHAUSTED, 431),
+    ReloadFailed: (grpc.StatusCode.FAILED_PRECONDITION, 409),
     NotReady: (grpc.StatusCode.UNAVAILABLE, 503),
     Overloaded: (grpc.StatusCode.RESOURCE_EXHAUSTED, 429),
     DeadlineExceeded: (grpc.StatusCode.DEADLINE_EXCEEDED, 504),
