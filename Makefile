@@ -6,10 +6,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*)
+GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json proto/openapi.json
 
 .DEFAULT_GOAL := help
-.PHONY: help venv lint format test demo proto constraints clean
+.PHONY: help venv lint format test fuzz demo proto constraints clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,7 +42,7 @@ test: $(INSTALLED) ## run the tests
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
 
-proto: $(INSTALLED) ## generate the gRPC code from proto/
+proto: $(INSTALLED) ## generate the gRPC code, the contract and the OpenAPI document
 	PYTHON=$(BIN)/python scripts/generate_proto.sh
 
 constraints: ## resolve the dependencies afresh into constraints.txt

@@ -1,0 +1,25 @@
+"""Write the OpenAPI document of the HTTP transport.
+
+usage: scripts/openapi.py [FOLDER]    writes openapi.json there, or into proto/
+"""
+
+import json
+import sys
+from pathlib import Path
+
+from edgegrasp_service.core import GraspService
+from edgegrasp_service.dummy import DummyCatalogue
+from edgegrasp_service.http_app import create_app
+
+NAME = "openapi.json"
+
+
+def document() -> str:
+    """The document; no limit of a server is in it."""
+    app = create_app(GraspService(DummyCatalogue, max_points=1), max_body_bytes=1)
+    return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "proto"
+    (folder / NAME).write_text(document())
