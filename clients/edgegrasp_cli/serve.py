@@ -62,7 +62,7 @@ def _flag_type(annotation: Any) -> Any:
     """What typer reads: a list for a tuple, the text itself for one of several words."""
     parts = [part for part in get_args(annotation) if part not in (type(None), ...)]
     if get_origin(annotation) is tuple:
-        return list[parts[0]]
+        return {Path: list[Path], int: list[int]}[parts[0]]
     if parts and isinstance(parts[0], str):
         return str
     return parts[0] if parts else annotation

@@ -59,6 +59,46 @@ class Settings(BaseSettings):
     max_points: int = Field(
         default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
     )
+    # Bounds and batching: what `edgegrasp_service.bounds` makes of it.
+    max_balls: int = Field(
+        default=256, ge=1, le=256, description="most approach points a request may ask for"
+    )
+    max_candidates: int = Field(
+        default=16_000, ge=1, le=16_000, description="most candidates a request may ask for"
+    )
+    max_concurrent_requests: int = Field(
+        default=8, ge=1, le=1024, description="most requests worked on at a time"
+    )
+    max_queue_length: int = Field(
+        default=32, ge=0, le=65536, description="most requests that wait to be worked on"
+    )
+    max_stream_requests: int = Field(
+        default=4, ge=1, le=1024, description="most requests of one stream read ahead"
+    )
+    max_request_seconds: float = Field(
+        default=120.0,
+        gt=0.0,
+        le=86400.0,
+        description="longest a request may take, where the caller sets no shorter deadline",
+    )
+    prepare_threads: int = Field(
+        default=2, ge=1, le=256, description="threads that prepare clouds beside the network"
+    )
+    batching: bool = Field(
+        default=False, description="whether requests share a forward pass of the network"
+    )
+    max_batch_balls: int = Field(
+        default=256, ge=1, le=65536, description="most balls in one forward pass"
+    )
+    max_batch_points: int = Field(
+        default=200_000, ge=1, description="most points of balls in one forward pass"
+    )
+    max_batch_wait_microseconds: int = Field(
+        default=0, ge=0, le=10_000_000, description="longest that a batch waits to be joined"
+    )
+    preferred_batch_balls: tuple[int, ...] = Field(
+        default=(), description="sizes in balls that are not made to wait, e.g. [64, 128]"
+    )
     max_header_bytes: int = Field(
         default=32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
@@ -110,7 +150,9 @@ class Settings(BaseSettings):
         cls,
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
-        **sources: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Arguments only; `load_settings` reads the file and the environment when it is called."""
         return (init_settings,)

@@ -14,7 +14,14 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_model.errors import EdgeGraspError, UnknownModel
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.dummy import DummyCatalogue
-from edgegrasp_service.errors import STATUS, DetectorFailed, NotReady, kind_of, report
+from edgegrasp_service.errors import (
+    STATUS,
+    DetectorFailed,
+    NotReady,
+    ReloadFailed,
+    kind_of,
+    report,
+)
 from edgegrasp_service.grpc_server import GrpcServer
 from edgegrasp_service.http_app import create_app
 
@@ -43,7 +50,7 @@ class Failing:
 def example(kind: type[Exception]) -> Exception:
     if kind is UnknownModel:
         return UnknownModel("wanted", ["a", "b"])
-    if kind in (NotReady, DetectorFailed):
+    if kind in (NotReady, ReloadFailed, DetectorFailed):
         return kind("What happened.")
     return kind("cloud", "a value", "Fix it.")
 
