@@ -11,7 +11,7 @@ from starlette.exceptions import HTTPException
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.body_limit import BodyLimit
 from edgegrasp_service.core import GraspService
-from edgegrasp_service.errors import ErrorReport, NotReady, report
+from edgegrasp_service.errors import NotReady, report
 from edgegrasp_service.http_bodies import (
     KIND_PREFIX,
     DetectionBody,
@@ -21,10 +21,10 @@ from edgegrasp_service.http_bodies import (
     ScoringBody,
     detection_body,
     models_body,
-    problem_body,
     scoring_body,
 )
 from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
+from edgegrasp_service.http_problem import problem_response
 from edgegrasp_service.http_request import read_request, read_score_request
 
 logger = logging.getLogger(__name__)
@@ -110,7 +110,7 @@ async def _answer_error(request: Request, error: Exception) -> JSONResponse:
     problem = report(error)
     if problem.status >= 500:
         logger.warning("%s %s: %s", request.method, request.url.path, problem.detail)
-    return _problem_response(problem)
+    return problem_response(problem)
 
 
 async def _answer_http_error(request: Request, error: Exception) -> JSONResponse:
@@ -127,10 +127,4 @@ async def _answer_http_error(request: Request, error: Exception) -> JSONResponse
     }
     return JSONResponse(
         body, error.status_code, headers=error.headers, media_type="application/problem+json"
-    )
-
-
-def _problem_response(problem: ErrorReport) -> JSONResponse:
-    return JSONResponse(
-        problem_body(problem), problem.status, media_type="application/problem+json"
     )
