@@ -7,6 +7,7 @@ EdgeGraspError
   + InvalidGripper        a gripper file cannot be used
 """
 
+import reprlib
 from collections.abc import Iterable
 
 
@@ -30,6 +31,18 @@ class InvalidRequest(EdgeGraspError):  # noqa: N818
         super().__init__(f"{field}: got {value}. {fix}")
 
 
+def brief(value: object) -> str:
+    """A value as it goes into an error: short, however long or deep it is."""
+    text = _SHORT.repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 8
+_SHORT.maxdict = _SHORT.maxlist = _SHORT.maxtuple = 20  # members
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 90  # characters
+
+
 class UnknownModel(EdgeGraspError):  # noqa: N818
     """No weights of that name are loaded."""
 
@@ -37,7 +50,7 @@ class UnknownModel(EdgeGraspError):  # noqa: N818
         self.name = name
         self.known = sorted(known)
         super().__init__(
-            f"model: got {name!r}. Use one of: {', '.join(self.known) or 'none loaded'}."
+            f"model: got {brief(name)}. Use one of: {', '.join(self.known) or 'none loaded'}."
         )
 
 

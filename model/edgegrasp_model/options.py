@@ -13,7 +13,7 @@ from pydantic import (
 )
 
 from edgegrasp_model.directions import ApproachDirection, Cone
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.gripper import GripperGeometry
 from edgegrasp_model.option_types import Direction, Strict, Vector, ordered
 from edgegrasp_model.regions import Box, OrientedBox, Region
@@ -227,8 +227,7 @@ def invalid_options(
     if first["type"] == "extra_forbidden":
         known = "" if "." in field.removeprefix(prefix + ".") else _known_options()
         return InvalidRequest(field, "an unknown field", f"Remove it{known}.")
-    value = "nothing" if first["type"] == "missing" else repr(first["input"])
-    value = value if len(value) <= 80 else value[:77] + "..."
+    value = "nothing" if first["type"] == "missing" else brief(first["input"])
     fix = first["msg"].removeprefix("Value error, ")
     if first["type"] == "union_tag_invalid":
         fix = f"Set its kind to one of {first['ctx']['expected_tags']}"

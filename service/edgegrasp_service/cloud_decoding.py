@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.cloud_input import CloudInput
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.npy_file import check_count, read_npy, read_npz
 from edgegrasp_service.pcd_file import read_pcd
 from edgegrasp_service.ply_file import read_ply
-from edgegrasp_service.sent_arrays import brief
+from edgegrasp_service.sent_arrays import numbers_from_lists
 from edgegrasp_service.xyz_file import read_xyz
 
 Array = NDArray[Any]
@@ -57,16 +57,8 @@ def decode_list(points: object, max_points: int) -> Array:
     check_count(len(points), max_points)
     if not points:
         return np.empty((0, 3))
-    try:
-        array = np.array(points)
-    except ValueError:
-        raise InvalidRequest(
-            "points", "rows of different lengths", "Send [x, y, z] rows."
-        ) from None
+    array = numbers_from_lists("points", points, holes=True)
     check_count(array.size // 3, max_points)
-    if array.dtype.kind not in "iuf" and not _has_holes(array):
-        value = next((row for row in points if not _is_numbers(row)), points[0])
-        raise InvalidRequest("points", brief(value), "Send numbers only: [x, y, z] in metres.")
     return array.astype(np.float64)
 
 
@@ -122,14 +114,3 @@ _DECODERS: dict[str, Callable[[bytes, int], CloudInput]] = {
 }
 
 FILE_FORMATS = tuple(_DECODERS)
-
-
-def _has_holes(array: Array) -> bool:
-    """Whether it is organised, of numbers and None."""
-    return array.ndim == 3 and all(
-        value is None or type(value) in (int, float) for value in array.ravel().tolist()
-    )
-
-
-def _is_numbers(row: object) -> bool:
-    return isinstance(row, list) and all(type(value) in (int, float) for value in row)

@@ -24,7 +24,9 @@ from dataclasses import dataclass
 
 import grpc
 
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
+
+STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
 
 
 class ServiceError(EdgeGraspError):
@@ -148,14 +150,21 @@ def report(error: Exception) -> ErrorReport:
     code, status = STATUS[type(error)]
     field, value, fix = "", "", ""
     if isinstance(error, UnknownModel):
-        field, value = "options.model", repr(error.name)
+        field, value = "options.model", brief(error.name)
         fix = f"Use one of: {', '.join(error.known)}."
     elif isinstance(error, InvalidRequest | _FieldError):
         field, value, fix = error.field, error.value, error.fix
+    field, value = _sendable(field), _sendable(value)
     detail = f"{field}: got {value}. {fix}" if field else str(error)
     retry_after = error.retry_after if isinstance(error, Overloaded) else None
     kind = kind_of(type(error))
     return ErrorReport(kind, detail, field, value, fix, code, status, retry_after)
+
+
+def _sendable(text: str) -> str:
+    """A caller's own words, short enough for gRPC's metadata and without half characters."""
+    text = text.encode("utf-8", "backslashreplace").decode()
+    return text if len(text) <= 200 else text[:197] + "..."
 
 
 def kind_of(error: type[Exception]) -> str:

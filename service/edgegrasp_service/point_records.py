@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.errors import InvalidRequest
 
+MAX_WORD = 48  # characters; %.40f fits
+
 
 def read_binary_records(
     body: bytes, record: np.dtype[Any], count: int, kind: str
@@ -40,16 +42,29 @@ def read_ascii_records(
     if len(words) < expected:
         value = f"{len(words)} numbers where the {kind} header promises {expected}"
         raise InvalidRequest("cloud", value, "Send the whole file.")
-    try:
-        table = np.array(words, dtype="S32").astype(np.float64).reshape(count, len(names))
-    except ValueError:
-        value = f"text among the numbers of a {kind} file"
-        raise InvalidRequest("cloud", value, "Send numbers only.") from None
+    table = numbers_from_words(words, kind).reshape(count, len(names))
     rows = np.empty(count, dtype=record)
     with np.errstate(all="ignore"):
         for column, name in enumerate(names):
             rows[name] = table[:, column]
     return rows
+
+
+def numbers_from_words(words: list[bytes], kind: str) -> NDArray[np.float64]:
+    """Numbers written as text, in a flat array.
+
+    Raises:
+        InvalidRequest: A word is no number, or longer than any number needs to be.
+    """
+    longest = max(map(len, words), default=1)  # every element of the array has the room of that
+    if longest > MAX_WORD:
+        value = f"a word of {longest} characters in a {kind} file"
+        raise InvalidRequest("cloud", value, f"Send numbers of {MAX_WORD} characters at most.")
+    try:
+        return np.array(words, dtype=f"S{longest}").astype(np.float64)
+    except ValueError:
+        value = f"text among the numbers of a {kind} file"
+        raise InvalidRequest("cloud", value, "Send numbers only.") from None
 
 
 def columns(rows: NDArray[np.void], names: tuple[str, ...]) -> NDArray[Any] | None:

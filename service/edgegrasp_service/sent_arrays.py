@@ -1,12 +1,13 @@
 """Arrays that come beside a cloud, as each transport carries them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_service.npy_file import read_npy
 
 Array = NDArray[Any]
@@ -64,32 +65,49 @@ SentArray = PackedArray | ListArray | NpyArray
 
 
 def array_from_lists(field: str, values: object) -> Array:
-    """Lists of numbers as an array.
+    """Lists of numbers as an array: int64 where all are whole, float64 else.
 
     Raises:
         InvalidRequest: No list, rows of different lengths, or something other than numbers.
     """
     if not isinstance(values, list):
         raise InvalidRequest(field, brief(values), "Send a list of numbers, or of lists of them.")
+    return numbers_from_lists(field, values) if values else np.empty(0)
+
+
+def numbers_from_lists(field: str, values: list[Any], holes: bool = False) -> Array:
+    """As `array_from_lists`, for a list; with `holes`, None is NaN in lists three deep.
+
+    Raises:
+        InvalidRequest: Rows of different lengths, or something other than numbers.
+    """
+    # As objects: an array of text would give every element the room of the longest.
     try:
-        array = np.array(values) if values else np.empty(0)
+        array = np.array(values, dtype=object)
     except ValueError:
         raise InvalidRequest(
             field, "rows of different lengths", "Send rows of one length."
         ) from None
-    if array.dtype.kind not in "iuf":
-        bad = next((row for row in values if not _is_numbers(row)), values[0])
+    kinds = set(map(type, array.ravel().tolist()))
+    if list in kinds:
+        raise InvalidRequest(field, "rows of different lengths", "Send rows of one length.")
+    allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
+    if not kinds <= allowed:
+        bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
         raise InvalidRequest(field, brief(bad), "Send numbers only.")
-    return array
+    try:
+        return array.astype(np.int64 if kinds == {int} else np.float64)
+    except OverflowError:
+        bad = next(row for row in values if _holds(row, _too_large))
+        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
 
 
-def brief(value: object) -> str:
-    """A value as it goes into an error."""
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _is_numbers(value: object) -> bool:
+def _holds(value: object, of_kind: Callable[[object], bool]) -> bool:
+    """Whether any number in lists of any depth is of a kind."""
     if isinstance(value, list):
-        return all(_is_numbers(part) for part in value)
-    return type(value) in (int, float)
+        return any(_holds(part, of_kind) for part in value)
+    return of_kind(value)
+
+
+def _too_large(value: object) -> bool:
+    return isinstance(value, int) and not -(2**63) <= value < 2**63

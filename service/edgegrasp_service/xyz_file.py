@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 
-import numpy as np
-
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_service.point_records import numbers_from_words
 
 FIX = "Send lines of three numbers: x y z in metres. Normals and colours go into a .ply file."
 
@@ -23,16 +22,16 @@ def read_xyz(data: bytes, check_count: Callable[[int], None]) -> CloudInput:
     Raises:
         InvalidRequest: A line does not hold three numbers, or there is none.
     """
-    lines = [line.split() for line in data.splitlines()]
-    rows = [words for words in lines if words and not words[0].startswith(b"#")]
-    check_count(len(rows))
-    if not rows:
-        raise InvalidRequest("cloud", f"{len(data)} bytes without a line of an .xyz file", FIX)
-    for number, words in enumerate(lines, start=1):
-        if words and not words[0].startswith(b"#") and len(words) != 3:
-            value = f"line {number} with {len(words)} words in an .xyz file"
+    numbers: list[bytes] = []
+    for row, line in enumerate(data.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith(b"#"):
+            continue
+        if len(words) != 3:
+            value = f"line {row} with {len(words)} words in an .xyz file"
             raise InvalidRequest("cloud", value, FIX)
-    try:
-        return CloudInput(np.array(rows, dtype="S32").astype(np.float64))
-    except ValueError:
-        raise InvalidRequest("cloud", "text among the numbers of an .xyz file", FIX) from None
+        numbers += words
+    check_count(len(numbers) // 3)
+    if not numbers:
+        raise InvalidRequest("cloud", f"{len(data)} bytes without a line of an .xyz file", FIX)
+    return CloudInput(numbers_from_words(numbers, ".xyz").reshape(-1, 3))

@@ -1,0 +1,238 @@
+"""Fuzzing: short in `make test`, long in `make fuzz` (--hypothesis-profile=fuzz)."""
+
+import base64
+import io
+import tracemalloc
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+settings.register_profile(
+    "fuzz",
+    max_examples=2500,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3)).astype(np.float32)
+
+# What readers trip over: counts that promise much, signs, and numbers that are none.
+WORDS = [
+    b"0", b"-1", b"1", b"nan", b"inf", b"1e999", b"4294967295", b"999999999999999999",
+    b"9223372036854775808", b"\x00", b"\xff\xff\xff\xff", b"\x00\x00\x00\x80", b"\n", b"\r\n", b" ",
+    b"#", b"x", b"end_header\n", b"element vertex 1000000000\n", b"property list uchar int x\n",
+    b"POINTS 1000000000\n", b"WIDTH 0\n", b"HEIGHT 7\n", b"DATA binary_compressed\n", b"ascii",
+    b"(0, 3)", b"(-1, 3)", b"(99999999999, 3)", b"'|O'", b"'<f8'", b"True", b"PK\x03\x04",
+    "\u0663".encode(), b"_", b"1" * 400, b"x" * 5000,
+]  # fmt: skip
+
+
+def npy(array: np.ndarray, order: str = "C") -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, np.asarray(array, order=order))
+    return stream.getvalue()
+
+
+def npz(compressed: bool, **arrays: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+    return stream.getvalue()
+
+
+def ply(encoding: str) -> bytes:
+    header = f"ply\nformat {encoding} 1.0\ncomment a\nelement vertex {len(POINTS)}\n"
+    header += "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
+    header += "property uchar green\nproperty uchar blue\nend_header\n"
+    if encoding == "ascii":
+        rows = "\n".join(f"{x} {y} {z} 1 2 3" for x, y, z in POINTS.tolist())
+        return header.encode() + rows.encode()
+    order = "<" if "little" in encoding else ">"
+    record = np.zeros(len(POINTS), [(axis, f"{order}f4") for axis in "xyz"] + [("c", "u1", 3)])
+    for column, axis in enumerate("xyz"):
+        record[axis] = POINTS[:, column]
+    return header.encode() + record.tobytes()
+
+
+def pcd(encoding: str, height: int = 1) -> bytes:
+    header = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    header += f"WIDTH {len(POINTS) // height}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
+    header += f"POINTS {len(POINTS)}\nDATA {encoding}\n"
+    if encoding == "ascii":
+        rows = "\n".join(f"{x} {y} {z} 255" for x, y, z in POINTS.tolist())
+        return header.encode() + rows.encode()
+    record = np.concatenate([POINTS, np.zeros((len(POINTS), 1), np.float32)], axis=1)
+    if encoding == "binary":
+        return header.encode() + record.tobytes()
+    plain = np.ascontiguousarray(record.T).tobytes()
+    packed = lzf_literals(plain)
+    sizes = np.array([len(packed), len(plain)], "<u4").tobytes()
+    return header.encode() + sizes + packed
+
+
+def lzf_literals(plain: bytes) -> bytes:
+    """LZF without a back reference: runs of up to 32 bytes, each after its length less one."""
+    runs = (plain[start : start + 32] for start in range(0, len(plain), 32))
+    return b"".join(bytes([len(run) - 1]) + run for run in runs)
+
+
+FILES: dict[str, list[bytes]] = {
+    "npy": [
+        npy(POINTS), npy(POINTS.astype(">f8")), npy(POINTS, "F"), npy(POINTS.reshape(5, 8, 3)),
+        npy(np.zeros((0, 3))), npy(np.zeros(3, "i4,f8")),
+    ],
+    "npz": [
+        npz(False, points=POINTS), npz(True, points=POINTS, normals=POINTS),
+        npz(True, points=POINTS, segment_ids=np.arange(40), colors=POINTS),
+    ],
+    "ply": [ply("ascii"), ply("binary_little_endian"), ply("binary_big_endian")],
+    "pcd": [pcd("ascii"), pcd("binary"), pcd("binary", 4), pcd("binary_compressed")],
+    "xyz": ["\n".join(f"{x} {y} {z}" for x, y, z in POINTS.tolist()).encode(), b"# c\n0 0 0\n"],
+}  # fmt: skip
+
+
+@st.composite
+def mutated(draw: st.DrawFn, originals: list[bytes]) -> bytes:
+    """A good file with a few bytes changed, put in, cut out, doubled or exchanged for words."""
+    data = bytearray(draw(st.sampled_from(originals)))
+    for _ in range(draw(st.integers(1, 4))):
+        # Half of the changes go into the first 200 bytes, where headers are.
+        end = min(len(data), 200) if draw(st.booleans()) else len(data)
+        start = draw(st.integers(0, end))
+        stop = min(len(data), start + draw(st.integers(0, 30)))
+        match draw(st.integers(0, 4)):
+            case 0:
+                data[start:stop] = draw(st.sampled_from(WORDS))
+            case 1:
+                data[start:stop] = draw(st.binary(max_size=12))
+            case 2:
+                del data[start:]
+            case 3:
+                data[start:start] = data[start:stop]
+            case _ if start < len(data):
+                data[start] = draw(st.integers(0, 255))
+    return bytes(data)
+
+
+def files(file_format: str) -> st.SearchStrategy[bytes]:
+    return st.one_of(mutated(FILES[file_format]), st.binary(max_size=200))
+
+
+NUMBERS = st.one_of(
+    st.integers(-3, 300),
+    st.sampled_from([2**31, 2**53, 2**63, 2**64, 10**400, -(2**63), 0.1, 1e308, -0.0, 1e-320]),
+    st.floats(width=32),
+)
+SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    NUMBERS,
+    st.text(max_size=5),
+    st.sampled_from(["x", "z", "\ud800", "x" * 5000]),
+)
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.text(max_size=4) | st.just("\ud800"), inner, max_size=3)
+    ),
+    max_leaves=12,
+)
+LISTS = st.one_of(
+    VALUES,
+    st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=1, max_size=40),
+    st.lists(
+        st.lists(st.lists(NUMBERS | st.none(), min_size=3, max_size=3), min_size=2, max_size=2),
+        min_size=1,
+        max_size=4,
+    ),
+)
+
+
+def changed(good: dict[str, Any]) -> st.SearchStrategy[dict[str, Any]]:
+    """An object with some of its fields, at any depth, taken out or put to other values."""
+
+    @st.composite
+    def change(draw: st.DrawFn) -> dict[str, Any]:
+        found = copied(good)
+        for _ in range(draw(st.integers(1, 3))):
+            at: Any = found
+            while True:
+                keys = list(at) if isinstance(at, dict) else list(range(len(at)))
+                if not keys:
+                    break
+                key = draw(st.sampled_from(keys))
+                if isinstance(at[key], dict | list) and at[key] and draw(st.integers(0, 3)):
+                    at = at[key]
+                    continue
+                if isinstance(at, dict) and not draw(st.integers(0, 4)):
+                    del at[key]
+                else:
+                    at[key] = draw(VALUES | st.binary(max_size=8))
+                break
+        return found
+
+    return change()
+
+
+def copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: copied(part) for name, part in value.items()}
+    return [copied(part) for part in value] if isinstance(value, list) else value
+
+
+def base64_of(value: Any) -> str:
+    return base64.b64encode(value).decode()
+
+
+DEPTH_IMAGE = {
+    "depth": {
+        "height": 5, "width": 8, "encoding": "32FC1",
+        "data": np.linspace(0.4, 0.5, 40, dtype="<f4").tobytes(),
+    },
+    "intrinsics": {"fx": 20.0, "fy": 20.0, "cx": 3.5, "cy": 2.0},
+    "T_cloud_camera": np.eye(4).tolist(),
+}  # fmt: skip
+DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
+POINT_CLOUD2 = {
+    "height": 1, "width": 40, "is_bigendian": False, "point_step": 12, "row_step": 480,
+    "fields": [
+        {"name": name, "offset": 4 * row, "datatype": 7, "count": 1}
+        for row, name in enumerate("xyz")
+    ],
+    "data": POINTS.tobytes(),
+}  # fmt: skip
+
+
+@contextmanager
+def bounded_memory(allowed: int) -> Iterator[None]:
+    """Fail if more bytes are held at once, beyond those held before."""
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak <= allowed, f"{peak} bytes at once where {allowed} are allowed"
+
+
+def decodes_or_refuses(work: Callable[[], object], size: int, max_points: int) -> None:
+    """Run a decoder on `size` bytes; anything but an answer or an error of the table fails."""
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_service.errors import report
+
+    # Text costs most: a list and an object for each word; files unpack to five arrays at most.
+    allowed = 200 * size + 5 * (48 * max_points + 65536) + 2**20
+    with bounded_memory(allowed), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            work()
+        except EdgeGraspError as error:
+            problem = report(error)
+            assert 400 <= problem.status < 500, problem
+            problem.detail.encode()  # what cannot be encoded cannot be answered
+            assert len(problem.detail) < 2000, problem.detail[:200]
