@@ -11,6 +11,7 @@ from edgegrasp_client.async_client import AsyncGraspClient
 from edgegrasp_client.client import GraspClient
 from edgegrasp_client.depth_image import DepthImage, Intrinsics
 from edgegrasp_client.errors import (
+    AccessDeniedError,
     DeadlineError,
     GraspClientError,
     InvalidRequestError,
@@ -43,8 +44,10 @@ from edgegrasp_client.options import (
 )
 from edgegrasp_client.point_cloud2 import PointCloud2, PointField
 from edgegrasp_client.results import DebugInfo, Detection, Evaluation, Grasp, Model, Scoring
+from edgegrasp_client.security import Tls
 
 __all__ = [
+    "AccessDeniedError",
     "ApproachDirection",
     "AsyncGraspClient",
     "Box",
@@ -82,6 +85,7 @@ __all__ = [
     "SupportPlane",
     "Suppression",
     "Swing",
+    "Tls",
     "UnknownModelError",
     "Workspace",
 ]

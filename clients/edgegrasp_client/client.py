@@ -17,6 +17,7 @@ from edgegrasp_client.errors import DeadlineError
 from edgegrasp_client.inputs import Given, Inputs
 from edgegrasp_client.options import DetectOptions, plain_options
 from edgegrasp_client.results import Detection, Model, Scoring
+from edgegrasp_client.security import Tls, channel_credentials, ssl_context, token_metadata
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
@@ -29,6 +30,9 @@ class GraspClient:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
         timeout: Seconds for one call, unless the call says otherwise; over REST for each of
             connecting, sending and waiting.
+        token: For a server that asks for one; over TLS, or everyone on the way can read it.
+        tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
+            authorities that httpx knows.
         channel: gRPC channel to use instead of opening one; its owner closes it.
         http_transport: httpx transport to use instead of the network.
     """
@@ -38,15 +42,17 @@ class GraspClient:
         address: str = DEFAULT_ADDRESS,
         *,
         timeout: float = 30.0,
+        token: str | None = None,
+        tls: Tls | None = None,
         channel: grpc.Channel | None = None,
         http_transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
         self._transport: _Transport
         if is_rest(address):
-            self._transport = _RestTransport(address, http_transport)
+            self._transport = _RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = _GrpcTransport(address, channel)
+            self._transport = _GrpcTransport(address, token, tls, channel)
 
     def detect(
         self,
@@ -184,17 +190,27 @@ class _Transport(Protocol):
     def close(self) -> None: ...
 
 
+def _open_channel(address: str, tls: Tls | None) -> grpc.Channel:
+    if tls is None:
+        return grpc.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
+    credentials = channel_credentials(tls)
+    return grpc.secure_channel(address, credentials, grpc_wire.CHANNEL_OPTIONS)
+
+
 class _GrpcTransport:
-    def __init__(self, address: str, channel: grpc.Channel | None) -> None:
+    def __init__(
+        self, address: str, token: str | None, tls: Tls | None, channel: grpc.Channel | None
+    ) -> None:
         self._owned = channel is None
-        self._channel = channel or grpc.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
+        self._channel = channel or _open_channel(address, tls)
+        self._metadata = token_metadata(token)
         self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
 
     def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
         request = grpc_wire.request_message(inputs, options)
         try:
-            answer = self._stub.DetectGrasps(request, timeout=timeout)
+            answer = self._stub.DetectGrasps(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
             raise grpc_wire.error_from_call(error) from None
         return grpc_wire.detection_from_message(answer)
@@ -204,14 +220,15 @@ class _GrpcTransport:
     ) -> Scoring:
         request = grpc_wire.score_message(inputs, given, options)
         try:
-            answer = self._stub.ScoreGrasps(request, timeout=timeout)
+            answer = self._stub.ScoreGrasps(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
             raise grpc_wire.error_from_call(error) from None
         return grpc_wire.scoring_from_message(answer)
 
     def models(self, timeout: float) -> list[Model]:
         try:
-            answer = self._stub.ListModels(grasp_pb2.ListModelsRequest(), timeout=timeout)
+            request = grasp_pb2.ListModelsRequest()
+            answer = self._stub.ListModels(request, timeout=timeout, metadata=self._metadata)
         except grpc.RpcError as error:
             raise grpc_wire.error_from_call(error) from None
         return grpc_wire.models_from_message(answer)
@@ -228,8 +245,19 @@ class _GrpcTransport:
 
 
 class _RestTransport:
-    def __init__(self, address: str, transport: httpx.BaseTransport | None) -> None:
-        self._http = httpx.Client(base_url=address, transport=transport)
+    def __init__(
+        self,
+        address: str,
+        token: str | None,
+        tls: Tls | None,
+        transport: httpx.BaseTransport | None,
+    ) -> None:
+        self._http = httpx.Client(
+            base_url=address,
+            headers=dict(token_metadata(token)),
+            verify=ssl_context(tls),
+            transport=transport,
+        )
 
     def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
         post = rest_wire.detect_post(inputs, options)

@@ -4,6 +4,7 @@ GraspClientError
   + InvalidRequestError         the cloud or an option is wrong: field, value, fix
       + UnknownModelError       the server has no weights of that name
       + PayloadTooLargeError    the request exceeds the server's limits
+  + AccessDeniedError           no token, none the server knows, or one that is good for less
   + ServerUnavailableError      no connection, weights still loading, or the server is stopping
   + DeadlineError               no answer within the timeout
   + ServerFailedError           the server failed on a good request
@@ -40,6 +41,10 @@ class PayloadTooLargeError(InvalidRequestError):
     """The request exceeds the server's limits."""
 
 
+class AccessDeniedError(GraspClientError):
+    """The server asks for a token: there is none, it does not know it, or it is good for less."""
+
+
 class ServerUnavailableError(GraspClientError):
     """No connection, weights still loading, or the server is stopping; trying again may help."""
 
@@ -61,6 +66,10 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "unsupported-media-type": InvalidRequestError,
     "unknown-model": UnknownModelError,
     "payload-too-large": PayloadTooLargeError,
+    "headers-too-large": InvalidRequestError,
+    "unauthenticated": AccessDeniedError,
+    "permission-denied": AccessDeniedError,
+    "reload-failed": ServerFailedError,
     "decoder-missing": ServerFailedError,
     "detector-failed": ServerFailedError,
     "not-ready": ServerUnavailableError,

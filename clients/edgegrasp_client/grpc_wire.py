@@ -11,6 +11,7 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.cloud_encoding import cloud_file, packable
 from edgegrasp_client.depth_image import depth_image_fields
 from edgegrasp_client.errors import (
+    AccessDeniedError,
     DeadlineError,
     GraspClientError,
     InvalidRequestError,
@@ -50,6 +51,8 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineError,
     grpc.StatusCode.INVALID_ARGUMENT: InvalidRequestError,
     grpc.StatusCode.RESOURCE_EXHAUSTED: PayloadTooLargeError,
+    grpc.StatusCode.UNAUTHENTICATED: AccessDeniedError,
+    grpc.StatusCode.PERMISSION_DENIED: AccessDeniedError,
     grpc.StatusCode.UNAVAILABLE: ServerUnavailableError,
     grpc.StatusCode.CANCELLED: ServerUnavailableError,
     grpc.StatusCode.INTERNAL: ServerFailedError,
