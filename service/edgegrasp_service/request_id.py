@@ -6,8 +6,9 @@ from contextvars import ContextVar
 
 HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC metadata of both
 
-# Of the request that the running task works on; the edge of each transport sets it.
+# Of the request that the running task works on; the edge of each transport sets them.
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
+TRACEPARENT: ContextVar[str] = ContextVar("traceparent", default="")  # W3C trace context
 
 _USABLE = re.compile(r"[\w.:+/=@-]{1,128}", re.ASCII)
 

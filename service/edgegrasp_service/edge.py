@@ -1,0 +1,84 @@
+"""What is the same at the edge of both transports, before and after the service itself."""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from edgegrasp_service.errors import HeadersTooLarge
+from edgegrasp_service.metrics import Metrics
+from edgegrasp_service.request_id import HEADER, REQUEST_ID, TRACEPARENT, usable_request_id
+from edgegrasp_service.tokens import Tokens
+
+MAX_HEADERS = 64
+
+logger = logging.getLogger("edgegrasp_service.requests")
+
+
+@dataclass
+class Answered:
+    """How a request ends; the transport fills in the code."""
+
+    code: str
+    long: bool = False  # a stream, whose duration says nothing
+
+
+class Edge:
+    """Who may ask, what a request is called, and what is counted and logged of it.
+
+    Attributes:
+        tokens: Replaced when they are read anew.
+        draining: Whether the server is stopping.
+    """
+
+    def __init__(self, tokens: Tokens, metrics: Metrics) -> None:
+        self.tokens = tokens
+        self.metrics = metrics
+        self.draining = False
+        self.unanswered = 0  # streams are not counted: they may never end
+
+    @contextmanager
+    def request(
+        self, transport: str, method: str, headers: dict[str, str], answered: Answered
+    ) -> Iterator[str]:
+        """Name, count and log one request.
+
+        Args:
+            transport: "grpc" or "http".
+            method: For metrics and the log.
+            headers: By their lower-case names.
+            answered: Read when the request ends.
+
+        Yields:
+            The request's id.
+        """
+        request_id = usable_request_id(headers.get(HEADER))
+        REQUEST_ID.set(request_id)  # of the request's own task
+        TRACEPARENT.set(headers.get("traceparent", ""))
+        start = time.monotonic()
+        self._count(answered, 1)
+        try:
+            yield request_id
+        finally:
+            self._count(answered, -1)
+            seconds = time.monotonic() - start
+            timed = None if answered.long else seconds
+            self.metrics.request(transport, method, answered.code, timed)
+            fields = {"transport": transport, "method": method, "code": answered.code}
+            logger.info("request", extra={"fields": fields | {"seconds": round(seconds, 6)}})
+
+    def _count(self, answered: Answered, change: int) -> None:
+        if not answered.long:
+            self.unanswered += change
+            self.metrics.in_flight(change)
+
+
+def check_count(count: int, kind: str) -> None:
+    """Pass where there are not too many headers; the libraries below limit their size.
+
+    Raises:
+        HeadersTooLarge: There are more than MAX_HEADERS.
+    """
+    if count > MAX_HEADERS:
+        raise HeadersTooLarge(kind, f"{count} entries", f"Send at most {MAX_HEADERS}.")

@@ -1,0 +1,133 @@
+"""The edge of the gRPC transport: tokens, request ids, metrics, and a log line for each request."""
+
+import asyncio
+import inspect
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Any
+
+import grpc
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.edge import Answered, Edge, check_count
+from edgegrasp_service.errors import ServiceError, report
+from edgegrasp_service.grpc_messages import error_message
+from edgegrasp_service.request_id import HEADER
+from edgegrasp_service.tokens import HEADER as AUTHORIZATION
+
+ERROR_METADATA = "edgegrasp-error-bin"
+HEALTH = "grpc.health.v1.Health"
+
+_SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
+
+# Values of the label `method`.
+METHODS = {
+    **{f"/{_SERVICE.full_name}/{name}": name for name in _SERVICE.methods_by_name},
+    **{f"/{HEALTH}/{name}": f"Health{name}" for name in ("Check", "Watch", "List")},
+    "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo": "Reflection",
+}
+
+Handler = Any  # grpc.RpcMethodHandler, of which the stubs know no fields
+
+
+class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in its stubs only
+    """Interceptor before every method, those of health checks and reflection included."""
+
+    def __init__(self, edge: Edge) -> None:
+        self._edge = edge
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> Handler:
+        """The method's handler, named, counted and logged; or one that refuses."""
+        path: str = handler_call_details.method
+        entries = list(handler_call_details.invocation_metadata or ())
+        headers = {name: value for name, value in entries if isinstance(value, str)}
+        method = METHODS.get(path, "other")
+        try:
+            check_count(len(entries), "metadata")
+            if not path.startswith(f"/{HEALTH}/"):
+                admin = method == "ReloadModels"
+                self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)
+        except ServiceError as error:
+            # As a stream, it refuses before the request is read.
+            return self._around_writer(method, headers, refusal(error), "stream_stream", None)
+        handler = await continuation(handler_call_details)
+        if handler is None:
+            self._edge.metrics.request("grpc", method, "UNIMPLEMENTED", None)
+            return None
+        kinds = ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
+        kind = next(kind for kind in kinds if getattr(handler, kind) is not None)
+        behavior = getattr(handler, kind)
+        if inspect.isasyncgenfunction(behavior):
+            return self._around_generator(method, headers, behavior, kind, handler)
+        return self._around_writer(method, headers, behavior, kind, handler)
+
+    def _around_writer(
+        self, method: str, headers: dict[str, str], behavior: Any, kind: str, handler: Handler
+    ) -> Handler:
+        """A handler that returns its answer, or writes it to the context."""
+
+        async def named(request: Any, context: Any) -> Any:
+            answered = Answered("UNKNOWN", long=not kind.endswith("unary"))
+            with self._edge.request("grpc", method, headers, answered) as request_id:
+                try:
+                    await context.send_initial_metadata(((HEADER, request_id),))
+                    answer = await behavior(request, context)
+                    answered.code = "OK"
+                except BaseException as error:
+                    answered.code = _code(error, context)
+                    raise
+                return answer
+
+        return _handler(kind, named, handler)
+
+    def _around_generator(
+        self, method: str, headers: dict[str, str], behavior: Any, kind: str, handler: Handler
+    ) -> Handler:
+        """A handler that yields its answers."""
+
+        async def named(request: Any, context: Any) -> AsyncIterator[Any]:
+            answered = Answered("UNKNOWN", long=True)
+            with self._edge.request("grpc", method, headers, answered) as request_id:
+                try:
+                    await context.send_initial_metadata(((HEADER, request_id),))
+                    async for answer in behavior(request, context):
+                        yield answer
+                    answered.code = "OK"
+                except BaseException as error:
+                    answered.code = _code(error, context)
+                    raise
+
+        return _handler(kind, named, handler)
+
+
+def refusal(error: Exception) -> Callable[[Any, Any], Awaitable[None]]:
+    """A behaviour that aborts with an error."""
+
+    async def refuse(request: Any, context: Any) -> None:
+        problem = report(error)
+        detail = error_message(problem).SerializeToString()
+        await context.abort(problem.code, problem.detail, ((ERROR_METADATA, detail),))
+
+    return refuse
+
+
+def _code(error: BaseException, context: Any) -> str:
+    if isinstance(error, asyncio.CancelledError | GeneratorExit):
+        return "CANCELLED"
+    code = context.code()
+    return code.name if isinstance(code, grpc.StatusCode) else "UNKNOWN"
+
+
+def _handler(kind: str, behavior: Any, original: Handler) -> Handler:
+    make = getattr(grpc, f"{kind}_rpc_method_handler")
+    if original is None:
+        return make(behavior)
+    return make(
+        behavior,
+        request_deserializer=original.request_deserializer,
+        response_serializer=original.response_serializer,
+    )
