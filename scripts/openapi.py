@@ -16,7 +16,7 @@ NAME = "openapi.json"
 
 def document() -> str:
     """The document; no limit of a server is in it."""
-    app = create_app(GraspService(DummyCatalogue, max_points=1), max_body_bytes=1)
+    app = create_app(GraspService(DummyCatalogue))
     return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
 
 

@@ -1,6 +1,6 @@
 """What the service needs of whatever finds grasps: the weights' catalogue, or the dummy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -11,11 +11,49 @@ from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.settings import Settings
 
 
-class Detector(Protocol):
-    """Finds grasps in a cloud with one set of weights."""
+class Batch(Protocol):
+    """What the network is to score."""
 
-    def detect(self, cloud: CloudInput, options: DetectOptions) -> Detection:
-        """Find grasps; raises InvalidRequest for a cloud that does not suit."""
+    @property
+    def num_balls(self) -> int:
+        """Balls."""
+
+    @property
+    def points(self) -> Sized:
+        """Points of all balls."""
+
+    @property
+    def contact(self) -> Sized:
+        """What of each candidate; the network gives a logit for each."""
+
+    @staticmethod
+    def concatenate(batches: Sequence[Any]) -> Any:
+        """One batch of several, in order."""
+
+
+class Prepared(Protocol):
+    """A request between the stages."""
+
+    @property
+    def batch(self) -> Batch | None:
+        """None: there is nothing to score."""
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Spent in each stage."""
+
+
+class Detector(Protocol):
+    """Finds grasps in a cloud with one set of weights, in three stages; of any thread."""
+
+    def prepare(self, cloud: CloudInput, options: DetectOptions) -> Prepared:
+        """What comes before the network; raises InvalidRequest for a cloud that does not suit."""
+
+    def run(self, batch: Any) -> NDArray[Any]:
+        """The network: a logit for each candidate of a batch, of one request or of several."""
+
+    def finish(self, prepared: Any, logits: NDArray[Any]) -> Detection:
+        """What comes after the network."""
 
     def score(
         self,
@@ -25,7 +63,7 @@ class Detector(Protocol):
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
     ) -> Scoring:
-        """Score edges (M, 2) or hand poses (M, 4, 4); raises InvalidRequest as `detect`."""
+        """Score edges (M, 2) or hand poses (M, 4, 4); raises InvalidRequest as `prepare`."""
 
 
 class Catalogue(Protocol):

@@ -65,6 +65,11 @@ class Call:
         """Whether nobody waits for the answer any more."""
         return self._cancelled.is_set()
 
+    @property
+    def over(self) -> bool:
+        """Whether an answer would come in vain: cancelled, or after the deadline."""
+        return self.cancelled or (self.remaining is not None and self.remaining <= 0.0)
+
     def limit(self, timeout: float) -> None:
         """Bring the deadline forward to `timeout` seconds after it came in, if it is later."""
         deadline = self._start + timeout
@@ -83,7 +88,7 @@ class Call:
         """
         if self.cancelled:
             raise Cancelled("The caller cancelled the request.")
-        if self.remaining is not None and self.remaining <= 0.0:
+        if self.over:
             raise deadline_exceeded()
 
 

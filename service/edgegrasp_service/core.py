@@ -1,23 +1,39 @@
-"""The service itself, without a transport: decode, detect in the worker thread, answer."""
+"""The service itself, without a transport: admit, decode, prepare, network, finish."""
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
 
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_service.admission import Admission, Place
 from edgegrasp_service.backend import Catalogue, Detector
-from edgegrasp_service.errors import DetectorFailed, NotReady
+from edgegrasp_service.batching import BatchPolicy
+from edgegrasp_service.call import Call, deadline_exceeded
+from edgegrasp_service.errors import (
+    STOPPING,
+    DetectorFailed,
+    NotReady,
+    PayloadTooLarge,
+    WorkerLost,
+)
 from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.network_worker import LOST, NetworkWorker, out_of_memory
+from edgegrasp_service.observer import Observer
 from edgegrasp_service.sent_cloud import SentCloud, decode_cloud
+from edgegrasp_service.settings import Settings
 
 logger = logging.getLogger(__name__)
 
+Result = TypeVar("Result")
 Answer = TypeVar("Answer", Detection, Scoring)
 
 
@@ -52,21 +68,40 @@ class ModelInfo:
 
 
 class GraspService:
-    """Answers requests with the detectors of one catalogue, one detection at a time.
+    """Answers requests with the detectors of one catalogue.
+
+    Clouds are decoded and prepared, and grasps ranked, in pools of threads; one thread runs the
+    networks. Every stage begins only where the answer is still wanted.
 
     Args:
-        load: Makes the catalogue; called in the worker thread by `start`.
-        max_points: Most points accepted in a cloud.
+        load: Makes the catalogue; called by `start` and `reload`, in a thread.
+        settings: Its bounds and how it batches.
+        observer: Told of what happens.
     """
 
-    def __init__(self, load: Callable[[], Catalogue], max_points: int) -> None:
+    def __init__(
+        self,
+        load: Callable[[], Catalogue],
+        settings: Settings | None = None,
+        observer: Observer | None = None,
+    ) -> None:
+        self.settings = settings or Settings()
+        self.observer = observer or Observer()
+        self.stopping = asyncio.Event()  # set: new requests are refused
         self._load = load
-        self._max_points = max_points
         self._catalogue: Catalogue | None = None
-        self._draining = False
-        # Decoding a large file should not delay a detection, nor wait for one to fail.
-        self._decoders = ThreadPoolExecutor(2, thread_name_prefix="decode")
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="detect")
+        self._admission = Admission(
+            self.settings.max_concurrent_requests, self.settings.max_queue_length, self.observer
+        )
+        # Decoding a large file should not delay another's cloud, nor ranking wait for either.
+        threads = self.settings.prepare_threads
+        self._pools = {
+            "decode": ThreadPoolExecutor(threads, thread_name_prefix="decode"),
+            "prepare": ThreadPoolExecutor(threads, thread_name_prefix="prepare"),
+            "finish": ThreadPoolExecutor(1, thread_name_prefix="finish"),
+        }
+        self._closed = False
+        self._worker = NetworkWorker(BatchPolicy.from_settings(self.settings), self.observer)
 
     async def start(self) -> None:
         """Load and warm up; ready once this returns.
@@ -74,36 +109,85 @@ class GraspService:
         Raises:
             EdgeGraspError: Weights cannot be used.
         """
+        self._worker.start()
+        await self.reload()
+
+    async def reload(self) -> None:
+        """Load anew and warm up; requests that come after that get what was loaded.
+
+        Those that are in the server finish with what they began with.
+
+        Raises:
+            EdgeGraspError: Weights cannot be used; those at hand stay in use.
+        """
         loop = asyncio.get_running_loop()
-        self._catalogue = await loop.run_in_executor(self._worker, self._load_and_warm_up)
+        self._catalogue = await loop.run_in_executor(None, self._load_and_warm_up)
 
     @property
     def ready(self) -> bool:
         """Whether requests are answered."""
-        return self._catalogue is not None and not self._draining
+        return self._catalogue is not None and not self.stopping.is_set()
 
-    def drain(self) -> None:
+    def stop_accepting(self) -> None:
         """Refuse new requests; those accepted still finish."""
-        self._draining = True
+        self.stopping.set()
+
+    async def drain(self, grace: float) -> bool:
+        """Refuse new requests, and wait for those accepted.
+
+        Args:
+            grace: Seconds to wait at most.
+
+        Returns:
+            Whether every one of them has ended.
+        """
+        self.stop_accepting()
+        try:
+            async with asyncio.timeout(grace):
+                await self._admission.empty()
+        except TimeoutError:
+            return False
+        return True
 
     def close(self) -> None:
-        """Stop the threads once what they run now is done; what waits is dropped."""
-        self._decoders.shutdown(wait=False, cancel_futures=True)
-        self._worker.shutdown(wait=False, cancel_futures=True)
+        """Stop the threads once what they run now is done; what waits fails as not ready."""
+        self._closed = True
+        for pool in self._pools.values():
+            pool.shutdown(wait=False, cancel_futures=True)
+        self._worker.close()
 
-    async def detect(self, request: DetectRequest) -> Detection:
+    def admit(self, call: Call) -> Place:
+        """Take a place for a call, a context manager; before anything is read of it.
+
+        Raises:
+            NotReady: Weights are not loaded yet, or the server is stopping.
+            Overloaded: There is no place, or its turn would come too late.
+        """
+        self._ready_catalogue()
+        call.limit(self.settings.max_request_seconds)
+        call.check()
+        return self._admission.enter(call)
+
+    async def detect(self, request: DetectRequest, place: Place) -> Detection:
         """Find grasps.
 
         Raises:
             EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
         """
 
-        def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Detection:
-            return detector.detect(cloud, options)
+        async def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Detection:
+            call = place.call
+            prepared = await self._stage(call, "prepare", detector.prepare, cloud, options)
+            logits, seconds = np.empty(0, np.float32), 0.0
+            if prepared.batch is not None:
+                scored = self._worker.score(call, detector, prepared.batch)
+                logits, seconds = await asyncio.wrap_future(scored)
+            prepared.seconds["network"] = seconds
+            return await self._stage(call, "finish", detector.finish, prepared, logits)
 
-        return await self._answer(request, work)
+        return await self._answer(request, place, work)
 
-    async def score(self, request: ScoreRequest) -> Scoring:
+    async def score(self, request: ScoreRequest, place: Place) -> Scoring:
         """Score edges or hand poses that the caller gives.
 
         Raises:
@@ -111,30 +195,80 @@ class GraspService:
         """
         request.given.check()
         edges, hand_poses = request.given.edges, request.given.hand_poses
+        for name, given in vars(request.given).items():
+            _limit(name, 0 if given is None else len(given), self.settings.max_candidates)
 
-        def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Scoring:
-            return detector.score(cloud, options, edges=edges, hand_poses=hand_poses)
+        async def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Scoring:
+            def score() -> Scoring:
+                return detector.score(cloud, options, edges=edges, hand_poses=hand_poses)
 
-        return await self._answer(request, work)
+            scoring: Scoring = await asyncio.wrap_future(self._worker.run(place.call, score))
+            return scoring
+
+        return await self._answer(request, place, work)
 
     async def _answer(
-        self, request: DetectRequest, work: Callable[[Detector, CloudInput, DetectOptions], Answer]
+        self,
+        request: DetectRequest,
+        place: Place,
+        work: Callable[[Detector, CloudInput, DetectOptions], Coroutine[Any, Any, Answer]],
     ) -> Answer:
-        """Decode a request, then do the work in the worker thread."""
-        catalogue = self._ready_catalogue()
+        """Decode a request and do the work, in its turn and before its deadline."""
+        call = place.call
         options = parse_options(dict(request.options))
-        detector = catalogue.get(options.model)
-        loop = asyncio.get_running_loop()
+        _limit("options.num_approach_points", options.num_approach_points, self.settings.max_balls)
+        _limit("options.num_candidates", options.num_candidates, self.settings.max_candidates)
+        assert self._catalogue is not None  # or there would be no place
+        detector = self._catalogue.get(options.model)
+
+        async def decode_and_work() -> Answer:
+            self.observer.stage(call, "admission", call.seconds)
+            try:
+                cloud, chosen = await self._stage(
+                    call,
+                    "decode",
+                    decode_cloud,
+                    request.cloud,
+                    options,
+                    self.settings.max_points,
+                )
+                return await work(detector, cloud, chosen)
+            except EdgeGraspError:
+                raise
+            except Exception as error:
+                logger.exception("%s failed on %s", call.request_id, _describe(options))
+                if out_of_memory(error):
+                    raise WorkerLost(LOST) from None
+                raise DetectorFailed("The detector failed; the server's log says why.") from None
+
+        answer = await in_time(call, place.begin(decode_and_work))
+        self.observer.answered(call, answer)
+        return answer
+
+    async def _stage(
+        self, call: Call, name: str, work: Callable[..., Result], *args: object
+    ) -> Result:
+        """Do something in the pool of a stage, if the answer is still wanted then."""
+
+        def checked() -> Result:
+            call.check()
+            start = time.perf_counter()
+            try:
+                return work(*args)
+            except Exception:
+                raise
+            except BaseException:  # a SystemExit would end the event loop that waits for this
+                logger.exception("the stage %s was ended", name)
+                raise WorkerLost(LOST) from None
+            finally:
+                self.observer.stage(call, name, time.perf_counter() - start)
+
         try:
-            cloud, options = await loop.run_in_executor(
-                self._decoders, decode_cloud, request.cloud, options, self._max_points
-            )
-            return await loop.run_in_executor(self._worker, work, detector, cloud, options)
-        except EdgeGraspError:
-            raise
-        except Exception:
-            logger.exception("the detector failed on %s", _describe(options))
-            raise DetectorFailed("The detector failed; the server's log says why.") from None
+            return await asyncio.wrap_future(self._pools[name].submit(checked))
+        except (RuntimeError, asyncio.CancelledError):
+            if not self._closed:
+                raise
+            raise NotReady(STOPPING) from None
 
     def models(self) -> list[ModelInfo]:
         """The weights a request can name.
@@ -149,8 +283,8 @@ class GraspService:
         ]
 
     def _ready_catalogue(self) -> Catalogue:
-        if self._draining:
-            raise NotReady("The server is stopping. Try another one.")
+        if self.stopping.is_set():
+            raise NotReady(STOPPING)
         if self._catalogue is None:
             raise NotReady("Weights are still loading. Try again in some seconds.")
         return self._catalogue
@@ -159,6 +293,28 @@ class GraspService:
         catalogue = self._load()
         catalogue.warm_up()
         return catalogue
+
+
+async def in_time(call: Call, work: Coroutine[Any, Any, Result]) -> Result:
+    """Wait for something until the deadline of a call.
+
+    Raises:
+        DeadlineExceeded: It took longer; the call is cancelled.
+    """
+    try:
+        async with asyncio.timeout(call.remaining):
+            return await work
+    except TimeoutError:
+        call.cancel()
+        raise deadline_exceeded() from None
+    except asyncio.CancelledError:
+        call.cancel()
+        raise
+
+
+def _limit(field: str, asked: int, most: int) -> None:
+    if asked > most:
+        raise PayloadTooLarge(field, str(asked), f"This server takes at most {most}.")
 
 
 def _describe(options: DetectOptions) -> str:

@@ -1,7 +1,9 @@
 """A detector of known service time and made-up grasps, to measure and test the service alone."""
 
 import time
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,14 +29,57 @@ GRASPS = 10  # made at most
 WARNING = "The dummy detector made these grasps up."
 
 
+@dataclass(frozen=True)
+class DummyBatch:
+    """What the dummy network scores, of one request or of several."""
+
+    points: Float32  # (A, 3) approach points, each the only point of its ball
+    contact: Float32  # (A,) scores, which the network gives back
+    requests: int = 1
+
+    @property
+    def num_balls(self) -> int:
+        """Balls."""
+        return len(self.points)
+
+    @staticmethod
+    def concatenate(batches: Sequence["DummyBatch"]) -> "DummyBatch":
+        """Join batches into one."""
+        return DummyBatch(
+            np.concatenate([batch.points for batch in batches]),
+            np.concatenate([batch.contact for batch in batches]),
+            sum(batch.requests for batch in batches),
+        )
+
+
+@dataclass(frozen=True)
+class DummyPrepared:
+    """A request between the stages."""
+
+    options: DetectOptions
+    points: Float32  # (N, 3)
+    drawn: NDArray[np.int64]  # (A,) approach points, rows of `points`
+    batch: DummyBatch
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
 class DummyDetector:
-    """Puts top-down grasps on points drawn by the seed; they hold nothing."""
+    """Puts top-down grasps on points drawn by the seed; they hold nothing.
 
-    def __init__(self, seconds: float = 0.0) -> None:
+    Args:
+        seconds: What the network takes for one request; as much for each that share a pass.
+        begin: Called as "prepare", "run", "finish" and "score" begin, with what they work on. It
+            may wait, or raise: tests of the service do both.
+    """
+
+    def __init__(
+        self, seconds: float = 0.0, begin: Callable[[str, object], None] | None = None
+    ) -> None:
         self._seconds = seconds
+        self._begin = begin or (lambda stage, subject: None)
 
-    def detect(self, cloud: CloudInput, options: DetectOptions) -> Detection:
-        """Make up grasps, the same ones for the same cloud and options.
+    def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
+        """Draw approach points, the same ones for the same cloud and options.
 
         Args:
             cloud: As for a real detector.
@@ -43,24 +88,36 @@ class DummyDetector:
         Raises:
             InvalidRequest: The cloud is none, as for a real detector.
         """
-        start = time.perf_counter()
+        self._begin("prepare", cloud)
         points = check_cloud(cloud, options.num_approach_points).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), options.num_approach_points, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
+        return DummyPrepared(options, points, drawn, DummyBatch(points[drawn], scores))
+
+    def run(self, batch: DummyBatch) -> Float32:
+        """Take the time of a network."""
+        self._begin("run", batch)
+        time.sleep(self._seconds * batch.requests)
+        return batch.contact
+
+    def finish(self, prepared: DummyPrepared, logits: NDArray[Any]) -> Detection:
+        """Put a grasp on each of the best approach points."""
+        self._begin("finish", prepared)
+        options, points, drawn = prepared.options, prepared.points, prepared.drawn
         grasps = [
             _top_down(points[row], float(score))
-            for row, score in zip(drawn[:GRASPS], scores[:GRASPS], strict=True)
+            for row, score in zip(drawn[:GRASPS], logits[:GRASPS], strict=True)
             if score >= options.min_score
         ][: options.top_k]
-        time.sleep(self._seconds)
+        counts = {"points": len(points), "scored": len(drawn), "returned": len(grasps)}
         return Detection(
             grasps=grasps,
-            counts={"points": len(points), "scored": len(drawn), "returned": len(grasps)},
-            seconds={"total": time.perf_counter() - start},
+            counts=counts | {"crc32": zlib.crc32(points.tobytes())},
+            seconds=prepared.seconds | {"total": sum(prepared.seconds.values())},
             model=NAME,
             warnings=[WARNING],
-            debug=_debug(points, drawn, scores) if options.debug else None,
+            debug=_debug(points, drawn, logits) if options.debug else None,
         )
 
     def score(
@@ -77,6 +134,7 @@ class DummyDetector:
             InvalidRequest: The cloud is none, or an edge names a row that it does not have.
         """
         start = time.perf_counter()
+        self._begin("score", cloud)
         checked = check_cloud(cloud)
         random = np.random.default_rng(options.seed)
         if edges is not None:
@@ -111,8 +169,10 @@ class DummyDetector:
 class DummyCatalogue:
     """The dummy detector as the only weights."""
 
-    def __init__(self, seconds: float = 0.0) -> None:
-        self._detector = DummyDetector(seconds)
+    def __init__(
+        self, seconds: float = 0.0, begin: Callable[[str, object], None] | None = None
+    ) -> None:
+        self._detector = DummyDetector(seconds, begin)
 
     def get(self, name: str = "") -> DummyDetector:
         """The detector; raises UnknownModel for any name but its own."""

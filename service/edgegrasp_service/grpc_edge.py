@@ -11,11 +11,10 @@ from grpc import aio
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.edge import Answered, Edge, check_count
 from edgegrasp_service.errors import ServiceError, report
-from edgegrasp_service.grpc_messages import error_message
+from edgegrasp_service.grpc_messages import ERROR_METADATA, error_message
 from edgegrasp_service.request_id import HEADER
 from edgegrasp_service.tokens import HEADER as AUTHORIZATION
 
-ERROR_METADATA = "edgegrasp-error-bin"
 HEALTH = "grpc.health.v1.Health"
 
 _SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]

@@ -18,6 +18,8 @@ from edgegrasp_service.option_messages import (
 from edgegrasp_service.sent_arrays import PER_POINT, PackedArray
 from edgegrasp_service.sent_cloud import DepthCloud, FileCloud, PackedCloud, RosCloud, SentCloud
 
+ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
+
 
 def request_from_message(message: grasp_pb2.DetectGraspsRequest) -> DetectRequest:
     """Take a request apart.
@@ -121,8 +123,26 @@ def models_message(models: list[ModelInfo]) -> grasp_pb2.ListModelsResponse:
 def error_message(problem: ErrorReport) -> grasp_pb2.ErrorDetail:
     """An error as the message in the trailing metadata."""
     return grasp_pb2.ErrorDetail(
-        kind=problem.kind, field=problem.field, value=problem.value, fix=problem.fix
+        kind=problem.kind,
+        field=problem.field,
+        value=problem.value,
+        fix=problem.fix,
+        retry_after=problem.retry_after,
     )
+
+
+def stream_response(
+    request_id: str, answer: Detection | ErrorReport
+) -> grasp_pb2.DetectGraspsStreamResponse:
+    """The answer to one request of a stream."""
+    if isinstance(answer, Detection):
+        return grasp_pb2.DetectGraspsStreamResponse(
+            request_id=request_id, detection=detection_message(answer)
+        )
+    error = grasp_pb2.StreamError(
+        code=answer.code.value[0], message=answer.detail, detail=error_message(answer)
+    )
+    return grasp_pb2.DetectGraspsStreamResponse(request_id=request_id, error=error)
 
 
 def _grasp_message(grasp: Grasp) -> grasp_pb2.Grasp:

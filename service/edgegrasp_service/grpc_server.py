@@ -1,46 +1,50 @@
 """The gRPC transport: servicer, health, reflection."""
 
 import logging
+from collections.abc import AsyncIterator, Sequence
 from typing import Any, NoReturn
 
-from google.protobuf.message import Message
+import grpc
 from grpc import aio
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_service.body_limit import MAX_DROPPED_BYTES, too_large
+from edgegrasp_service.body_limit import MAX_DROPPED_BYTES
+from edgegrasp_service.call import Call
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.errors import AddressInUse, report
+from edgegrasp_service.grpc_edge import GrpcEdge
 from edgegrasp_service.grpc_messages import (
+    ERROR_METADATA,
     detection_message,
     error_message,
     models_message,
-    request_from_message,
     score_request_from_message,
     scoring_message,
 )
+from edgegrasp_service.grpc_stream import answer_stream, check_size, detect
+from edgegrasp_service.observer import observed
+from edgegrasp_service.request_id import REQUEST_ID
 
 logger = logging.getLogger(__name__)
 
 SERVICE_NAME = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"].full_name
-ERROR_METADATA = "edgegrasp-error-bin"
 
 
 class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
     """edgegrasp.v1.GraspService over a service core."""
 
-    def __init__(self, service: GraspService, max_body_bytes: int) -> None:
+    def __init__(self, service: GraspService) -> None:
         self._service = service
-        self._max_body_bytes = max_body_bytes
 
     async def DetectGrasps(  # noqa: N802
         self, request: grasp_pb2.DetectGraspsRequest, context: Any
     ) -> grasp_pb2.DetectGraspsResponse:
         """Find grasps in one cloud."""
+        call = _call("DetectGrasps", context)
         try:
-            self._check_size(request)
-            return detection_message(await self._service.detect(request_from_message(request)))
+            return detection_message(await detect(self._service, request, call))
         except Exception as error:
             await _abort(context, error)
 
@@ -48,9 +52,22 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         self, request: grasp_pb2.ScoreGraspsRequest, context: Any
     ) -> grasp_pb2.ScoreGraspsResponse:
         """Score given edges or hand poses."""
+        call = _call("ScoreGrasps", context)
         try:
-            self._check_size(request)
-            return scoring_message(await self._service.score(score_request_from_message(request)))
+            with observed(self._service.observer, call), self._service.admit(call) as place:
+                check_size(request, self._service.settings.max_body_bytes)
+                asked = score_request_from_message(request)
+                return scoring_message(await self._service.score(asked, place))
+        except Exception as error:
+            await _abort(context, error)
+
+    async def DetectGraspsStream(  # noqa: N802
+        self, request_iterator: AsyncIterator[grasp_pb2.DetectGraspsStreamRequest], context: Any
+    ) -> AsyncIterator[grasp_pb2.DetectGraspsStreamResponse]:
+        """Find grasps in one cloud after the other."""
+        try:
+            async for answer in answer_stream(self._service, request_iterator):
+                yield answer
         except Exception as error:
             await _abort(context, error)
 
@@ -63,10 +80,6 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         except Exception as error:
             await _abort(context, error)
 
-    def _check_size(self, request: Message) -> None:
-        if (size := request.ByteSize()) > self._max_body_bytes:
-            raise too_large(size, self._max_body_bytes)
-
 
 class GrpcServer:
     """A grpc.aio server with the grasp service, health checks and reflection.
@@ -77,26 +90,49 @@ class GrpcServer:
         service: The core.
         host: Address to bind to.
         port: 0: any free port.
-        max_body_bytes: Largest request message accepted.
+        interceptors: Around every method, the first outermost.
+        credentials: For TLS; None: without.
 
     Raises:
         AddressInUse: The port cannot be bound.
     """
 
-    def __init__(self, service: GraspService, host: str, port: int, max_body_bytes: int) -> None:
+    def __init__(
+        self,
+        service: GraspService,
+        host: str,
+        port: int,
+        *,
+        interceptors: Sequence[GrpcEdge] = (),
+        credentials: grpc.ServerCredentials | None = None,
+    ) -> None:
         # Messages somewhat over the limit come in to be refused with field, value and fix.
-        longest = max_body_bytes + MAX_DROPPED_BYTES
-        options = [("grpc.max_receive_message_length", longest), ("grpc.so_reuseport", 0)]
-        self._server = aio.server(options=options)
+        longest = service.settings.max_body_bytes + MAX_DROPPED_BYTES
+        most_metadata = service.settings.max_header_bytes
+        options = [
+            ("grpc.max_receive_message_length", longest),
+            ("grpc.max_metadata_size", most_metadata),
+            ("grpc.absolute_max_metadata_size", most_metadata),
+            # What is compressed is unpacked before its length is known: none of it.
+            ("grpc.compression_enabled_algorithms_bitset", 1),
+            ("grpc.so_reuseport", 0),
+            # A client that vanished without a word is found out, and its streams end.
+            ("grpc.keepalive_time_ms", 30_000),
+            ("grpc.keepalive_timeout_ms", 10_000),
+        ]
+        self._server = aio.server(interceptors=interceptors, options=options)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        servicer = GraspServicer(service, max_body_bytes)
+        servicer = GraspServicer(service)
         grasp_pb2_grpc.add_GraspServiceServicer_to_server(servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, self._server)
         address = f"[{host}]" if ":" in host else host
         try:
-            self.port = self._server.add_insecure_port(f"{address}:{port}")
+            if credentials is None:
+                self.port = self._server.add_insecure_port(f"{address}:{port}")
+            else:
+                self.port = self._server.add_secure_port(f"{address}:{port}", credentials)
         except RuntimeError as error:
             raise AddressInUse(f"gRPC: cannot listen on {address}:{port} ({error})") from None
         self.address = f"{address}:{self.port}"
@@ -113,10 +149,18 @@ class GrpcServer:
         for name in ("", SERVICE_NAME):
             await self._health.set(name, status)
 
+    async def stop_serving(self) -> None:
+        """Tell health checks that the server is stopping."""
+        await self._health.enter_graceful_shutdown()
+
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
-        await self._health.enter_graceful_shutdown()
         await self._server.stop(grace_seconds)
+
+
+def _call(method: str, context: Any) -> Call:
+    timeout: float | None = context.time_remaining()
+    return Call("grpc", method, request_id=REQUEST_ID.get(), timeout=timeout)
 
 
 async def _abort(context: Any, error: Exception) -> NoReturn:

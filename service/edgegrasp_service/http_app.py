@@ -1,17 +1,22 @@
 """The HTTP transport: routes, problem documents, probes."""
 
+import asyncio
 import http
 import logging
-from typing import Any
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, TypeVar
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from edgegrasp_model.errors import EdgeGraspError
+from edgegrasp_service.admission import Place
 from edgegrasp_service.body_limit import BodyLimit
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.errors import NotReady, report
+from edgegrasp_service.call import Call
+from edgegrasp_service.core import GraspService, in_time
+from edgegrasp_service.errors import Cancelled, report
 from edgegrasp_service.http_bodies import (
     KIND_PREFIX,
     DetectionBody,
@@ -25,9 +30,14 @@ from edgegrasp_service.http_bodies import (
 )
 from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
 from edgegrasp_service.http_problem import problem_response
-from edgegrasp_service.http_request import read_request, read_score_request
+from edgegrasp_service.http_request import read_request, read_score_request, read_timeout
+from edgegrasp_service.observer import observed
+from edgegrasp_service.request_id import REQUEST_ID
 
 logger = logging.getLogger(__name__)
+
+Asked = TypeVar("Asked")
+Answer = TypeVar("Answer")
 
 DESCRIPTION = """Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
 
@@ -42,14 +52,16 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
     404: {"description": "No weights of that name.", **PROBLEM},
     413: {"description": "Over the server's limits.", **PROBLEM},
     415: {"description": "A body the server does not read.", **PROBLEM},
+    429: {"description": "The server is full; Retry-After says for how long.", **PROBLEM},
     503: {"description": "Weights are loading, or the server is stopping.", **PROBLEM},
+    504: {"description": "The deadline passed before there was an answer.", **PROBLEM},
 }
 
 
-def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
+def create_app(service: GraspService) -> FastAPI:
     """The ASGI application over a service core."""
     app = FastAPI(title="EdgeGrasp", version="v1", description=DESCRIPTION, redoc_url=None)
-    app.add_middleware(BodyLimit, max_body_bytes=max_body_bytes)
+    app.add_middleware(BodyLimit, max_body_bytes=service.settings.max_body_bytes)
     for error in (EdgeGraspError, Exception):
         app.add_exception_handler(error, _answer_error)
     app.add_exception_handler(HTTPException, _answer_http_error)
@@ -62,8 +74,8 @@ def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
         openapi_extra=OPENAPI_DETECT,
     )
     async def detect_grasps(request: Request) -> JSONResponse:
-        _require_ready(service)
-        detection = await service.detect(await read_request(request))
+        call = Call("http", "DetectGrasps", request_id=REQUEST_ID.get())
+        detection = await _answer(service, request, call, read_request, service.detect)
         return JSONResponse(detection_body(detection))
 
     @app.post(
@@ -74,8 +86,8 @@ def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
         openapi_extra=OPENAPI_SCORE,
     )
     async def score_grasps(request: Request) -> JSONResponse:
-        _require_ready(service)
-        scoring = await service.score(await read_score_request(request))
+        call = Call("http", "ScoreGrasps", request_id=REQUEST_ID.get())
+        scoring = await _answer(service, request, call, read_score_request, service.score)
         return JSONResponse(scoring_body(scoring))
 
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
@@ -100,10 +112,43 @@ def create_app(service: GraspService, max_body_bytes: int) -> FastAPI:
     return app
 
 
-def _require_ready(service: GraspService) -> None:
-    """Raise NotReady before reading what would be read in vain."""
-    if not service.ready:
-        raise NotReady("Weights are still loading, or the server is stopping.")
+async def _answer(
+    service: GraspService,
+    request: Request,
+    call: Call,
+    read: Callable[[Request], Coroutine[Any, Any, Asked]],
+    work: Callable[[Asked, Place], Coroutine[Any, Any, Answer]],
+) -> Answer:
+    """Take a place, read the request, and work on it while the client is there."""
+    with observed(service.observer, call):
+        if (timeout := read_timeout(request)) is not None:
+            call.limit(timeout)
+        with service.admit(call) as place:
+            try:
+                asked = await in_time(call, read(request))
+            except ClientDisconnect:
+                raise Cancelled("The client left before its request was whole.") from None
+            return await _unless_gone(request, work(asked, place))
+
+
+async def _unless_gone(request: Request, work: Coroutine[Any, Any, Answer]) -> Answer:
+    """What the work gives; once the client closes, it is cancelled, and Cancelled raised."""
+    working = asyncio.create_task(work)
+    gone = asyncio.create_task(_gone(request.receive))
+    try:
+        await asyncio.wait({working, gone}, return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise Cancelled("The client left.")
+        return working.result()
+    finally:
+        gone.cancel()
+        working.cancel()
+
+
+async def _gone(receive: Callable[[], Awaitable[Any]]) -> None:
+    """Return once the client has closed the connection."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
 
 
 async def _answer_error(request: Request, error: Exception) -> JSONResponse:
@@ -124,6 +169,7 @@ async def _answer_http_error(request: Request, error: Exception) -> JSONResponse
         "field": "",
         "value": "",
         "fix": "",
+        "retry_after": None,
     }
     return JSONResponse(
         body, error.status_code, headers=error.headers, media_type="application/problem+json"

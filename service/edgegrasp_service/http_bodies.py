@@ -121,6 +121,9 @@ class ProblemBody(_Body):
     field: str = Field(description="request field at fault; empty if none is")
     value: str = Field(description="what was received")
     fix: str = Field(description="what to send instead")
+    retry_after: float | None = Field(
+        description="seconds until another try is worth it, as in Retry-After; null: unknown"
+    )
 
 
 def detection_body(detection: Detection) -> dict[str, object]:
@@ -162,6 +165,7 @@ def problem_body(problem: ErrorReport) -> dict[str, object]:
         "field": problem.field,
         "value": problem.value,
         "fix": problem.fix,
+        "retry_after": problem.retry_after,
     }
 
 

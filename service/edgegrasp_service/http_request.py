@@ -1,6 +1,7 @@
 """Read the bodies of the POST routes: JSON, a point cloud file, or a form with parts."""
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
@@ -10,7 +11,7 @@ from fastapi import Request
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_service.cloud_decoding import FILE_FORMATS
 from edgegrasp_service.core import DetectRequest, ScoreRequest
 from edgegrasp_service.errors import UnsupportedMediaType
@@ -23,7 +24,6 @@ from edgegrasp_service.sent_arrays import (
     NpyArray,
     SentArray,
     array_from_lists,
-    brief,
 )
 from edgegrasp_service.sent_cloud import (
     DepthCloud,
@@ -45,6 +45,27 @@ SOURCES: dict[str, Callable[[Any], Source | DepthCloud]] = {
     "depth_images": DepthCloud,
 }
 GIVEN = ("edges", "hand_poses")
+
+
+TIMEOUT = "X-Request-Timeout"
+
+
+def read_timeout(request: Request) -> float | None:
+    """Seconds that the caller waits; None: it does not say.
+
+    Raises:
+        InvalidRequest: They are no positive number.
+    """
+    text = request.headers.get(TIMEOUT)
+    if text is None:
+        return None
+    try:
+        timeout = float(text)
+    except ValueError:
+        timeout = math.nan
+    if not 0.0 < timeout < math.inf:
+        raise InvalidRequest(TIMEOUT, brief(text), "Send seconds, such as 2.5, or leave it out.")
+    return timeout
 
 
 async def read_request(request: Request) -> DetectRequest:

@@ -1,8 +1,11 @@
 """What the server tells of its work, to whoever counts, logs or traces it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.call import Call
-from edgegrasp_service.errors import ErrorReport
+from edgegrasp_service.errors import Cancelled, ErrorReport, report
 
 
 class Observer:
@@ -42,3 +45,20 @@ class Observer:
 
 # In order. Scoring has decode, wait and score.
 STAGES = ("admission", "decode", "prepare", "wait", "network", "finish", "score")
+
+
+@contextmanager
+def observed(observer: Observer, call: Call) -> Iterator[None]:
+    """Tell of a call's start, and of its end however it comes."""
+    observer.started(call)
+    problem = None
+    try:
+        yield
+    except Exception as error:
+        problem = report(error)
+        raise
+    except BaseException:
+        problem = report(Cancelled("The caller cancelled the request."))
+        raise
+    finally:
+        observer.finished(call, problem)

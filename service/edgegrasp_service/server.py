@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import ipaddress
 import logging
 import signal
 import socket
@@ -10,27 +11,68 @@ from collections.abc import Callable, Iterator
 
 import uvicorn
 
+from edgegrasp_service import grpc_edge, http_edge
 from edgegrasp_service.backend import load_backend
 from edgegrasp_service.core import GraspService
+from edgegrasp_service.edge import Edge
 from edgegrasp_service.errors import AddressInUse
+from edgegrasp_service.grpc_edge import GrpcEdge
 from edgegrasp_service.grpc_server import GrpcServer
 from edgegrasp_service.http_app import create_app
+from edgegrasp_service.http_edge import HttpEdge
+from edgegrasp_service.logs import LogWriter, start_logging, write_line
+from edgegrasp_service.metrics import Metrics
+from edgegrasp_service.observer import Observer
+from edgegrasp_service.observers import Observers
+from edgegrasp_service.reload import Reloader
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.tls import load_tls
+from edgegrasp_service.tokens import load_tokens
 
 logger = logging.getLogger(__name__)
+
+METHODS = {*http_edge.METHODS.values(), *grpc_edge.METHODS.values()}
+
+NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
+CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
 
 
 class Server:
     """Both transports of one service.
 
     Attributes:
+        metrics: What /metrics shows.
         http_url: e.g. "http://127.0.0.1:8000", once ports are open.
         grpc_address: e.g. "127.0.0.1:50051", once ports are open.
+        reloader: Swaps weights and tokens, once ports are open.
     """
 
-    def __init__(self, settings: Settings, service: GraspService | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        service: GraspService | None = None,
+        observers: tuple[Observer, ...] = (),
+    ) -> None:
+        """Read certificates and tokens.
+
+        Args:
+            settings: What an operator set.
+            service: The core; None: one with the weights of the settings, observed.
+            observers: Further ones, besides the metrics.
+
+        Raises:
+            InvalidSettings: A certificate or a token cannot be used.
+        """
         self._settings = settings
-        self._service = service or GraspService(lambda: load_backend(settings), settings.max_points)
+        self._tls = load_tls(settings)
+        self.metrics = Metrics(sorted(METHODS))
+        self._edge = Edge(load_tokens(settings), self.metrics)
+        self._service = service or GraspService(
+            lambda: load_backend(settings), settings, Observers((self.metrics, *observers))
+        )
+        self.metrics.describe_models(self._service.models)
+        self.metrics.watch("ready", "1: requests are answered", lambda: self._service.ready)
+        self.reloader = Reloader(self._service, self._edge, lambda: load_tokens(settings))
         self.http_url = ""
         self.grpc_address = ""
 
@@ -53,11 +95,10 @@ class Server:
         """
         settings = self._settings
         with _listen(settings.host, settings.http_port) as http_socket:
-            grpc_server = GrpcServer(
-                self._service, settings.host, settings.grpc_port, settings.max_body_bytes
-            )
+            grpc_server = self._grpc_server()
             http_server = self._http_server()
-            self.http_url = f"http://{_host_and_port(http_socket)}"
+            scheme = "http" if self._tls is None else "https"
+            self.http_url = f"{scheme}://{_host_and_port(http_socket)}"
             self.grpc_address = grpc_server.address
             await grpc_server.start()
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
@@ -70,10 +111,9 @@ class Server:
                     load_task.result()
                 await stopped
             finally:
-                self._service.drain()
+                await self._drain(grpc_server)
                 http_server.should_exit = True
-                await asyncio.gather(http_task, grpc_server.stop(settings.grace_seconds))
-                self._service.close()
+                await asyncio.gather(http_task, grpc_server.stop(CLOSE_SECONDS))
                 for task in (stopped, load_task):
                     task.cancel()
 
@@ -82,15 +122,45 @@ class Server:
         await grpc_server.set_serving(True)
         ready()
 
+    async def _drain(self, grpc_server: GrpcServer) -> None:
+        """Refuse new requests, and wait until those accepted are answered, or grace is over."""
+        clock = asyncio.get_running_loop().time
+        end = clock() + self._settings.grace_seconds
+        self._edge.draining = True
+        self._service.stop_accepting()
+        await grpc_server.stop_serving()
+        await asyncio.sleep(min(NOTICE_SECONDS, self._settings.grace_seconds))
+        in_time = await self._service.drain(end - clock())
+        if not in_time:
+            logger.warning("grace is over: requests in flight are given up")
+        self._service.close()
+        end = max(end, clock() + CLOSE_SECONDS)
+        while self._edge.unanswered and clock() < end:
+            await asyncio.sleep(0.01)
+
+    def _grpc_server(self) -> GrpcServer:
+        return GrpcServer(
+            self._service,
+            self._settings.host,
+            self._settings.grpc_port,
+            interceptors=[GrpcEdge(self._edge)],
+            credentials=None if self._tls is None else self._tls.grpc,
+        )
+
     def _http_server(self) -> "_HttpServer":
+        tls = self._tls
         config = uvicorn.Config(
-            create_app(self._service, self._settings.max_body_bytes),
+            HttpEdge(create_app(self._service), self._edge),
             log_config=None,
             access_log=False,
             lifespan="off",
+            http="h11",  # whatever else is installed: its limit of headers is the one set here
+            h11_max_incomplete_event_size=self._settings.max_header_bytes,
             ws="none",
             server_header=False,
-            timeout_graceful_shutdown=max(1, round(self._settings.grace_seconds)),
+            proxy_headers=False,
+            timeout_graceful_shutdown=1,  # there was grace before
+            ssl_context_factory=None if tls is None else lambda config, default: tls.http,
         )
         return _HttpServer(config)
 
@@ -110,29 +180,50 @@ def run(settings: Settings) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
-    logging.basicConfig(
-        level=settings.log_level.upper(),
-        stream=sys.stderr,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-    )
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
-    asyncio.run(_serve_until_signalled(Server(settings)))
+    with contextlib.ExitStack() as ends:
+        log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
+        observers: list[Observer] = []
+        if settings.otlp_endpoint:
+            from edgegrasp_service.tracing import Tracer, otlp_provider
+
+            provider = otlp_provider(settings.otlp_endpoint)
+            ends.callback(provider.shutdown)
+            observers.append(Tracer(provider))
+        _warn_of_strangers(settings)
+        asyncio.run(_serve_until_signalled(settings, tuple(observers), log))
 
 
-async def _serve_until_signalled(server: Server) -> None:
+async def _serve_until_signalled(
+    settings: Settings, observers: tuple[Observer, ...], log: LogWriter
+) -> None:
     stop = asyncio.Event()
+    server = Server(settings, observers=observers)
+    server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
+    loop.add_signal_handler(signal.SIGHUP, server.reloader.reload_soon)
 
     def opened() -> None:
         logger.info("opened %s and gRPC %s, loading", server.http_url, server.grpc_address)
 
     def ready() -> None:
-        sys.stdout.write(f"EdgeGrasp serves HTTP {server.http_url} gRPC {server.grpc_address}\n")
-        sys.stdout.flush()
+        line = f"EdgeGrasp serves HTTP {server.http_url} gRPC {server.grpc_address}"
+        write_line(sys.stdout, line)
 
     await server.serve(stop, opened, ready)
+
+
+def _warn_of_strangers(settings: Settings) -> None:
+    """Say what is open to whoever can reach this machine."""
+    try:
+        local = ipaddress.ip_address(settings.host).is_loopback
+    except ValueError:
+        local = settings.host == "localhost"
+    if not local and settings.tls_certificate is None:
+        logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
+    if not local and not (load_tokens(settings).required or settings.tls_client_ca):
+        logger.warning("%s: others can reach this server, and it asks nobody who", settings.host)
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -59,7 +59,7 @@ class Settings(BaseSettings):
     max_points: int = Field(
         default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
     )
-    # Bounds and batching: what `edgegrasp_service.bounds` makes of it.
+    # Bounds and batching.
     max_balls: int = Field(
         default=256, ge=1, le=256, description="most approach points a request may ask for"
     )

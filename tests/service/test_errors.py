@@ -11,19 +11,21 @@ from grpc import aio
 import edgegrasp_model.errors
 import edgegrasp_service.errors
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_model.errors import EdgeGraspError, UnknownModel
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.dummy import DummyCatalogue
 from edgegrasp_service.errors import (
     STATUS,
-    DetectorFailed,
-    NotReady,
-    ReloadFailed,
+    Overloaded,
+    _FieldError,
     kind_of,
     report,
 )
 from edgegrasp_service.grpc_server import GrpcServer
 from edgegrasp_service.http_app import create_app
+from edgegrasp_service.settings import Settings
+
+SMALL = Settings(max_points=100, max_body_bytes=10_000)
 
 # Errors of starting up: no request ever meets them.
 START_UP = {"InvalidCheckpoint", "InvalidGripper", "InvalidSettings", "AddressInUse"}
@@ -38,7 +40,7 @@ class Failing:
     def get(self, name: str = "") -> "Failing":
         return self
 
-    def detect(self, cloud: object, options: object) -> None:
+    def prepare(self, cloud: object, options: object) -> None:
         raise self._error
 
     def describe(self) -> list[dict[str, object]]:
@@ -50,18 +52,20 @@ class Failing:
 def example(kind: type[Exception]) -> Exception:
     if kind is UnknownModel:
         return UnknownModel("wanted", ["a", "b"])
-    if kind in (NotReady, ReloadFailed, DetectorFailed):
-        return kind("What happened.")
-    return kind("cloud", "a value", "Fix it.")
+    if kind is Overloaded:
+        return Overloaded("What happened.", 7.0)
+    if issubclass(kind, InvalidRequest | _FieldError):
+        return kind("cloud", "a value", "Fix it.")
+    return kind("What happened.")
 
 
 async def ask(error: Exception) -> tuple[httpx.Response, aio.AioRpcError]:
-    service = GraspService(lambda: Failing(error), max_points=100)
+    service = GraspService(lambda: Failing(error), SMALL)
     await service.start()
-    transport = httpx.ASGITransport(create_app(service, 10_000), raise_app_exceptions=False)
+    transport = httpx.ASGITransport(create_app(service), raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
         response = await http.post("/v1/grasps", json={"points": [[0, 0, 0]]})
-    server = GrpcServer(service, "127.0.0.1", 0, 10_000)
+    server = GrpcServer(service, "127.0.0.1", 0)
     await server.start()
     async with aio.insecure_channel(server.address) as channel:
         stub = grasp_pb2_grpc.GraspServiceStub(channel)
@@ -86,14 +90,24 @@ async def test_every_error_of_the_table(kind: type[Exception]) -> None:
     assert problem["detail"] == status.details()
     told = (problem["field"], problem["value"], problem["fix"])
     assert told == (detail.field, detail.value, detail.fix)
+    retry_after = detail.retry_after if detail.HasField("retry_after") else None
+    assert problem["retry_after"] == retry_after == (7.0 if kind is Overloaded else None)
+    assert response.headers.get("retry-after") == ("7" if kind is Overloaded else None)
     if hasattr(error, "fix"):
         assert told == ("cloud", "a value", "Fix it.")
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("secret"), MemoryError("secret")])
-async def test_unforeseen_errors_tell_nothing(error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (ZeroDivisionError("secret"), (500, grpc.StatusCode.INTERNAL)),
+        (MemoryError("secret"), (503, grpc.StatusCode.UNAVAILABLE)),
+        (RuntimeError("can't allocate memory: secret"), (503, grpc.StatusCode.UNAVAILABLE)),
+    ],
+)
+async def test_unforeseen_errors_tell_nothing(error: Exception, expected: object) -> None:
     response, status = await ask(error)
-    assert (response.status_code, status.code()) == (500, grpc.StatusCode.INTERNAL)
+    assert (response.status_code, status.code()) == expected
     assert "secret" not in response.text + (status.details() or "")
 
 
@@ -119,9 +133,9 @@ async def test_a_failed_detection_leaves_the_service_working() -> None:
                 return Failing(ValueError("once"))
             return super().get(name)
 
-    service = GraspService(Once, max_points=100)
+    service = GraspService(Once, SMALL)
     await service.start()
-    transport = httpx.ASGITransport(create_app(service, 10_000))
+    transport = httpx.ASGITransport(create_app(service))
     body = {"points": np.zeros((40, 3)).tolist()}
     async with httpx.AsyncClient(transport=transport, base_url="http://test") as http:
         assert (await http.post("/v1/grasps", json=body)).status_code == 500

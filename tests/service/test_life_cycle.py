@@ -54,7 +54,7 @@ async def test_not_ready_until_loaded_and_warm() -> None:
         may_load.wait(20)
         return DummyCatalogue()
 
-    server = Server(SETTINGS, GraspService(load, SETTINGS.max_points))
+    server = Server(SETTINGS, GraspService(load, SETTINGS))
     serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))
     await opened.wait()
     async with (
@@ -81,7 +81,7 @@ async def test_stopping_finishes_what_was_accepted() -> None:
             return super().get(name)
 
     ready, stop = asyncio.Event(), asyncio.Event()
-    service = GraspService(lambda: Counting(seconds=0.5), SETTINGS.max_points)
+    service = GraspService(lambda: Counting(seconds=0.5), SETTINGS)
     server = Server(SETTINGS, service)
     serving = asyncio.create_task(server.serve(stop, ready=ready.set))
     await ready.wait()
@@ -108,7 +108,7 @@ async def test_weights_that_cannot_be_loaded_end_the_server() -> None:
     def load() -> DummyCatalogue:
         raise InvalidCheckpoint("weights: truncated")
 
-    server = Server(SETTINGS, GraspService(load, SETTINGS.max_points))
+    server = Server(SETTINGS, GraspService(load, SETTINGS))
     with pytest.raises(InvalidCheckpoint, match="truncated"):
         await asyncio.wait_for(server.serve(asyncio.Event()), 20)
 

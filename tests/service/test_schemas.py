@@ -202,7 +202,7 @@ def test_openapi_has_no_dangling_reference() -> None:
 
 
 def openapi() -> dict:
-    return create_app(GraspService(DummyCatalogue, 100), 10_000).openapi()
+    return create_app(GraspService(DummyCatalogue)).openapi()
 
 
 def test_what_is_generated_is_committed(tmp_path: Path) -> None:

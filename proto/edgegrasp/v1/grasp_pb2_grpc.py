@@ -39,6 +39,11 @@ class GraspServiceStub:
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.SerializeToString,
                 response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.FromString,
                 _registered_method=True)
+        self.DetectGraspsStream = channel.stream_stream(
+                '/edgegrasp.v1.GraspService/DetectGraspsStream',
+                request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamRequest.SerializeToString,
+                response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamResponse.FromString,
+                _registered_method=True)
         self.ScoreGrasps = channel.unary_unary(
                 '/edgegrasp.v1.GraspService/ScoreGrasps',
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ScoreGraspsRequest.SerializeToString,
@@ -58,8 +63,19 @@ class GraspServiceServicer:
         """Finds grasps in one cloud. No grasp found is a success with an empty list.
         INVALID_ARGUMENT    the cloud or an option is wrong
         NOT_FOUND           options.model names no loaded weights
-        RESOURCE_EXHAUSTED  the request exceeds the server's limits
-        UNAVAILABLE         weights are still loading, or the server is stopping
+        RESOURCE_EXHAUSTED  the request exceeds the server's limits, or the server is full
+        DEADLINE_EXCEEDED   the deadline passed before there was an answer
+        UNAVAILABLE         weights are still loading, or the server is stopping: try again
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DetectGraspsStream(self, request_iterator, context):
+        """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
+        each; the error of a request is its answer, and the stream goes on. The server reads ahead a
+        few requests only: a client that sends faster waits. While the server stops, it answers what
+        it has read and ends the stream with UNAVAILABLE.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -86,6 +102,11 @@ def add_GraspServiceServicer_to_server(servicer, server):
                     servicer.DetectGrasps,
                     request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.FromString,
                     response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.SerializeToString,
+            ),
+            'DetectGraspsStream': grpc.stream_stream_rpc_method_handler(
+                    servicer.DetectGraspsStream,
+                    request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamRequest.FromString,
+                    response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamResponse.SerializeToString,
             ),
             'ScoreGrasps': grpc.unary_unary_rpc_method_handler(
                     servicer.ScoreGrasps,
@@ -125,6 +146,33 @@ class GraspService:
             '/edgegrasp.v1.GraspService/DetectGrasps',
             edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsRequest.SerializeToString,
             edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DetectGraspsStream(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/edgegrasp.v1.GraspService/DetectGraspsStream',
+            edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamRequest.SerializeToString,
+            edgegrasp_dot_v1_dot_grasp__pb2.DetectGraspsStreamResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -42,8 +42,15 @@ class GraspServiceStub:
     """Finds grasps in one cloud. No grasp found is a success with an empty list.
       INVALID_ARGUMENT    the cloud or an option is wrong
       NOT_FOUND           options.model names no loaded weights
-      RESOURCE_EXHAUSTED  the request exceeds the server's limits
-      UNAVAILABLE         weights are still loading, or the server is stopping
+      RESOURCE_EXHAUSTED  the request exceeds the server's limits, or the server is full
+      DEADLINE_EXCEEDED   the deadline passed before there was an answer
+      UNAVAILABLE         weights are still loading, or the server is stopping: try again
+    """
+    DetectGraspsStream: _grpc.StreamStreamMultiCallable[_grasp_pb2.DetectGraspsStreamRequest, _grasp_pb2.DetectGraspsStreamResponse]
+    """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
+    each; the error of a request is its answer, and the stream goes on. The server reads ahead a
+    few requests only: a client that sends faster waits. While the server stops, it answers what
+    it has read and ends the stream with UNAVAILABLE.
     """
     ScoreGrasps: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
@@ -57,8 +64,15 @@ class GraspServiceAsyncStub(GraspServiceStub):
     """Finds grasps in one cloud. No grasp found is a success with an empty list.
       INVALID_ARGUMENT    the cloud or an option is wrong
       NOT_FOUND           options.model names no loaded weights
-      RESOURCE_EXHAUSTED  the request exceeds the server's limits
-      UNAVAILABLE         weights are still loading, or the server is stopping
+      RESOURCE_EXHAUSTED  the request exceeds the server's limits, or the server is full
+      DEADLINE_EXCEEDED   the deadline passed before there was an answer
+      UNAVAILABLE         weights are still loading, or the server is stopping: try again
+    """
+    DetectGraspsStream: _aio.StreamStreamMultiCallable[_grasp_pb2.DetectGraspsStreamRequest, _grasp_pb2.DetectGraspsStreamResponse]  # type: ignore[assignment]
+    """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
+    each; the error of a request is its answer, and the stream goes on. The server reads ahead a
+    few requests only: a client that sends faster waits. While the server stops, it answers what
+    it has read and ends the stream with UNAVAILABLE.
     """
     ScoreGrasps: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ScoreGraspsRequest, _grasp_pb2.ScoreGraspsResponse]  # type: ignore[assignment]
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
@@ -75,8 +89,21 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         """Finds grasps in one cloud. No grasp found is a success with an empty list.
           INVALID_ARGUMENT    the cloud or an option is wrong
           NOT_FOUND           options.model names no loaded weights
-          RESOURCE_EXHAUSTED  the request exceeds the server's limits
-          UNAVAILABLE         weights are still loading, or the server is stopping
+          RESOURCE_EXHAUSTED  the request exceeds the server's limits, or the server is full
+          DEADLINE_EXCEEDED   the deadline passed before there was an answer
+          UNAVAILABLE         weights are still loading, or the server is stopping: try again
+        """
+
+    @_abc_1.abstractmethod
+    def DetectGraspsStream(
+        self,
+        request_iterator: _MaybeAsyncIterator[_grasp_pb2.DetectGraspsStreamRequest],
+        context: _ServicerContext,
+    ) -> _typing.Union[_abc.Iterator[_grasp_pb2.DetectGraspsStreamResponse], _abc.AsyncIterator[_grasp_pb2.DetectGraspsStreamResponse]]:
+        """Finds grasps in one cloud after the other. Answers come in the order of the requests, one for
+        each; the error of a request is its answer, and the stream goes on. The server reads ahead a
+        few requests only: a client that sends faster waits. While the server stops, it answers what
+        it has read and ends the stream with UNAVAILABLE.
         """
 
     @_abc_1.abstractmethod
