@@ -12,6 +12,7 @@ from edgegrasp_service.request_id import HEADER, REQUEST_ID, TRACEPARENT, usable
 from edgegrasp_service.tokens import Tokens
 
 MAX_HEADERS = 64
+PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
 
 logger = logging.getLogger("edgegrasp_service.requests")
 
@@ -66,7 +67,8 @@ class Edge:
             timed = None if answered.long else seconds
             self.metrics.request(transport, method, answered.code, timed)
             fields = {"transport": transport, "method": method, "code": answered.code}
-            logger.info("request", extra={"fields": fields | {"seconds": round(seconds, 6)}})
+            level = logging.DEBUG if method in PROBES else logging.INFO
+            logger.log(level, "request", extra={"fields": fields | {"seconds": round(seconds, 6)}})
 
     def _count(self, answered: Answered, change: int) -> None:
         if not answered.long:

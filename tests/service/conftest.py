@@ -1,4 +1,6 @@
-from collections.abc import Iterator
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,6 +9,9 @@ import httpx
 import pytest
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_service.core import GraspService
+from edgegrasp_service.server import Server
+from edgegrasp_service.settings import load_settings
 
 
 @dataclass
@@ -96,3 +101,27 @@ def raw_rest(dummy_server) -> Iterator[RawRest]:
 def raw(request: pytest.FixtureRequest) -> RawGrpc | RawRest:
     found: RawGrpc | RawRest = request.getfixturevalue(f"raw_{request.param}")
     return found
+
+
+@contextlib.asynccontextmanager
+async def a_server(service: GraspService | None = None, **given: Any) -> AsyncIterator[Server]:
+    """A server in this event loop, on free ports, of dummies unless told otherwise."""
+    defaults = {"backend": "dummy", "http_port": 0, "grpc_port": 0, "grace_seconds": 5.0}
+    server = Server(load_settings(**(defaults | given)), service)
+    ready, stop = asyncio.Event(), asyncio.Event()
+    serving = asyncio.create_task(server.serve(stop, ready=ready.set))
+    waiting = asyncio.create_task(ready.wait())
+    await asyncio.wait([serving, waiting], return_when=asyncio.FIRST_COMPLETED)
+    try:
+        if serving.done():
+            serving.result()
+        yield server
+    finally:
+        waiting.cancel()
+        stop.set()
+        await asyncio.wait([serving])
+
+
+@pytest.fixture
+def serving() -> Callable[..., contextlib.AbstractAsyncContextManager[Server]]:
+    return a_server

@@ -1,0 +1,334 @@
+"""Who may ask, over both transports: TLS, client certificates, tokens, and what stays open."""
+
+import asyncio
+import logging
+import ssl
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import trustme
+from grpc import StatusCode, aio
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import (
+    AccessDeniedError,
+    AsyncGraspClient,
+    GraspClient,
+    InvalidRequestError,
+    ServerUnavailableError,
+    Tls,
+)
+from edgegrasp_service import tokens
+from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.tls import load_tls
+from edgegrasp_service.tokens import Tokens, load_tokens
+
+USER = "user-token-0123456789"
+SECOND = "second-token-0123456789"
+ADMIN = "admin-token-0123456789"
+WRONG = "wrong-token-0123456789"
+HOST = "127.0.0.1"
+
+
+@pytest.fixture(scope="module")
+def pem(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Files: a CA, a server's and a client's certificates and keys of it, and those of another."""
+    folder = tmp_path_factory.mktemp("pem")
+    files: dict[str, Path] = {}
+    for prefix in ("", "other_"):
+        authority = trustme.CA()
+        files[f"{prefix}ca"] = folder / f"{prefix}ca.pem"
+        authority.cert_pem.write_to_path(files[f"{prefix}ca"])
+        for name in ("server", "client"):
+            issued = authority.issue_cert(HOST, "localhost")
+            files[f"{prefix}{name}"] = folder / f"{prefix}{name}.pem"
+            files[f"{prefix}{name}_key"] = folder / f"{prefix}{name}_key.pem"
+            chain = b"".join(blob.bytes() for blob in issued.cert_chain_pems)
+            files[f"{prefix}{name}"].write_bytes(chain)
+            issued.private_key_pem.write_to_path(files[f"{prefix}{name}_key"])
+    return files
+
+
+@pytest.fixture
+def server_tls(pem: dict[str, Path]) -> dict[str, Path]:
+    return {"tls_certificate": pem["server"], "tls_key": pem["server_key"]}
+
+
+@pytest.fixture(params=["grpc", "rest"])
+def transport(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name
+
+
+def address_of(server: Any, transport: str) -> str:
+    address: str = server.grpc_address if transport == "grpc" else server.http_url
+    return address
+
+
+async def refused(address: str, **security: Any) -> Exception:
+    async with AsyncGraspClient(address, timeout=5, **security) as client:
+        with pytest.raises(Exception) as caught:  # noqa: PT011  # the caller looks at it
+            await client.models()
+    return caught.value
+
+
+async def test_tls(serving, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
+    async with serving(**server_tls) as server:
+        assert server.http_url.startswith("https://")
+        address = address_of(server, transport)
+        async with AsyncGraspClient(address, tls=Tls(ca=pem["ca"])) as client:
+            assert await client.ready()
+            assert len((await client.detect(cloud)).grasps) == 10
+        by_other = await refused(address, tls=Tls(ca=pem["other_ca"]))
+        plain = await refused(address.replace("https", "http"))
+        assert {type(by_other), type(plain)} == {ServerUnavailableError}
+
+
+async def test_the_synchronous_client_over_tls(
+    serving, server_tls, pem, transport: str, cloud: np.ndarray
+) -> None:
+    async with serving(**server_tls, tokens=[USER]) as server:
+        address = address_of(server, transport)
+
+        def detect() -> int:
+            with GraspClient(address, tls=Tls(ca=pem["ca"]), token=USER) as client:
+                return len(client.detect(cloud).grasps)
+
+        assert await asyncio.to_thread(detect) == 10
+
+
+async def test_mutual_tls(serving, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
+    async with serving(**server_tls, tls_client_ca=pem["ca"]) as server:
+        address = address_of(server, transport)
+        own = Tls(pem["ca"], pem["client"], pem["client_key"])
+        async with AsyncGraspClient(address, tls=own) as client:
+            assert len((await client.detect(cloud)).grasps) == 10
+        stranger = Tls(pem["ca"], pem["other_client"], pem["other_client_key"])
+        for tls in (Tls(ca=pem["ca"]), stranger):
+            assert isinstance(await refused(address, tls=tls), ServerUnavailableError)
+
+
+async def test_no_tls_older_than_1_2(serving, server_tls, pem) -> None:
+    async with serving(**server_tls) as server:
+        context = ssl.create_default_context(cafile=pem["ca"])
+        context.maximum_version = ssl.TLSVersion.TLSv1_2
+        async with httpx.AsyncClient(verify=context) as http:
+            assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
+    loaded = load_tls(Settings(**server_tls))
+    assert loaded is not None
+    assert loaded.http.minimum_version == ssl.TLSVersion.TLSv1_2
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"tls_certificate": "none.pem"}, "tls_certificate: got 'none.pem'. No such file"),
+        ({"tls_key": "other_server_key"}, "They are no certificate with its key"),
+        ({"tls_certificate": "text"}, "They are no certificate with its key"),
+        ({"tls_client_ca": "text"}, "tls_client_ca: got"),
+        ({"tls_key": "encrypted"}, "nobody is there to ask"),
+    ],
+)
+def test_bad_certificates_are_named(
+    pem, server_tls, tmp_path: Path, changed: dict[str, str], sentence: str
+) -> None:
+    (tmp_path / "text").write_text("no certificate")
+    files = {**pem, "text": tmp_path / "text", "encrypted": encrypted(pem, tmp_path)}
+    given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
+    with pytest.raises(InvalidSettings) as caught:
+        load_tls(Settings(**given))
+    assert sentence in str(caught.value)
+
+
+def encrypted(pem: dict[str, Path], folder: Path) -> Path:
+    from cryptography.hazmat.primitives import serialization
+
+    key = serialization.load_pem_private_key(pem["server_key"].read_bytes(), None)
+    path = folder / "encrypted.pem"
+    path.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.BestAvailableEncryption(b"word"),
+        )
+    )
+    return path
+
+
+async def test_tokens(serving, transport: str, cloud: np.ndarray, tmp_path: Path) -> None:
+    file = tmp_path / "tokens"
+    file.write_text(f"# of the cell\n\n  {SECOND}\n")
+    async with serving(tokens=[USER], token_file=file, admin_tokens=[ADMIN]) as server:
+        address = address_of(server, transport)
+        for token in (USER, SECOND, ADMIN):
+            async with AsyncGraspClient(address, token=token) as client:
+                assert len((await client.detect(cloud)).grasps) == 10
+        for token in (None, WRONG, USER[:-1], USER + "x"):
+            error = await refused(address, token=token)
+            assert isinstance(error, AccessDeniedError)
+            assert "authorization: got" in str(error)
+            assert token is None or token not in str(error)
+
+
+PROTECTED = [
+    *("/v1/models", "/v1/grasps", "/v1/grasps:score", "/v1/models:reload"),
+    *("/metrics", "/docs", "/openapi.json", "/none", "//health/live", "/health/live/"),
+]
+
+
+async def test_only_probes_are_open(serving) -> None:
+    async with serving(tokens=[USER], admin_tokens=[ADMIN]) as server:
+        async with httpx.AsyncClient(base_url=server.http_url) as http:
+            for path in ("/health/live", "/health/ready"):
+                assert (await http.get(path)).status_code == 200
+            for path in PROTECTED:
+                answer = await http.get(server.http_url + path)
+                assert answer.status_code == 401, path
+                assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
+                assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
+            basic = await http.get("/v1/models", auth=("user", USER))
+            assert basic.json()["value"] == "another scheme than Bearer"
+        async with aio.insecure_channel(server.grpc_address) as channel:
+            health = health_pb2_grpc.HealthStub(channel)
+            status = (await health.Check(health_pb2.HealthCheckRequest())).status
+            assert status == health_pb2.HealthCheckResponse.SERVING
+            reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
+            request = reflection_pb2.ServerReflectionRequest(list_services="")
+            unknown = channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)
+            for call in (reflection.ServerReflectionInfo(iter([request])), unknown(b"")):
+                assert await call.code() == StatusCode.UNAUTHENTICATED
+
+
+async def test_a_refused_request_is_not_read(serving) -> None:
+    """Without a token, a body over the limit is refused for the token, not for its size."""
+    async with serving(tokens=[USER], max_body_bytes=1024) as server:
+        stub_request = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))
+        async with aio.insecure_channel(server.grpc_address) as channel:
+            call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(stub_request)
+            assert await call.code() == StatusCode.UNAUTHENTICATED
+            detail = dict(await call.trailing_metadata())["edgegrasp-error-bin"]
+            assert grasp_pb2.ErrorDetail.FromString(detail).kind == "unauthenticated"
+
+
+async def test_no_token_reaches_a_log_or_an_answer(
+    serving, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    async with serving(tokens=[USER], admin_tokens=[ADMIN]) as server:
+        for token in (USER, ADMIN, WRONG):
+            headers = {"authorization": f"Bearer {token}"}
+            async with httpx.AsyncClient(base_url=server.http_url, headers=headers) as http:
+                for path in ("/v1/models", "/metrics", "/none"):
+                    answer = await http.get(path)
+                    assert token not in answer.text + str(answer.headers)
+            async with AsyncGraspClient(server.grpc_address, token=token) as client:
+                await asyncio.gather(client.models(), return_exceptions=True)
+    ours = [record for record in caplog.records if record.name.startswith("edgegrasp")]
+    assert len(ours) > 6
+    assert not any(token in str(vars(record)) for record in ours for token in (USER, ADMIN, WRONG))
+    assert USER not in repr(Settings(tokens=[USER])) + str(Settings(tokens=[USER]))
+
+
+async def test_no_other_origin_is_let_in(serving) -> None:
+    async with serving() as server, httpx.AsyncClient(base_url=server.http_url) as http:
+        headers = {"origin": "http://evil.example", "access-control-request-method": "POST"}
+        for answer in (
+            await http.options("/v1/grasps", headers=headers),
+            await http.get("/v1/models", headers=headers),
+        ):
+            assert not [name for name in answer.headers if name.startswith("access-control")]
+
+
+async def test_only_this_machine_by_default(serving) -> None:
+    async with serving() as server:
+        assert server.grpc_address.startswith("127.0.0.1:")
+        assert server.http_url.startswith("http://127.0.0.1:")
+
+
+class TestTokens:
+    @pytest.mark.parametrize(
+        ("header", "admin", "error"),
+        [
+            (f"Bearer {USER}", False, None),
+            (f"bearer  {SECOND} ", False, None),
+            (f"Bearer {ADMIN}", False, None),
+            (f"Bearer {ADMIN}", True, None),
+            (f"Bearer {USER}", True, PermissionDenied),
+            (f"Bearer {WRONG}", True, Unauthenticated),
+            (None, True, Unauthenticated),
+            (None, False, Unauthenticated),
+            ("", False, Unauthenticated),
+            ("Bearer", False, Unauthenticated),
+            (f"Basic {USER}", False, Unauthenticated),
+            (USER, False, Unauthenticated),
+            ("Bearer \udcff\xff", False, Unauthenticated),
+        ],
+    )
+    def test_check(self, header: str | None, admin: bool, error: type[Exception] | None) -> None:
+        known = Tokens([USER, SECOND], [ADMIN])
+        if error is None:
+            known.check(header, admin=admin)
+        else:
+            with pytest.raises(error):
+                known.check(header, admin=admin)
+
+    def test_without_tokens_all_but_administration_is_open(self) -> None:
+        Tokens().check(None)
+        with pytest.raises(PermissionDenied, match="SIGHUP"):
+            Tokens().check(f"Bearer {ADMIN}", admin=True)
+
+    def test_comparison_takes_as_long_whichever_token_it_is(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        compared: list[tuple[int, int]] = []
+
+        def compare(first: bytes, second: bytes) -> bool:
+            compared.append((len(first), len(second)))
+            return first == second
+
+        known = Tokens([USER, SECOND], [ADMIN])
+        monkeypatch.setattr(tokens.hmac, "compare_digest", compare)
+        known.check(f"Bearer {USER}")
+        assert compared == [(32, 32)] * 3
+
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            ("short\n", "got 5 letters as token 1"),
+            (f"{USER}\ntwo words of enough letters\n", "token 2"),
+            ("# none\n", "It holds no token"),
+            (b"\xff\xfe", "cannot be read"),
+            (None, "cannot be read"),
+        ],
+    )
+    def test_bad_files_are_named(
+        self, tmp_path: Path, text: str | bytes | None, sentence: str
+    ) -> None:
+        path = tmp_path / "tokens"
+        if text is not None:
+            path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        with pytest.raises(InvalidSettings) as caught:
+            load_tokens(Settings(token_file=path))
+        assert sentence in str(caught.value)
+        assert "short" not in str(caught.value)
+
+
+def test_the_client_refuses_what_cannot_be() -> None:
+    missing = Path("none.pem")
+    for security in (
+        {"token": "two words"},
+        {"token": "line\nbreak"},
+        {"token": ""},
+        {"tls": Tls(ca=missing)},
+    ):
+        for address in ("127.0.0.1:1", "https://127.0.0.1:1"):
+            with pytest.raises(InvalidRequestError):
+                GraspClient(address, **security)
+    with pytest.raises(InvalidRequestError, match="alone"):
+        Tls(certificate=missing)
