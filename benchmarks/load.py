@@ -1,0 +1,285 @@
+"""Measure the server under load: `python -m benchmarks.load --output benchmarks/results`.
+
+Clients run in processes of their own, over both transports, against 127.0.0.1. Four measurements:
+
+overhead   one request after the other: the server's answer against the same detector in-process
+closed     as many requests at a time as there are connections: throughput and latency
+open       requests at a fixed average rate, up to twice what the server sustains, with a deadline
+batching   8 requests at a time of a small cloud through the real network, with and without batches
+
+The dummy network sleeps for a known time, so what is left is the server's own.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from benchmarks.load_client import Sample, Task
+from benchmarks.load_picture import draw
+from benchmarks.senders import cloud, sender
+from benchmarks.served import Served, served
+
+ROOT = Path(__file__).parents[1]
+TRANSPORTS = ("grpc", "rest")
+POINTS = 20_000
+SMALL = 3_000
+OPTIONS = {"num_approach_points": 32, "num_candidates": 500}
+SMALL_OPTIONS = {"num_approach_points": 8, "num_candidates": 100}
+DUMMY_SECONDS = 0.02
+DEADLINE = 1.0  # seconds, of requests in the open loop
+OVERLOAD = 2.0  # times the sustainable rate
+START_SECONDS = 1.0  # from the order to the first request
+
+
+def main() -> None:
+    """Measure and write load.json and load.png."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "results")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
+    parser.add_argument("--pairs", type=int, default=60, help="requests that overhead compares")
+    parser.add_argument("--without-network", action="store_true", help="the dummy alone")
+    given = parser.parse_args()
+    results: dict[str, Any] = {"machine": machine()}
+    with served("--backend", "dummy", "--dummy-seconds", str(DUMMY_SECONDS)) as dummy:
+        results["overhead"] = {"dummy": overhead(dummy, dummy_in_process(), given.pairs)}
+        results["closed"] = closed(dummy, given.seconds)
+    results["open"] = open_loops(results["closed"], given.seconds)
+    if not given.without_network:
+        with served(threads=1) as real:
+            results["overhead"]["network"] = overhead(real, network_in_process(), given.pairs // 3)
+        results["batching"] = batching(given.seconds)
+    results["targets"] = targets(results)
+    given.output.mkdir(parents=True, exist_ok=True)
+    (given.output / "load.json").write_text(json.dumps(results, indent=1) + "\n")
+    draw(results, given.output / "load.png")
+    print(json.dumps(results["targets"], indent=1))
+
+
+def machine() -> dict[str, Any]:
+    """Where it was measured."""
+    return {
+        "cores": len(os.sched_getaffinity(0)),
+        "python": platform.python_version(),
+        "load_average": os.getloadavg()[0],  # other work on the machine makes everything slower
+    }
+
+
+class InProcess:
+    """A detector without a server around it."""
+
+    def __init__(self, detector: Any) -> None:
+        self._detector = detector
+
+    def seconds(self, points: Any, options: dict[str, int]) -> float:
+        """What one detection takes."""
+        from edgegrasp_model.cloud_input import CloudInput
+        from edgegrasp_model.options import parse_options
+
+        parsed = parse_options(dict(options))
+        start = time.perf_counter()
+        prepared = self._detector.prepare(CloudInput(points), parsed)
+        logits = self._detector.run(prepared.batch)
+        self._detector.finish(prepared, logits)
+        return time.perf_counter() - start
+
+
+def dummy_in_process() -> InProcess:
+    """The dummy network."""
+    from edgegrasp_service.dummy import DummyDetector
+
+    return InProcess(DummyDetector(DUMMY_SECONDS))
+
+
+def network_in_process() -> InProcess:
+    """The default weights, on one thread as in the server that is compared."""
+    import torch
+
+    from edgegrasp_model.catalogue import ModelCatalogue
+
+    torch.set_num_threads(1)
+    return InProcess(ModelCatalogue.load((), default="", grippers=()).get(""))
+
+
+def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any]:
+    """Milliseconds that an answer over a transport takes beyond the detector in this process.
+
+    The two take turns, so that what else the machine does is in both.
+    """
+    points = cloud(POINTS, seed=0)
+    found: dict[str, Any] = {}
+    for transport in TRANSPORTS:
+        alone, beyond, answers = [], [], []
+        with sender(transport, server.address(transport), points, OPTIONS) as one:
+            for _ in range(5):
+                one.send(None)
+                in_process.seconds(points, OPTIONS)
+            for _ in range(pairs):
+                alone.append(in_process.seconds(points, OPTIONS))
+                start = time.perf_counter()
+                told = one.send(None)
+                answers.append(time.perf_counter() - start)
+                beyond.append(answers[-1] - told.network_seconds)
+                if told.code != "OK":
+                    raise RuntimeError(f"{transport}: {told.code}")
+        found[transport] = {
+            "pairs": pairs,
+            "in_process_ms": percentiles(alone),
+            "served_ms": percentiles(answers),
+            "overhead_p50_ms": 1000 * (float(np.median(answers)) - float(np.median(alone))),
+            "beyond_reported_ms": percentiles(beyond),
+        }
+    return found
+
+
+def closed(server: Served, seconds: float) -> list[dict[str, Any]]:
+    """Throughput and latency by the number of requests at a time."""
+    rows = []
+    for transport in TRANSPORTS:
+        task = Task(transport, server.address(transport), POINTS, OPTIONS, seconds, seed=0)
+        for concurrency in (1, 2, 4, 8):
+            rows.append({"concurrency": concurrency} | measure(server, task, concurrency))
+    return rows
+
+
+def open_loops(closed_rows: Sequence[dict[str, Any]], seconds: float) -> list[dict[str, Any]]:
+    """What becomes of requests that come at fractions and multiples of what is sustained."""
+    rows = []
+    for transport in TRANSPORTS:
+        of_transport = [row for row in closed_rows if row["transport"] == transport]
+        sustainable = max(row["accepted_per_second"] for row in of_transport)
+        for share in (0.25, 0.5, 0.75, 0.9, 1.5, OVERLOAD):
+            with served("--backend", "dummy", "--dummy-seconds", str(DUMMY_SECONDS)) as server:
+                task = Task(
+                    transport, server.address(transport), POINTS, OPTIONS, seconds, seed=0,
+                    rate=share * sustainable, timeout=DEADLINE,
+                )  # fmt: skip
+                rows.append({"share": share} | measure(server, task, concurrency=96))
+    return rows
+
+
+def batching(seconds: float) -> dict[str, Any]:
+    """Throughput of 8 small clouds at a time with the real network, batches on and off in turns."""
+    found: dict[str, list[float]] = {"on": [], "off": []}
+    with ExitStack() as stack:
+        on = ("--batching", "--max-batch-wait-microseconds", "5000")
+        servers = {
+            "off": stack.enter_context(served(threads=1)),
+            "on": stack.enter_context(served(*on, threads=1)),
+        }
+        for _ in range(3):
+            for name, server in servers.items():
+                task = Task("grpc", server.address("grpc"), SMALL, SMALL_OPTIONS, seconds, seed=0)
+                row = measure(server, task, concurrency=8)
+                found[name].append(row["accepted_per_second"])
+    medians = {name: float(np.median(rates)) for name, rates in found.items()}
+    return {
+        "points": SMALL,
+        **SMALL_OPTIONS,
+        "concurrency": 8,
+        "requests_per_second": found,
+        "ratio": medians["on"] / medians["off"],
+    }
+
+
+def measure(server: Served, task: Task, concurrency: int) -> dict[str, Any]:
+    """Run two client processes with half of the load each (one, for one connection)."""
+    processes = min(2, concurrency)
+    before, cpu = server.memory(), server.cpu_seconds()
+    samples: list[Sample] = []
+    clients = [
+        subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.load_client"],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for _ in range(processes)
+    ]
+    for client in clients:
+        assert client.stdout is not None
+        client.stdout.readline()
+    start = time.monotonic() + START_SECONDS
+    for number, client in enumerate(clients):
+        share = replace(
+            task,
+            start=start,
+            seed=number,
+            concurrency=concurrency // processes,
+            rate=None if task.rate is None else task.rate / processes,
+        )
+        assert client.stdin is not None
+        client.stdin.write(share.text())
+        client.stdin.flush()
+    for client in clients:
+        output, _ = client.communicate(timeout=task.seconds + 120)
+        samples += [tuple(sample) for sample in json.loads(output)]
+    row = summary(samples, start, task.seconds)
+    row |= {"transport": task.transport, "points": task.points, "rate": task.rate}
+    row |= {
+        "memory_before_mb": before,
+        "memory_after_mb": server.memory(),
+        "memory_peak_mb": server.peak_memory(),
+        "server_cpu_ms_per_request": 1000 * (server.cpu_seconds() - cpu) / max(1, len(samples)),
+    }
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def summary(samples: Sequence[Sample], start: float, seconds: float) -> dict[str, Any]:
+    """Latencies of what was accepted and refused, and how many there were."""
+    codes = [code for _, _, code, _ in samples]
+    took = {code: [s for _, s, other, _ in samples if other == code] for code in set(codes)}
+    accepted = took.get("OK", [])
+    end = max((due + s for due, s, code, _ in samples if code == "OK"), default=start)
+    return {
+        "requests": len(samples),
+        "codes": {code: len(times) for code, times in sorted(took.items())},
+        "accepted_per_second": len(accepted) / max(seconds, end - start),
+        "accepted_ms": percentiles(accepted),
+        "refused_ms": percentiles(took.get("RESOURCE_EXHAUSTED", [])),
+    }
+
+
+def percentiles(seconds: Sequence[float]) -> dict[str, float] | None:
+    """In milliseconds; None of nothing."""
+    if not seconds:
+        return None
+    values = np.percentile(np.array(seconds) * 1000, (50, 90, 95, 99, 100)).round(3)
+    return dict(zip(("p50", "p90", "p95", "p99", "max"), values.tolist(), strict=True))
+
+
+def targets(results: dict[str, Any]) -> dict[str, Any]:
+    """The figures that the project asks of itself, beside what was measured."""
+    found: dict[str, Any] = {}
+    for name, limit in (("grpc", 3.0), ("rest", 6.0)):
+        for kind, both in results["overhead"].items():
+            found[f"{name}: overhead p50 with the {kind}, ms (<= {limit:g})"] = round(
+                both[name]["overhead_p50_ms"], 2
+            )
+    for row in results["open"]:
+        if row["share"] != OVERLOAD:
+            continue
+        name = f"{row['transport']}: at {OVERLOAD:g} times the sustainable rate"
+        found[f"{name}, p99 of accepted, ms (<= {1000 * DEADLINE:g})"] = row["accepted_ms"]["p99"]
+        found[f"{name}, refused, ms (<= 50)"] = row["refused_ms"]
+        found[f"{name}, codes"] = row["codes"]
+    if "batching" in results:
+        found["batching: throughput of 8 small clouds, ratio (>= 1.3, or off by default)"] = round(
+            results["batching"]["ratio"], 2
+        )
+    return found
+
+
+if __name__ == "__main__":
+    main()
