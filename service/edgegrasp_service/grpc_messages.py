@@ -117,7 +117,16 @@ def scoring_message(scoring: Scoring) -> grasp_pb2.ScoreGraspsResponse:
 
 def models_message(models: list[ModelInfo]) -> grasp_pb2.ListModelsResponse:
     """Loaded weights as a message."""
-    return grasp_pb2.ListModelsResponse(models=[grasp_pb2.Model(**vars(model)) for model in models])
+    return grasp_pb2.ListModelsResponse(models=_models(models))
+
+
+def reloaded_message(models: list[ModelInfo]) -> grasp_pb2.ReloadModelsResponse:
+    """Weights loaded anew as a message."""
+    return grasp_pb2.ReloadModelsResponse(models=_models(models))
+
+
+def _models(models: list[ModelInfo]) -> list[grasp_pb2.Model]:
+    return [grasp_pb2.Model(**vars(model)) for model in models]
 
 
 def error_message(problem: ErrorReport) -> grasp_pb2.ErrorDetail:

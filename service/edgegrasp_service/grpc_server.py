@@ -20,11 +20,13 @@ from edgegrasp_service.grpc_messages import (
     detection_message,
     error_message,
     models_message,
+    reloaded_message,
     score_request_from_message,
     scoring_message,
 )
 from edgegrasp_service.grpc_stream import answer_stream, check_size, detect
 from edgegrasp_service.observer import observed
+from edgegrasp_service.reload import Reloader, reload_models
 from edgegrasp_service.request_id import REQUEST_ID
 
 logger = logging.getLogger(__name__)
@@ -35,8 +37,9 @@ SERVICE_NAME = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"].full_name
 class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
     """edgegrasp.v1.GraspService over a service core."""
 
-    def __init__(self, service: GraspService) -> None:
+    def __init__(self, service: GraspService, reloader: Reloader | None = None) -> None:
         self._service = service
+        self._reloader = reloader
 
     async def DetectGrasps(  # noqa: N802
         self, request: grasp_pb2.DetectGraspsRequest, context: Any
@@ -80,6 +83,15 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         except Exception as error:
             await _abort(context, error)
 
+    async def ReloadModels(  # noqa: N802
+        self, request: grasp_pb2.ReloadModelsRequest, context: Any
+    ) -> grasp_pb2.ReloadModelsResponse:
+        """Load weights and tokens anew."""
+        try:
+            return reloaded_message(await reload_models(self._reloader))
+        except Exception as error:
+            await _abort(context, error)
+
 
 class GrpcServer:
     """A grpc.aio server with the grasp service, health checks and reflection.
@@ -92,6 +104,7 @@ class GrpcServer:
         port: 0: any free port.
         interceptors: Around every method, the first outermost.
         credentials: For TLS; None: without.
+        reloader: None: nobody may reload.
 
     Raises:
         AddressInUse: The port cannot be bound.
@@ -105,6 +118,7 @@ class GrpcServer:
         *,
         interceptors: Sequence[GrpcEdge] = (),
         credentials: grpc.ServerCredentials | None = None,
+        reloader: Reloader | None = None,
     ) -> None:
         # Messages somewhat over the limit come in to be refused with field, value and fix.
         longest = service.settings.max_body_bytes + MAX_DROPPED_BYTES
@@ -122,7 +136,7 @@ class GrpcServer:
         ]
         self._server = aio.server(interceptors=interceptors, options=options)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        servicer = GraspServicer(service)
+        servicer = GraspServicer(service, reloader)
         grasp_pb2_grpc.add_GraspServiceServicer_to_server(servicer, self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (SERVICE_NAME, health.SERVICE_NAME, reflection.SERVICE_NAME)

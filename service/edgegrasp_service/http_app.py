@@ -32,6 +32,7 @@ from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
 from edgegrasp_service.http_problem import problem_response
 from edgegrasp_service.http_request import read_request, read_score_request, read_timeout
 from edgegrasp_service.observer import observed
+from edgegrasp_service.reload import Reloader, reload_models
 from edgegrasp_service.request_id import REQUEST_ID
 
 logger = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ PROBLEM = {"content": {"application/problem+json": {"schema": ProblemBody.model_
 
 PROBLEMS: dict[int | str, dict[str, Any]] = {
     400: {"description": "The cloud or an option is wrong.", **PROBLEM},
+    401: {"description": "No token, or none that the server knows.", **PROBLEM},
     404: {"description": "No weights of that name.", **PROBLEM},
     413: {"description": "Over the server's limits.", **PROBLEM},
     415: {"description": "A body the server does not read.", **PROBLEM},
@@ -57,9 +59,16 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
     504: {"description": "The deadline passed before there was an answer.", **PROBLEM},
 }
 
+RELOAD_PROBLEMS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "No token, or none that the server knows.", **PROBLEM},
+    403: {"description": "A token for detection, or a server without admin tokens.", **PROBLEM},
+    409: {"description": "New weights cannot be used; the old ones still serve.", **PROBLEM},
+    503: PROBLEMS[503],
+}
 
-def create_app(service: GraspService) -> FastAPI:
-    """The ASGI application over a service core."""
+
+def create_app(service: GraspService, reloader: Reloader | None = None) -> FastAPI:
+    """The ASGI application over a service core; without a reloader, nobody may reload."""
     app = FastAPI(title="EdgeGrasp", version="v1", description=DESCRIPTION, redoc_url=None)
     app.add_middleware(BodyLimit, max_body_bytes=service.settings.max_body_bytes)
     for error in (EdgeGraspError, Exception):
@@ -93,6 +102,15 @@ def create_app(service: GraspService) -> FastAPI:
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
     async def list_models() -> JSONResponse:
         return JSONResponse(models_body(service.models()))
+
+    @app.post(
+        "/v1/models:reload",
+        summary="Load weights and tokens anew; needs an admin token",
+        response_model=ModelsBody,
+        responses=RELOAD_PROBLEMS,
+    )
+    async def reload() -> JSONResponse:
+        return JSONResponse(models_body(await reload_models(reloader)))
 
     @app.get("/health/live", summary="Does the process answer?", response_model=HealthBody)
     async def live() -> JSONResponse:

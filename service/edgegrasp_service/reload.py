@@ -7,8 +7,8 @@ from collections.abc import Callable
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.core import GraspService, ModelInfo
 from edgegrasp_service.edge import Edge
-from edgegrasp_service.errors import NotReady, ReloadFailed
-from edgegrasp_service.tokens import Tokens
+from edgegrasp_service.errors import NotReady, PermissionDenied, ReloadFailed
+from edgegrasp_service.tokens import ADMIN_FIX, HEADER, Tokens
 
 logger = logging.getLogger(__name__)
 
@@ -86,3 +86,10 @@ class Reloader:
             await self.reload()
         except EdgeGraspError as error:
             logger.warning("SIGHUP: %s", error)
+
+
+async def reload_models(reloader: Reloader | None) -> list[ModelInfo]:
+    """As `Reloader.reload`; raises PermissionDenied where there is none."""
+    if reloader is None:
+        raise PermissionDenied(HEADER, "a call that this server takes from nobody", ADMIN_FIX)
+    return await reloader.reload()

@@ -145,12 +145,13 @@ class Server:
             self._settings.grpc_port,
             interceptors=[GrpcEdge(self._edge)],
             credentials=None if self._tls is None else self._tls.grpc,
+            reloader=self.reloader,
         )
 
     def _http_server(self) -> "_HttpServer":
         tls = self._tls
         config = uvicorn.Config(
-            HttpEdge(create_app(self._service), self._edge),
+            HttpEdge(create_app(self._service, self.reloader), self._edge),
             log_config=None,
             access_log=False,
             lifespan="off",

@@ -196,6 +196,7 @@ def test_openapi_has_no_dangling_reference() -> None:
         "/v1/grasps",
         "/v1/grasps:score",
         "/v1/models",
+        "/v1/models:reload",
         "/health/live",
         "/health/ready",
     }

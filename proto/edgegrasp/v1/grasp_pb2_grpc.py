@@ -54,6 +54,11 @@ class GraspServiceStub:
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.SerializeToString,
                 response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.FromString,
                 _registered_method=True)
+        self.ReloadModels = channel.unary_unary(
+                '/edgegrasp.v1.GraspService/ReloadModels',
+                request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsRequest.SerializeToString,
+                response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsResponse.FromString,
+                _registered_method=True)
 
 
 class GraspServiceServicer:
@@ -95,6 +100,18 @@ class GraspServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReloadModels(self, request, context):
+        """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
+        answer until the new ones are warm, and all that came before. Needs an admin token.
+        FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
+        UNAUTHENTICATED      no token, or none that the server knows
+        PERMISSION_DENIED    a token for detection only, or a server without admin tokens
+        UNAVAILABLE          the first weights are still loading, or the server is stopping
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_GraspServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -117,6 +134,11 @@ def add_GraspServiceServicer_to_server(servicer, server):
                     servicer.ListModels,
                     request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.FromString,
                     response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.SerializeToString,
+            ),
+            'ReloadModels': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReloadModels,
+                    request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsRequest.FromString,
+                    response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -227,6 +249,33 @@ class GraspService:
             '/edgegrasp.v1.GraspService/ListModels',
             edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.SerializeToString,
             edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReloadModels(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/edgegrasp.v1.GraspService/ReloadModels',
+            edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsRequest.SerializeToString,
+            edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsResponse.FromString,
             options,
             channel_credentials,
             insecure,

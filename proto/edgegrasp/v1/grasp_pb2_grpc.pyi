@@ -56,6 +56,14 @@ class GraspServiceStub:
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]
     """Lists the weights that options.model can name."""
+    ReloadModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]
+    """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
+    answer until the new ones are warm, and all that came before. Needs an admin token.
+      FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
+      UNAUTHENTICATED      no token, or none that the server knows
+      PERMISSION_DENIED    a token for detection only, or a server without admin tokens
+      UNAVAILABLE          the first weights are still loading, or the server is stopping
+    """
 
 @_typing.type_check_only
 class GraspServiceAsyncStub(GraspServiceStub):
@@ -78,6 +86,14 @@ class GraspServiceAsyncStub(GraspServiceStub):
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]  # type: ignore[assignment]
     """Lists the weights that options.model can name."""
+    ReloadModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]  # type: ignore[assignment]
+    """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
+    answer until the new ones are warm, and all that came before. Needs an admin token.
+      FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
+      UNAUTHENTICATED      no token, or none that the server knows
+      PERMISSION_DENIED    a token for detection only, or a server without admin tokens
+      UNAVAILABLE          the first weights are still loading, or the server is stopping
+    """
 
 class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
     @_abc_1.abstractmethod
@@ -121,5 +137,19 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_grasp_pb2.ListModelsResponse, _abc.Awaitable[_grasp_pb2.ListModelsResponse]]:
         """Lists the weights that options.model can name."""
+
+    @_abc_1.abstractmethod
+    def ReloadModels(
+        self,
+        request: _grasp_pb2.ReloadModelsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_grasp_pb2.ReloadModelsResponse, _abc.Awaitable[_grasp_pb2.ReloadModelsResponse]]:
+        """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
+        answer until the new ones are warm, and all that came before. Needs an admin token.
+          FAILED_PRECONDITION  new weights cannot be used; the old ones still serve
+          UNAUTHENTICATED      no token, or none that the server knows
+          PERMISSION_DENIED    a token for detection only, or a server without admin tokens
+          UNAVAILABLE          the first weights are still loading, or the server is stopping
+        """
 
 def add_GraspServiceServicer_to_server(servicer: GraspServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...
