@@ -81,7 +81,8 @@ def remove_map_entry_field(file: File) -> None:
 
 
 def remove_rpc(file: File) -> None:
-    del file.service[0].method[1]
+    methods = file.service[0].method
+    methods.remove(next(method for method in methods if method.name == "ScoreGrasps"))
 
 
 def remove_service(file: File) -> None:
