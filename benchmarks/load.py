@@ -118,7 +118,7 @@ def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any
     points = cloud(POINTS, seed=0)
     found: dict[str, Any] = {}
     for transport in TRANSPORTS:
-        alone, beyond, answers = [], [], []
+        alone, answers = [], []
         with sender(transport, server.address(transport), points, OPTIONS) as one:
             for _ in range(5):
                 one.send(None)
@@ -128,7 +128,6 @@ def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any
                 start = time.perf_counter()
                 told = one.send(None)
                 answers.append(time.perf_counter() - start)
-                beyond.append(answers[-1] - told.network_seconds)
                 if told.code != "OK":
                     raise RuntimeError(f"{transport}: {told.code}")
         found[transport] = {
@@ -136,7 +135,6 @@ def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any
             "in_process_ms": percentiles(alone),
             "served_ms": percentiles(answers),
             "overhead_p50_ms": 1000 * (float(np.median(answers)) - float(np.median(alone))),
-            "beyond_reported_ms": percentiles(beyond),
         }
     return found
 
@@ -238,10 +236,10 @@ def measure(server: Served, task: Task, concurrency: int) -> dict[str, Any]:
 
 def summary(samples: Sequence[Sample], start: float, seconds: float) -> dict[str, Any]:
     """Latencies of what was accepted and refused, and how many there were."""
-    codes = [code for _, _, code, _ in samples]
-    took = {code: [s for _, s, other, _ in samples if other == code] for code in set(codes)}
+    codes = [code for _, _, code in samples]
+    took = {code: [s for _, s, other in samples if other == code] for code in set(codes)}
     accepted = took.get("OK", [])
-    end = max((due + s for due, s, code, _ in samples if code == "OK"), default=start)
+    end = max((due + s for due, s, code in samples if code == "OK"), default=start)
     return {
         "requests": len(samples),
         "codes": {code: len(times) for code, times in sorted(took.items())},

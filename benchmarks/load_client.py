@@ -1,8 +1,8 @@
 """One client process of benchmarks/load.py: told what to send on stdin, writes samples to stdout.
 
-A sample is [moment due, seconds until the answer, code, the detector's own seconds]. In an open
-loop requests are due at fixed moments whatever became of those before, and their seconds count
-from then, so that a server that stalls cannot hide it by slowing its clients down.
+A sample is [moment due, seconds until the answer, code]. In an open loop requests are due at
+fixed moments whatever became of those before, and their seconds count from then, so that a server
+that stalls cannot hide it by slowing its clients down.
 """
 
 import json
@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from benchmarks.senders import cloud, sender, wait_until
 
-Sample = tuple[float, float, str, float]
+Sample = tuple[float, float, str]
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ def run(task: Task) -> list[Sample]:
                     return
                 wait_until(moment)
                 told = one.send(task.timeout)
-                sample = (moment, time.monotonic() - moment, told.code, told.network_seconds)
-                samples.append(sample)
+                samples.append((moment, time.monotonic() - moment, told.code))
 
     with ThreadPoolExecutor(task.concurrency) as pool:
         for future in [pool.submit(work) for _ in range(task.concurrency)]:
