@@ -16,42 +16,65 @@ class BallCrop(NamedTuple):
 
     ball_rows: NDArray[np.int64]  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: NDArray[np.int64]  # (P,) ascending, 0..A-1
-    neighbors: NDArray[np.int64]  # (P, k) rows of `ball_rows`, nearest (the point itself) first
+    radius: float  # metres
 
 
 def crop_balls(
     points: NDArray[np.float32],  # (N, 3)
     approach_index: NDArray[np.integer],  # (A,)
     radius: float,
-    k: int = 16,
 ) -> BallCrop:
-    """Crops a ball around each approach point and joins its points to their k nearest in it.
+    """Crops a ball around each approach point.
 
-    A cloud point within two balls counts twice, once for each. The point itself is one of its k
-    neighbours; where a ball holds fewer than k points, the own row fills the rest, which changes
-    no maximum over neighbours.
+    A cloud point within two balls counts twice, once for each.
 
     Args:
         points: The cloud (N, 3), metres, any frame.
         approach_index: Rows (A,) of `points`; one ball each, in this order.
         radius: Ball radius, metres.
-        k: Neighbours per point, itself included.
 
-    Source: paper section (the ball of radius G_w / 2) and its PointNet++ graph of 16 nearest.
+    Source: paper section (the ball of radius G_w / 2).
     """
     approach_index = np.asarray(approach_index, dtype=np.int64)
     members = cKDTree(points).query_ball_point(points[approach_index], radius, return_sorted=True)
     ball_of_point = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
     ball_rows = np.concatenate([np.empty(0), *members]).astype(np.int64)
-    centred = points[ball_rows] - points[approach_index[ball_of_point]]
+    return BallCrop(ball_rows, ball_of_point, radius)
+
+
+def nearest_in_ball(
+    points: NDArray[np.float32],  # (N, 3)
+    approach_index: NDArray[np.integer],  # (A,)
+    crop: BallCrop,
+    k: int = 16,
+) -> NDArray[np.int64]:
+    """Joins the points of balls to their k nearest in the same ball.
+
+    The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
+    row fills the rest, which changes no maximum over neighbours.
+
+    Args:
+        points: The cloud (N, 3), metres.
+        approach_index: Rows (A,) of `points`, as given to `crop_balls`.
+        crop: P ball points.
+        k: Neighbours per point, itself included.
+
+    Returns:
+        (P, k) rows of `crop.ball_rows`, nearest (the point itself) first.
+
+    Source: paper section IV (its PointNet++ graph of 16 nearest).
+    """
+    centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
+    centred = points[crop.ball_rows] - centre
     # One search for all balls: a fourth coordinate keeps them further apart than any is wide.
-    lifted = np.column_stack((centred, ball_of_point * (8.0 * radius)))
+    lifted = np.column_stack((centred, crop.ball_of_point * (8.0 * crop.radius)))
     if len(lifted) == 0:
-        return BallCrop(ball_rows, ball_of_point, np.empty((0, k), dtype=np.int64))
-    _, neighbors = cKDTree(lifted).query(lifted, k=range(1, k + 1), distance_upper_bound=4 * radius)
+        return np.empty((0, k), dtype=np.int64)
+    _, neighbors = cKDTree(lifted).query(
+        lifted, k=range(1, k + 1), distance_upper_bound=4 * crop.radius
+    )
     own_row = np.arange(len(lifted))[:, None]
-    neighbors = np.where(neighbors == len(lifted), own_row, neighbors).astype(np.int64)
-    return BallCrop(ball_rows, ball_of_point, neighbors)
+    return np.where(neighbors == len(lifted), own_row, neighbors).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -69,7 +92,6 @@ class BallBatch:
     contact: Tensor  # (E,) int64, rows of `points`: the contact point of each edge grasp
     approach: Tensor  # (E, 3) float32, outward approach direction u, unit length
     depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
-    hand_description: Tensor | None = None  # (E, F) float32, the cloud in each grasp's hand frame
 
     @classmethod
     def from_cloud(
@@ -81,7 +103,7 @@ class BallBatch:
         contact: NDArray[np.integer],  # (E,)
         approach: NDArray[np.float32],  # (E, 3)
         depth: NDArray[np.float32],  # (E,)
-        hand_description: NDArray[np.float32] | None = None,  # (E, F)
+        k: int = 16,
     ) -> Self:
         """Packs a cloud and its balls.
 
@@ -93,19 +115,18 @@ class BallBatch:
             contact: Rows (E,) of `crop.ball_rows`, not of the cloud: a contact has a ball.
             approach: Outward approach directions (E, 3), unit length.
             depth: Depths (E,), metres.
-            hand_description: What the classifier is told beside, (E, F), or none.
+            k: Neighbours per point, itself included.
         """
         centre = points[approach_index][crop.ball_of_point]
         return cls(
             points=_float_tensor(points[crop.ball_rows] - centre),
             normals=_float_tensor(normals[crop.ball_rows]),
-            neighbors=torch.from_numpy(crop.neighbors),
+            neighbors=torch.from_numpy(nearest_in_ball(points, approach_index, crop, k)),
             ball_of_point=torch.from_numpy(crop.ball_of_point),
             num_balls=len(approach_index),
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=_float_tensor(approach),
             depth=_float_tensor(depth),
-            hand_description=None if hand_description is None else _float_tensor(hand_description),
         )
 
     @staticmethod
@@ -113,17 +134,10 @@ class BallBatch:
         """Joins batches into one; scores come out in the same order.
 
         Raises:
-            ValueError: No batch, or only some of them have a hand description.
+            ValueError: No batch.
         """
         if not batches:
             raise ValueError("batches: got none. Give at least one BallBatch.")
-        described = [batch.hand_description for batch in batches]
-        present = [description for description in described if description is not None]
-        if len(present) not in (0, len(batches)):
-            raise ValueError(
-                f"hand_description: present in {len(present)} of {len(batches)} batches. "
-                "Give it in all of them or in none."
-            )
         first_point = np.cumsum([0] + [len(batch.points) for batch in batches]).tolist()
         first_ball = np.cumsum([0] + [batch.num_balls for batch in batches]).tolist()
         return BallBatch(
@@ -141,7 +155,6 @@ class BallBatch:
             ),
             approach=torch.cat([batch.approach for batch in batches]),
             depth=torch.cat([batch.depth for batch in batches]),
-            hand_description=torch.cat(present) if present else None,
         )
 
     @property
@@ -157,7 +170,6 @@ class BallBatch:
 
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
-        description = self.hand_description
         return BallBatch(
             points=self.points.to(device),
             normals=self.normals.to(device),
@@ -167,7 +179,6 @@ class BallBatch:
             contact=self.contact.to(device),
             approach=self.approach.to(device),
             depth=self.depth.to(device),
-            hand_description=None if description is None else description.to(device),
         )
 
 

@@ -96,7 +96,7 @@ class ModelCatalogue:
                 "crop_radius": detector.metadata.crop_radius,
                 "voxel_size": detector.metadata.voxel_size,
                 "gripper": detector.metadata.gripper,
-                "hand_description": detector.metadata.network.hand_description_size > 0,
+                "hand_description": detector.metadata.network.architecture == "hand",
             }
             for name, detector in sorted(self._detectors.items())
         ]

@@ -16,13 +16,13 @@ from edgegrasp_model.assembly import debug_info, grasps_in_cloud
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
 from edgegrasp_model.cloud_input import CheckedCloud, check_cloud
-from edgegrasp_model.collision import UP, clearances, widths_needed
+from edgegrasp_model.collision import clearances, widths_needed
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.evaluation import Scorer, evaluate
+from edgegrasp_model.evaluation import Scorer, evaluate, hand_batch
 from edgegrasp_model.given_grasps import check_edges, check_hand_poses, from_edges, from_hand_poses
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.gripper_choice import chosen_gripper
-from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.preparation import Sample, sample_candidates
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
@@ -30,6 +30,7 @@ from edgegrasp_model.scene import Scene, build_scene
 from edgegrasp_model.selection import select
 
 Float32 = NDArray[np.float32]
+Batch = BallBatch | HandBatch
 
 
 @dataclass
@@ -42,7 +43,7 @@ class Prepared:
     scene: Scene | None = None
     sample: Sample | None = None
     width: Float32 | None = None  # (E,) metres
-    batch: BallBatch | None = None  # None where there is nothing to score
+    batch: Batch | None = None  # None where there is nothing to score
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -133,8 +134,8 @@ class GraspDetector:
             )
             return prepared
         with prepared.timed("candidates"):
-            radius, k = prepared.crop_radius, self.metadata.k
-            sample = sample_candidates(scene, options, gripper, radius, k, prepared.counts)
+            radius = prepared.crop_radius
+            sample = sample_candidates(scene, options, gripper, radius, prepared.counts)
         prepared.sample = sample
         if len(sample.candidates) == 0:
             prepared.warnings.append("no candidate satisfies every constraint; see counts.")
@@ -144,7 +145,7 @@ class GraspDetector:
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
-    def run(self, batch: BallBatch) -> Float32:
+    def run(self, batch: Batch) -> Float32:
         """Second stage: the network's logits.  # (E,)."""
         with torch.inference_mode():
             logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
@@ -213,8 +214,7 @@ class GraspDetector:
             scorer = Scorer(
                 lambda batch: self._probability(self.run(batch)),
                 prepared.crop_radius,
-                self.metadata.k,
-                self.metadata.network.hand_description_size > 0,
+                self.metadata.network,
             )
             with prepared.timed("candidates"):
                 if edges is None:
@@ -262,12 +262,10 @@ class GraspDetector:
         probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-scaled))
         return probability
 
-    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> BallBatch:
-        candidates, description = sample.candidates, None
-        if self.metadata.network.hand_description_size:
-            description = describe_hands(
-                scene.cloud, candidates, gripper, UP, scene.support, sample.view
-            )
+    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> Batch:
+        candidates, network = sample.candidates, self.metadata.network
+        if network.architecture == "hand":
+            return hand_batch(scene, candidates, gripper, network, sample.view)
         return BallBatch.from_cloud(
             scene.cloud.points,
             scene.cloud.normals,
@@ -276,5 +274,5 @@ class GraspDetector:
             candidates.pair,
             candidates.approach,
             candidates.depth,
-            description,
+            network.k,
         )

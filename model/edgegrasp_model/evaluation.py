@@ -1,4 +1,4 @@
-"""Score the edges and hand poses that a caller gives, ball by ball."""
+"""Score the edges and hand poses that a caller gives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,8 +12,9 @@ from edgegrasp_model.candidates import Candidates
 from edgegrasp_model.collision import UP, clearances, collides, collision_reach, widths_needed
 from edgegrasp_model.given_grasps import Given
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import describe_hands
-from edgegrasp_model.hand_view import hand_views
+from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.hand_view import HandView, hand_views
+from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import Collision
 from edgegrasp_model.results import Evaluation
 from edgegrasp_model.scene import Scene
@@ -27,10 +28,9 @@ Float32 = NDArray[np.float32]
 class Scorer:
     """A network as the evaluation sees it."""
 
-    probability: Callable[[BallBatch], NDArray[np.floating]]
+    probability: Callable[[BallBatch | HandBatch], NDArray[np.floating]]
     crop_radius: float  # metres
-    k: int
-    described: bool  # whether it reads the hand-frame description
+    network: NetworkConfig
 
 
 def evaluate(
@@ -47,28 +47,10 @@ def evaluate(
     """
     candidates = given.candidates
     view = hand_views(scene.cloud, candidates.T_cloud_hand, collision_reach(gripper, request))
-    description = None
-    if scorer.described:
-        description = describe_hands(scene.cloud, candidates, gripper, UP, scene.support, view)
-    score = np.empty(len(candidates))
-    balls = np.unique(candidates.approach_index)
-    for start in range(0, len(balls), BALLS_AT_A_TIME):
-        some = balls[start : start + BALLS_AT_A_TIME]
-        crop = crop_balls(scene.cloud.points, some, scorer.crop_radius, scorer.k)
-        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
-        here = candidates.take(rows)
-        score[rows] = scorer.probability(
-            BallBatch.from_cloud(
-                scene.cloud.points,
-                scene.cloud.normals,
-                some,
-                crop,
-                _contact_rows(here, some, crop, len(scene.cloud.points)),
-                here.approach,
-                here.depth,
-                None if description is None else description[rows],
-            )
-        )
+    if scorer.network.architecture == "hand":
+        score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network, view))
+    else:
+        score = _score_balls(scene, candidates, scorer)
     if given.T_cloud_hand is not None:
         candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
     hands = candidates.T_cloud_hand
@@ -85,6 +67,41 @@ def evaluate(
     for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
         evaluations[number] = Evaluation(grasp, None)
     return evaluations
+
+
+def hand_batch(
+    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
+) -> HandBatch:
+    """What the hand network is told of some candidates of a scene."""
+    return HandBatch.from_cloud(
+        scene.cloud,
+        candidates,
+        gripper,
+        UP,
+        scene.support,
+        scene.viewpoint,
+        network.hand_points,
+        view,
+    )
+
+
+def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> NDArray[np.floating]:
+    """Scores (E,), ball by ball: there are as many balls as the caller has approach points."""
+    score = np.empty(len(candidates))
+    points, normals = scene.cloud.points, scene.cloud.normals
+    balls = np.unique(candidates.approach_index)
+    for start in range(0, len(balls), BALLS_AT_A_TIME):
+        some = balls[start : start + BALLS_AT_A_TIME]
+        crop = crop_balls(points, some, scorer.crop_radius)
+        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
+        here = candidates.take(rows)
+        contact = _contact_rows(here, some, crop, len(points))
+        score[rows] = scorer.probability(
+            BallBatch.from_cloud(
+                points, normals, some, crop, contact, here.approach, here.depth, scorer.network.k
+            )
+        )
+    return score
 
 
 def _contact_rows(

@@ -1,8 +1,8 @@
 """Describe each candidate by what the cloud looks like from its own hand.
 
-Invariant under rotations and translations of the whole scene by construction, and quick to learn
-from: how many points the hand would hit, what lies between its fingers, how it stands to gravity
-and support. The classifier of `edgegrasp-plus` reads it beside the paper's edge feature.
+Invariant under rotations, translations and reflections of the whole scene by construction, and
+quick to learn from: how many points the hand would hit, what lies between its fingers, from where
+it was seen, how it stands to gravity and support.
 """
 
 import numpy as np
@@ -58,9 +58,13 @@ def describe_hands(
     gripper: Gripper,
     up: Float32,
     support: SupportPlane | None,
+    viewpoint: Float32 | None = None,
     view: HandView | None = None,
 ) -> Float32:
     """The hand-frame description of each candidate.
+
+    A hand and what it would grasp may be mirrored in the hand's x without changing the outcome:
+    where the viewpoint is known, each is described with the camera on the side of positive x.
 
     Args:
         cloud: N points with normals.
@@ -68,6 +72,7 @@ def describe_hands(
         gripper: Fingers open to its maximum.
         up: (3,) away from gravity.
         support: Plane that heights are measured from; None where it is unknown.
+        viewpoint: (3,) the camera; None where it is unknown, or there are several.
         view: `hand_views` of the same candidates, where the caller has it already.
 
     Returns:
@@ -78,12 +83,27 @@ def describe_hands(
     x, y, z = (np.ascontiguousarray(column) for column in view.position.T)
     turn = candidates.T_cloud_hand[view.candidate, :3, :3]
     normal = np.einsum("pd,pdk->kp", cloud.normals[view.row], turn)  # (3, P)
+    side = mirror_sides(candidates.T_cloud_hand, viewpoint)
+    x, normal[0] = x * side[view.candidate], normal[0] * side[view.candidate]
     columns = [
         *_hits(view, x, y, z, gripper),
         *_between_fingers(view, x, y, z, normal, gripper),
+        *_directions(candidates.T_cloud_hand, viewpoint, up, side),
         *_stance(cloud, candidates, gripper, up, support),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
+
+
+def mirror_sides(T_cloud_hand: Float32, viewpoint: Float32 | None) -> Float32:
+    """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
+
+    1 for all where the viewpoint is not known.
+    """
+    if viewpoint is None:
+        return np.ones(len(T_cloud_hand), dtype=np.float32)
+    toward = viewpoint - T_cloud_hand[:, :3, 3]
+    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
 
 
 def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -91,6 +111,20 @@ def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
     unknown = description.copy()
     unknown[:, -HEIGHTS:] = UNKNOWN_HEIGHT
     return unknown
+
+
+def _directions(
+    T_cloud_hand: Float32, viewpoint: Float32 | None, up: Float32, side: Float32
+) -> list[Float32]:
+    """Where the camera and up are, in hand frames; a camera that is not known is nowhere."""
+    mirrored = T_cloud_hand[:, :3, :3].copy()
+    mirrored[:, :, 0] *= side[:, None]
+    toward = np.zeros((len(mirrored), 3), dtype=np.float32)
+    if viewpoint is not None:
+        toward = viewpoint - T_cloud_hand[:, :3, 3]
+        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
+    return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
 
 
 def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:
@@ -193,5 +227,5 @@ def _stance(
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
 
 
-HAND_DESCRIPTION_SIZE = 44
+HAND_DESCRIPTION_SIZE = 50
 HEIGHTS = 3  # the last of them: heights over the support plane

@@ -26,40 +26,6 @@ class SharedLinear(nn.Linear):
         return rows
 
 
-class HandDescription(nn.Module):
-    """Reads a batch's hand description, standardised by stored statistics.
-
-    Until they are set, the description passes as it is.
-    """
-
-    mean: Tensor  # (F,)
-    std: Tensor  # (F,)
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(size))
-        self.register_buffer("std", torch.ones(size))
-
-    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Stores mean (F,) and standard deviation (F,) of the training data."""
-        self.mean.copy_(mean)
-        self.std.copy_(std.clamp_min(1e-6))
-
-    def forward(self, batch: BallBatch) -> Tensor:
-        """The standardised description (E, F).
-
-        Raises:
-            ValueError: The batch carries none, or one of another size.
-        """
-        description, size = batch.hand_description, len(self.mean)
-        if description is None or description.shape[1] != size:
-            got = "none" if description is None else f"{description.shape[1]} numbers"
-            raise ValueError(
-                f"hand_description: got {got}. This network takes {size} per edge grasp."
-            )
-        return (description - self.mean) / self.std
-
-
 def mlp(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
     layers: list[nn.Module] = []

@@ -4,13 +4,15 @@ Huang, Wang, Zhu, Walters, Platt: "Edge Grasp Network: A Graph-Based SE(3)-invar
 Grasp Detection", ICRA 2023, section IV. Widths below are the paper's; P points, B balls, E grasps.
 """
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.layers import (
-    HandDescription,
     SharedLinear,
     ball_maximum,
     gather_rows,
@@ -18,7 +20,7 @@ from edgegrasp_model.layers import (
     maximum,
     mlp,
 )
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.network_config import Architecture, NetworkConfig
 from edgegrasp_model.vn_network import VNEdgeGraspNet
 
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
@@ -64,7 +66,7 @@ class GlobalFeature(nn.Module):
 
 
 class EdgeGraspNet(nn.Module):
-    """The paper's network; with `hand_description_size` also told the cloud in the hand's frame."""
+    """The paper's network."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -76,41 +78,40 @@ class EdgeGraspNet(nn.Module):
         self.ball_feature = GlobalFeature(
             config.local_width, config.global_widths_1, config.global_widths_2
         )
-        described = config.hand_description_size
-        self.description = HandDescription(described) if described else None
-        own_width = GRASP_WIDTH + width_3 + described
+        own_width = GRASP_WIDTH + width_3
         self.join = SharedLinear(
             own_width + config.global_widths_2[-1], config.classifier_widths[0]
         )
         self.classifier = mlp((*config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
-        """Scores the edge grasps of a batch: logits (E,) of success.
-
-        Raises:
-            ValueError: The batch has no hand description of the size this network was built for.
-        """
+        """Scores the edge grasps of a batch: logits (E,) of success."""
         f1 = F.relu(self.conv1(torch.cat((batch.points, batch.normals), dim=1), batch))  # (P, 32)
         f2 = F.relu(self.conv2(f1, batch))  # (P, 64)
         f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
-        grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138 + F)
+        grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
         hidden = F.relu(self.join(grasp, ball, batch.ball_of_edge))  # (E, 512)
         logits: Tensor = self.classifier(hidden).squeeze(1)  # (E, 1) -> (E,)
         return logits
 
     def _grasp_features(self, batch: BallBatch) -> Tensor:
-        """What is told of each grasp itself, (E, 10 + F)."""
+        """What is told of each grasp itself, (E, 10)."""
         contact = batch.contact
-        parts: list[Tensor] = [
+        parts = (
             batch.points[contact],
             batch.normals[contact],
             batch.depth.unsqueeze(1),
             batch.approach,
-        ]
-        if self.description is not None:
-            parts.append(self.description(batch))
+        )
         return torch.cat(parts, dim=1)
+
+
+NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
+    "edgegrasp": EdgeGraspNet,
+    "vn-edgegrasp": VNEdgeGraspNet,
+    "hand": HandNet,
+}
 
 
 def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
@@ -123,7 +124,7 @@ def build_network(config: NetworkConfig, generator: torch.Generator | None = Non
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # The layers first initialise themselves from the global stream: leave it as it was.
     with torch.random.fork_rng(devices=[]):
-        network = (EdgeGraspNet if config.architecture == "edgegrasp" else VNEdgeGraspNet)(config)
+        network = NETWORKS[config.architecture](config)
     for module in network.modules():
         if isinstance(module, nn.Linear):
             # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_args
 
-Architecture = Literal["edgegrasp", "vn-edgegrasp"]
+Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
 
-# Layers of each part; the classifier may be as deep as it likes.
+# Layers of each part of the paper's networks; the classifier may be as deep as it likes.
 _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
 
 
@@ -14,18 +14,20 @@ _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
 class NetworkConfig:
     """Shape of a network: a smaller network is another config, not another class.
 
-    Widths count channels; in `vn-edgegrasp` a channel is a 3-vector.
+    Widths count channels; in `vn-edgegrasp` a channel is a 3-vector. The paper's networks read
+    balls of points, `hand` the points around the fingers of each hand.
 
     Raises:
         ValueError: A field is out of range; names the field, the value and the fix.
     """
 
     architecture: Architecture
-    conv_widths: tuple[int, ...]  # the three graph convolutions
-    global_widths_1: tuple[int, ...]  # shared MLP before the first maximum over the ball
-    global_widths_2: tuple[int, ...]  # shared MLP before the second
     classifier_widths: tuple[int, ...]  # hidden layers
-    hand_description_size: int = 0  # numbers per grasp beside the paper's input; 0: none
+    conv_widths: tuple[int, ...] = ()  # the three graph convolutions
+    global_widths_1: tuple[int, ...] = ()  # shared MLP before the first maximum over the ball
+    global_widths_2: tuple[int, ...] = ()  # shared MLP before the second
+    hand_widths: tuple[int, ...] = ()  # of `hand`: shared MLP before the maximum over the points
+    hand_points: int = 64  # of `hand`: points around the fingers
     k: int = 16  # neighbours in the graph, the point itself included
     crop_radius: float = 0.05  # ball radius, metres
 
@@ -33,19 +35,19 @@ class NetworkConfig:
         if self.architecture not in get_args(Architecture):
             known = ", ".join(get_args(Architecture))
             raise ValueError(f"architecture: got {self.architecture!r}. Use one of: {known}.")
-        for name in (*_LAYERS, "classifier_widths"):
+        of_hand = self.architecture == "hand"
+        layers = {name: 0 if of_hand else count for name, count in _LAYERS.items()}
+        layers["hand_widths"] = max(len(self.hand_widths), 1) if of_hand else 0
+        layers["classifier_widths"] = max(len(self.classifier_widths), 1)
+        for name, count in layers.items():
             widths = tuple(getattr(self, name))
             object.__setattr__(self, name, widths)
-            count = _LAYERS.get(name, max(len(widths), 1))
             if len(widths) != count or not all(_is_count(width) for width in widths):
                 raise ValueError(f"{name}: got {widths}. Give {count} positive whole numbers.")
-        if self.hand_description_size != 0 and not _is_count(self.hand_description_size):
-            raise ValueError(
-                f"hand_description_size: got {self.hand_description_size!r}. "
-                "Give 0 or a positive whole number."
-            )
-        if not _is_count(self.k):
-            raise ValueError(f"k: got {self.k!r}. Give a positive whole number.")
+        for name in ("hand_points", "k"):
+            if not _is_count(getattr(self, name)):
+                value = getattr(self, name)
+                raise ValueError(f"{name}: got {value!r}. Give a positive whole number.")
         if not 0.0 < self.crop_radius < 1.0:
             raise ValueError(f"crop_radius: got {self.crop_radius!r}. Give metres, such as 0.05.")
 
@@ -108,5 +110,12 @@ EDGEGRASP_SMALL = NetworkConfig(
     conv_widths=(32, 64, 128),
     global_widths_1=(128, 128, 128),
     global_widths_2=(256, 256),
+    classifier_widths=(256, 128),
+)
+
+# Scores each edge grasp in the frame of its own hand; 0.11 M parameters.
+HAND = NetworkConfig(
+    architecture="hand",
+    hand_widths=(32, 64, 128),
     classifier_widths=(256, 128),
 )

@@ -51,7 +51,6 @@ def sample_candidates(
     options: DetectOptions,
     gripper: Gripper,
     crop_radius: float,
-    k: int,
     counts: dict[str, int],
 ) -> Sample:
     """Sample approach points and the candidates around them, free of collision where possible.
@@ -61,7 +60,6 @@ def sample_candidates(
         options: Sampling, constraints and seed.
         gripper: What has to fit.
         crop_radius: Radius of the balls, metres.
-        k: Neighbours in the graph.
         counts: Gets the number of candidates left after each constraint, over all rounds.
 
     Returns:
@@ -80,7 +78,7 @@ def sample_candidates(
             rng_approach,
         )
         approach_index = approach_rows[chosen]
-        crop = crop_balls(scene.cloud.points, approach_index, crop_radius, k)
+        crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
         this = _constrained(scene, approach_index, crop, options, gripper, counts)
         rounds.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])

@@ -39,6 +39,7 @@ class Scene:
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
     support: SupportPlane | None
+    viewpoint: Float32 | None  # (3,) the camera, where there is one and only one
     obstacles: SolidBoxes
 
 
@@ -101,6 +102,7 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
         support=None if support is None else _in_frame(support, frame),
+        viewpoint=_only(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
 
@@ -120,6 +122,13 @@ def _check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.
         fix = f"Send numbers from 0 to {len(viewpoints) - 1}, rows of options.viewpoint."
         raise InvalidRequest("view_ids", f"values from {low} to {high}", fix)
     return viewpoints
+
+
+def _only(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
+    """The camera (3,) in the canonical frame, if there is just one."""
+    if viewpoints is None or len(viewpoints) != 1:
+        return None
+    return frame.points(viewpoints[0]).astype(np.float32)
 
 
 def _in_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:

@@ -9,7 +9,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.layers import HandDescription, gather_rows, in_pieces, mlp
+from edgegrasp_model.layers import gather_rows, in_pieces, mlp
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.vn_layers import (
     VNLinearReLU,
@@ -106,16 +106,10 @@ class VNEdgeGraspNet(nn.Module):
         self.frame_1 = VNSharedLinearReLU(channels, channels // 2)
         self.frame_2 = VNLinearReLU(channels // 2, channels // 4)
         self.frame_3 = nn.Linear(channels // 4, 3, bias=False)
-        described = config.hand_description_size
-        self.description = HandDescription(described) if described else None
-        self.classifier = mlp((3 * channels + described, *config.classifier_widths, 1))
+        self.classifier = mlp((3 * channels, *config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
-        """Scores the edge grasps of a batch: logits (E,) of success.
-
-        Raises:
-            ValueError: The batch has no hand description of the size this network was built for.
-        """
+        """Scores the edge grasps of a batch: logits (E,) of success."""
         contact = batch.contact
         f1 = self.conv1(torch.stack((batch.points, batch.normals), dim=2), batch)  # (P, 3, 32)
         f2 = self.conv2(f1, batch)  # (P, 3, 64)
@@ -128,7 +122,5 @@ class VNEdgeGraspNet(nn.Module):
         frame = self.frame_3(self.frame_2(self.frame_1(grasp, ball, batch.ball_of_edge)))
         vectors = torch.cat((grasp, ball[batch.ball_of_edge]), dim=2)  # (E, 3, 512)
         invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (E, 512, 3) -> (E, 1536)
-        if self.description is not None:
-            invariant = torch.cat((invariant, self.description(batch)), dim=1)
         logits: Tensor = self.classifier(invariant).squeeze(1)  # (E, 1) -> (E,)
         return logits

@@ -24,7 +24,7 @@ from edgegrasp_training.views import LabelledView
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM = 0, 1, 2, 3
 VOXEL_SIZE = 0.0045  # metres
-SAMPLED_RADIUS, SAMPLED_K = 0.04, 16  # balls that candidates are drawn from
+SAMPLED_RADIUS = 0.04  # metres; balls that candidates are drawn from
 APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
 BEST_SHARE = 0.1  # of the candidates, by score: what a network would have executed
@@ -182,7 +182,7 @@ def _sampled(
     scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
     if scene is None:
         return None, None
-    return scene, sample_candidates(scene, request, load_gripper(), SAMPLED_RADIUS, SAMPLED_K, {})
+    return scene, sample_candidates(scene, request, load_gripper(), SAMPLED_RADIUS, {})
 
 
 def _chosen(

@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_training.metrics import Evaluation, reliability
 
 
@@ -27,11 +29,9 @@ def write_model_card(
     network = metadata.network
     rows = [
         ("architecture", network.architecture),
-        ("crop radius", f"{network.crop_radius * 1000:g} mm, k = {network.k}"),
-        ("convolutions", network.conv_widths),
-        ("global MLPs", f"{network.global_widths_1}, {network.global_widths_2}"),
+        ("crop radius", f"{network.crop_radius * 1000:g} mm"),
+        *_layers(network),
         ("classifier", network.classifier_widths),
-        ("hand description", f"{network.hand_description_size} numbers per candidate"),
         ("voxel size", f"{metadata.voxel_size * 1000:g} mm"),
         ("gripper", metadata.gripper),
         *((name.replace("_", " "), value) for name, value in training.items()),
@@ -51,6 +51,20 @@ def write_model_card(
         for predicted, observed, count in reliability(calibrated, evaluation.label)
     ]
     path.write_text("\n".join(lines) + "\n")
+
+
+def _layers(network: NetworkConfig) -> list[tuple[str, object]]:
+    """What comes before the classifier."""
+    if network.architecture == "hand":
+        return [
+            ("hand description", f"{HAND_DESCRIPTION_SIZE} numbers per edge grasp"),
+            ("point encoder", f"{network.hand_widths}, {network.hand_points} points of each hand"),
+        ]
+    return [
+        ("neighbours", network.k),
+        ("convolutions", network.conv_widths),
+        ("global MLPs", f"{network.global_widths_1}, {network.global_widths_2}"),
+    ]
 
 
 def _cell(value: object) -> str:

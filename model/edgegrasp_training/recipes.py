@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 from edgegrasp_model.checkpoint import CheckpointMetadata
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.network_config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
+    HAND,
     VN_EDGEGRASP,
     NetworkConfig,
 )
@@ -18,9 +18,7 @@ GRIPPER = "panda"
 RECIPES: dict[str, NetworkConfig] = {
     "edgegrasp": replace(EDGEGRASP, crop_radius=CROP_RADIUS),
     "edgegrasp-small": replace(EDGEGRASP_SMALL, crop_radius=CROP_RADIUS),
-    "edgegrasp-plus": replace(
-        EDGEGRASP_SMALL, crop_radius=CROP_RADIUS, hand_description_size=HAND_DESCRIPTION_SIZE
-    ),
+    "edgegrasp-plus": replace(HAND, crop_radius=CROP_RADIUS),
     "vn-edgegrasp": replace(VN_EDGEGRASP, crop_radius=CROP_RADIUS),
 }
 

@@ -11,19 +11,21 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.layers import HandDescription
+from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.network import build_network
-from edgegrasp_training.examples import TriedGrasps, pack, rotated, tried_grasps
+from edgegrasp_training.examples import TriedGrasps, pack_balls, pack_hands, rotated, tried_grasps
 from edgegrasp_training.metrics import Evaluation, evaluate_scores
 from edgegrasp_training.model_card import write_model_card
 from edgegrasp_training.views import load_view
 
-VIEWS_IN_MEMORY = 4000
+VIEWS_IN_MEMORY = 8000
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
 
 
@@ -39,7 +41,7 @@ class TrainingOptions:
     patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
-    unknown_support: float = 0.1  # share of training views described without their table
+    unknown: float = 0.1  # share of training views without their table, and without their camera
     seed: int = 0
 
 
@@ -110,14 +112,14 @@ class Trainer:
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
-                grasps = self._tried(path)
+                grasps = self._tried(path, True)
                 balls = grasps.balls()
                 if len(balls) == 0:
                     continue
                 if balls_per_view is not None and len(balls) > balls_per_view:
                     rng = np.random.default_rng([self.options.seed, number])
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
-                batch, label = pack(grasps, balls, self.metadata.network)
+                batch, label = self._pack(grasps, balls)
                 logits.append(self.network(batch.to(self.device)).float().cpu())
                 labels.append(label)
         logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
@@ -136,7 +138,7 @@ class Trainer:
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
-            "training_labels": sum(len(self._tried(p).label) for p in self.train_paths),
+            "training_labels": sum(len(self._tried(p, True).label) for p in self.train_paths),
             "validation_views": len(self.validation_paths),
             "validation_labels": len(evaluation.label),
             "steps": self.step,
@@ -160,39 +162,55 @@ class Trainer:
         self.optimizer.step()
         return float(loss.detach())
 
-    def _training_batch(self, rng: np.random.Generator) -> tuple[BallBatch, Tensor]:
+    def _training_batch(self, rng: np.random.Generator) -> tuple[BallBatch | HandBatch, Tensor]:
         """Some balls of some views; the step number alone decides which."""
         count = min(self.options.views_per_step, len(self.train_paths))
         batches, labels = [], []
         for index in rng.choice(len(self.train_paths), count, replace=False):
-            grasps = self._tried(self.train_paths[index])
-            if rng.random() < self.options.unknown_support:
+            camera_known, support_known = rng.random(2) >= self.options.unknown
+            camera_matters = self.metadata.network.architecture == "hand"
+            grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
+            if not support_known:
                 grasps = grasps.without_support()
             balls = grasps.balls()
             if len(balls) == 0:
                 continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
-            batch, label = pack(grasps, np.sort(chosen), self.metadata.network)
-            # The conventional network must learn invariance; Vector Neurons have it.
-            if self.metadata.network.architecture == "edgegrasp":
-                batch = rotated(batch, rng)
+            batch, label = self._pack(grasps, np.sort(chosen), rng)
             batches.append(batch)
             labels.append(label)
-        return BallBatch.concatenate(batches), torch.cat(labels)
+        join: Any = type(batches[0]).concatenate
+        return join(batches), torch.cat(labels)
 
-    def _read(self, path: Path) -> TriedGrasps:
-        return tried_grasps(load_view(path), self.metadata.network, self.gripper)
+    def _pack(
+        self,
+        grasps: TriedGrasps,
+        balls: NDArray[np.int64],
+        rng: np.random.Generator | None = None,
+    ) -> tuple[BallBatch | HandBatch, Tensor]:
+        """Some balls of a view; varied where there is a random stream."""
+        network = self.metadata.network
+        if network.architecture == "hand":
+            return pack_hands(grasps, balls, network, rng)
+        batch, label = pack_balls(grasps, balls, network)
+        # The conventional network must learn invariance; Vector Neurons have it.
+        if rng is not None and network.architecture == "edgegrasp":
+            batch = rotated(batch, rng)
+        return batch, label
+
+    def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
+        view = load_view(path)
+        network = self.metadata.network
+        return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
 
     def _standardise(self) -> None:
         """Fit the description's mean and spread to the training views."""
-        if not self.metadata.network.hand_description_size:
+        if not isinstance(self.network, HandNet):
             return
-        described = [self._tried(path).description for path in self.train_paths]
-        values = np.concatenate([d for d in described if d is not None]).astype(np.float32)
-        for module in self.network.modules():
-            if isinstance(module, HandDescription):
-                mean, std = values.mean(axis=0), values.std(axis=0)
-                module.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
+        seen = [self._tried(path, True).seen for path in self.train_paths]
+        values = np.concatenate([hands.description for hands in seen if hands is not None])
+        mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
+        self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
 
     def _after_evaluation(self, evaluation: Evaluation, train_loss: float) -> None:
         self.since_best += 1
