@@ -22,10 +22,10 @@ class NetworkConfig:
     """
 
     architecture: Architecture
-    classifier_widths: tuple[int, ...]  # hidden layers
     conv_widths: tuple[int, ...] = ()  # the three graph convolutions
     global_widths_1: tuple[int, ...] = ()  # shared MLP before the first maximum over the ball
     global_widths_2: tuple[int, ...] = ()  # shared MLP before the second
+    classifier_widths: tuple[int, ...] = ()  # hidden layers
     hand_widths: tuple[int, ...] = ()  # of `hand`: shared MLP before the maximum over the points
     hand_points: int = 64  # of `hand`: points around the fingers
     k: int = 16  # neighbours in the graph, the point itself included

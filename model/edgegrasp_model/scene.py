@@ -39,8 +39,8 @@ class Scene:
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
     support: SupportPlane | None
-    viewpoint: Float32 | None  # (3,) the camera, where there is one and only one
     obstacles: SolidBoxes
+    viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
 
 
 def build_scene(

@@ -1,12 +1,10 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls
+from edgegrasp_model.ball_batch import BallBatch, crop_balls, nearest_in_ball
 
 
 def cloud(seed: int, count: int = 120) -> np.ndarray:
@@ -18,7 +16,8 @@ def cloud(seed: int, count: int = 120) -> np.ndarray:
 def test_balls_and_neighbors_are_those_of_brute_force(seed, radius):
     points = cloud(seed)
     approach_index = np.array([3, 50, 4])
-    crop = crop_balls(points, approach_index, radius, k=16)
+    crop = crop_balls(points, approach_index, radius)
+    neighbors = nearest_in_ball(points, approach_index, crop, k=16)
 
     for ball, index in enumerate(approach_index):
         distance = np.linalg.norm(points.astype(float) - points[index], axis=1)
@@ -29,15 +28,16 @@ def test_balls_and_neighbors_are_those_of_brute_force(seed, radius):
         between = np.linalg.norm(members[:, None].astype(float) - members, axis=2)
         for place, own_row in enumerate(rows):
             nearest = set(rows[np.argsort(between[place], kind="stable")[:16]])
-            assert set(crop.neighbors[own_row]) == nearest
-            assert crop.neighbors[own_row, 0] == own_row
+            assert set(neighbors[own_row]) == nearest
+            assert neighbors[own_row, 0] == own_row
 
 
 def test_a_small_ball_repeats_the_own_row():
     points = np.array([[0, 0, 0], [0.01, 0, 0], [0.2, 0, 0]], dtype=np.float32)
-    crop = crop_balls(points, np.array([0]), 0.05, k=4)
+    crop = crop_balls(points, np.array([0]), 0.05)
     np.testing.assert_array_equal(crop.ball_rows, [0, 1])
-    np.testing.assert_array_equal(crop.neighbors, [[0, 1, 0, 0], [1, 0, 1, 1]])
+    neighbors = nearest_in_ball(points, np.array([0]), crop, k=4)
+    np.testing.assert_array_equal(neighbors, [[0, 1, 0, 0], [1, 0, 1, 1]])
 
 
 def test_a_point_within_two_balls_counts_twice_and_keeps_to_its_ball():
@@ -45,13 +45,15 @@ def test_a_point_within_two_balls_counts_twice_and_keeps_to_its_ball():
     crop = crop_balls(points, np.array([7, 7]), 0.08)
     half = len(crop.ball_rows) // 2
     np.testing.assert_array_equal(crop.ball_rows[:half], crop.ball_rows[half:])
-    np.testing.assert_array_equal(crop.neighbors[:half] + half, crop.neighbors[half:])
+    neighbors = nearest_in_ball(points, np.array([7, 7]), crop)
+    np.testing.assert_array_equal(neighbors[:half] + half, neighbors[half:])
 
 
 def test_no_approach_points_make_no_balls():
-    crop = crop_balls(cloud(1), np.empty(0, dtype=np.int64), 0.05)
-    assert [len(part) for part in crop] == [0, 0, 0]
-    assert crop.neighbors.shape == (0, 16)
+    none = np.empty(0, dtype=np.int64)
+    crop = crop_balls(cloud(1), none, 0.05)
+    assert (len(crop.ball_rows), len(crop.ball_of_point)) == (0, 0)
+    assert nearest_in_ball(cloud(1), none, crop).shape == (0, 16)
 
 
 def test_from_cloud_centres_each_ball_on_its_approach_point():
@@ -93,14 +95,6 @@ def test_concatenate_shifts_rows_and_balls(random_scene):
     assert both.ball_of_edge[-1] == second.ball_of_edge[-1] + first.num_balls
 
 
-def test_concatenate_takes_descriptions_from_all_or_none(random_scene):
-    plain = random_scene(1).batch()
-    described = replace(plain, hand_description=torch.zeros(len(plain.contact), 2))
-    assert BallBatch.concatenate([plain, plain]).hand_description is None
-    both = BallBatch.concatenate([described, described])
-    assert both.hand_description is not None
-    assert both.hand_description.shape == (2 * len(plain.contact), 2)
-    with pytest.raises(ValueError, match=r"hand_description: present in 1 of 2 batches"):
-        BallBatch.concatenate([plain, described])
+def test_there_is_no_batch_of_no_batches():
     with pytest.raises(ValueError, match=r"batches: got none"):
         BallBatch.concatenate([])

@@ -12,14 +12,13 @@ from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidRequest, UnknownModel
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.results import Detection, Outcome
 
 TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (8, 8), crop_radius=0.04)
-PLUS = replace(TINY, hand_description_size=HAND_DESCRIPTION_SIZE)
+PLUS = NetworkConfig("hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04)
 VN = NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 6, 6), (6, 6), (6, 6), crop_radius=0.04)
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
 VIEW = (0.3, 0.0, 0.5)

@@ -158,41 +158,6 @@ def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone(tiny_conf
     assert not torch.equal(first.join.weight, other.join.weight)
 
 
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_hand_description_is_standardised_within(random_scene, tiny_config, architecture):
-    config = replace(tiny_config, architecture=architecture, hand_description_size=2)
-    network = build_network(config).double()
-    batch = random_scene(1).batch()
-    described = torch.randn(
-        len(batch.contact), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
-    plain = scores(network, replace(batch, hand_description=described))
-    mean, std = torch.tensor([3.0, -2.0]), torch.tensor([0.5, 4.0])
-    network.description.set_statistics(mean, std)
-    shifted = replace(batch, hand_description=described * std + mean)
-    torch.testing.assert_close(scores(network, shifted), plain, rtol=0, atol=1e-12)
-    assert not torch.allclose(scores(network, replace(shifted, hand_description=described)), plain)
-
-
-def test_a_constant_number_of_the_description_stays_finite(random_scene, tiny_config):
-    network = build_network(replace(tiny_config, hand_description_size=1)).double()
-    network.description.set_statistics(torch.tensor([0.5]), torch.tensor([0.0]))
-    batch = random_scene(1).batch()
-    described = torch.full((len(batch.contact), 1), 0.5, dtype=torch.float64)
-    assert scores(network, replace(batch, hand_description=described)).isfinite().all()
-
-
-@pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_a_missing_hand_description_is_named(random_scene, tiny_config, architecture):
-    config = replace(tiny_config, architecture=architecture, hand_description_size=2)
-    network, batch = build_network(config).double(), random_scene(1).batch()
-    with pytest.raises(ValueError, match=r"hand_description: got none\. This network takes 2"):
-        scores(network, batch)
-    wrong = replace(batch, hand_description=torch.zeros(len(batch.contact), 3))
-    with pytest.raises(ValueError, match=r"hand_description: got 3 numbers\. This network takes 2"):
-        scores(network, wrong)
-
-
 def test_a_batch_without_grasps_has_no_scores(random_scene, tiny_config):
     scene = random_scene(1)
     empty = replace(scene, edges=np.empty((0, 2), dtype=np.int64))

@@ -9,21 +9,16 @@ from edgegrasp_model.candidates import edge_grasps
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_training.examples import pack, rotated, tried_grasps
+from edgegrasp_training.examples import SUPPORT, UP, pack_balls, pack_hands, rotated, tried_grasps
 from edgegrasp_training.recipes import RECIPES, recipe
 from edgegrasp_training.training import Trainer, TrainingOptions
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
-TINY = NetworkConfig(
-    "edgegrasp",
-    (8, 8, 8),
-    (8, 8, 8),
-    (8, 8),
-    (16, 8),
-    hand_description_size=HAND_DESCRIPTION_SIZE,
-    crop_radius=0.04,
+TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04)
+HAND = NetworkConfig(
+    "hand", hand_widths=(8, 16), hand_points=16, classifier_widths=(16, 8), crop_radius=0.04
 )
 FAST = TrainingOptions(
     steps=40, views_per_step=2, balls_per_view=3, learning_rate=3e-3, evaluate_every=10
@@ -64,7 +59,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return find_views([folder])
 
 
-def trainer(views: list[Path], folder: Path, config: NetworkConfig = TINY) -> Trainer:
+def trainer(views: list[Path], folder: Path, config: NetworkConfig = HAND) -> Trainer:
     metadata = CheckpointMetadata("tiny", config, voxel_size=0.0045, gripper="panda")
     train, validation = split_by_scene(views, 0.25, seed=0)
     return Trainer(metadata, train, validation, folder, FAST)
@@ -88,17 +83,18 @@ def test_loss_falls_and_the_best_network_is_kept_with_a_card(
     assert f"{after.auroc:.4f}" in card
     assert "edgegrasp train data" in card
     assert len((tmp_path / "log.csv").read_text().splitlines()) == 1 + 40 // 10
-    assert torch.isfinite(network.description.std).all()
+    assert torch.isfinite(network.std).all()
 
 
+@pytest.mark.parametrize("config", [TINY, HAND], ids=["balls", "hands"])
 def test_pausing_and_resuming_is_the_same_as_going_through(
-    views: list[Path], tmp_path: Path
+    views: list[Path], tmp_path: Path, config: NetworkConfig
 ) -> None:
-    through = trainer(views, tmp_path / "through")
+    through = trainer(views, tmp_path / "through", config)
     through.run(lambda step, loss: None, until=14)
-    first = trainer(views, tmp_path / "paused")
+    first = trainer(views, tmp_path / "paused", config)
     first.run(lambda step, loss: None, until=9)
-    resumed = trainer(views, tmp_path / "paused")
+    resumed = trainer(views, tmp_path / "paused", config)
     assert resumed.step == 9
     resumed.run(lambda step, loss: None, until=14)
     assert resumed.step == through.step == 14
@@ -119,21 +115,58 @@ def test_the_seed_decides_everything(views: list[Path], tmp_path: Path) -> None:
 def test_packed_balls_hold_each_tried_grasp_and_its_contact(views: list[Path]) -> None:
     view = made_up_view(1)
     grasps = tried_grasps(view, TINY, load_gripper())
-    batch, label = pack(grasps, grasps.balls(), TINY)
+    batch, label = pack_balls(grasps, grasps.balls(), TINY)
     assert len(label) == len(grasps.label) == len(batch.contact)
     order = np.argsort(grasps.candidates.approach_index, kind="stable")
     contact = grasps.cloud.points[grasps.candidates.contact_index]
     edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
     found = batch.points[batch.contact].numpy()
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(edge[order], axis=0), atol=1e-6)
-    some, some_label = pack(grasps, grasps.balls()[:2], TINY)
+    some, some_label = pack_balls(grasps, grasps.balls()[:2], TINY)
     assert some.num_balls == 2
     assert 0 < len(some_label) < len(label)
 
 
+def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream() -> None:
+    view = made_up_view(1)
+    grasps = tried_grasps(view, HAND, load_gripper())
+    batch, label = pack_hands(grasps, grasps.balls()[:2], HAND)
+    rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
+    np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
+    assert batch.num_balls == 2
+    exact = HandBatch.from_cloud(
+        grasps.cloud,
+        grasps.candidates.take(rows),
+        load_gripper(),
+        UP,
+        SUPPORT,
+        view.camera_position,
+        HAND.hand_points,
+    )
+    torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(batch.point_count, exact.point_count)
+    varied, _ = pack_hands(grasps, grasps.balls()[:2], HAND, np.random.default_rng(0))
+    assert not torch.equal(varied.points, batch.points)
+    there = torch.arange(HAND.hand_points) < varied.point_count[:, None]
+    assert (varied.points[there].abs().sum(dim=1) > 0).all()
+    assert (varied.points[~there] == 0).all()
+
+
+def test_a_hand_whose_camera_is_not_known_is_told_of_none() -> None:
+    view, gripper = made_up_view(1), load_gripper()
+    known = tried_grasps(view, HAND, gripper).seen
+    unknown = tried_grasps(view, HAND, gripper, viewpoint_known=False).seen
+    assert known is not None
+    assert unknown is not None
+    changed = (known.description != unknown.description).any(axis=0)
+    camera = slice(-8 - 6, -8 - 3)  # before the direction of up and the eight of the stance
+    assert changed[camera].all()
+    assert (unknown.description[:, camera] == 0).all()
+
+
 def test_augmentation_turns_points_normals_and_approach_alike(views: list[Path]) -> None:
     grasps = tried_grasps(made_up_view(2), TINY, load_gripper())
-    batch, _ = pack(grasps, grasps.balls(), TINY)
+    batch, _ = pack_balls(grasps, grasps.balls(), TINY)
     turned = rotated(batch, np.random.default_rng(0))
     assert not torch.allclose(batch.points, turned.points)
     lengths, cosines = batch.points.norm(dim=1), (batch.points * batch.normals).sum(dim=1)
