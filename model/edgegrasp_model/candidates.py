@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Gripper
@@ -20,6 +21,8 @@ MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
 TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand is drawn back
 LOW = 0.03  # metres over the support plane up to which contacts get a level grasp too
 MIN_LEVEL = 0.3  # horizontal part of a normal from which its heading can be trusted
+OUTLINE_RADIUS = 0.012  # metres of surface that say where the outline of a flat top runs
+MIN_OUTWARD = 0.003  # metres that a point on the outline lies further out than their middle
 MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a level grasp
 MIN_DROP = -0.002  # metres a contact may lie above the approach point of a level grasp
 
@@ -154,7 +157,9 @@ def level_grasps(
     """Candidates straight down onto low contacts, the closing direction level.
 
     The normals at the sides of a flat object are bent upward by its top, so that a hand which
-    closes along them would cut into the table: here they count by their heading only.
+    closes along them would cut into the table: here they count by their heading only. Of a very
+    flat one only the top is seen, and the normals say nothing: there the heading is that of its
+    outline, as seen from above.
 
     Args:
         cloud: The cloud with its normals.
@@ -167,15 +172,14 @@ def level_grasps(
         The pairs that allow such a grasp.
     """
     up = np.asarray(support.normal, dtype=np.float32)
-    normal, contact = cloud.normals[contact_index], cloud.points[contact_index]
+    contact = cloud.points[contact_index]
     edge = contact - cloud.points[approach_index]  # (M, 3)
-    level = normal - (normal @ up)[:, None] * up
-    share = np.linalg.norm(level, axis=1)
-    y = level / np.maximum(share, 1e-9)[:, None]
+    heading, certain = closing_headings(cloud, up)
+    y = heading[contact_index]
     along, sideways = np.einsum("md,md->m", edge, y), np.einsum("md,md->m", edge, np.cross(y, -up))
     pair = np.flatnonzero(
         (contact @ up - support.offset < LOW)
-        & (share > MIN_LEVEL)
+        & certain[contact_index]
         & (along > MIN_EDGE)
         & (along < gripper.max_opening / 2 - EDGE_MARGIN)
         & (np.abs(sideways) < MAX_SIDEWAYS)
@@ -191,6 +195,32 @@ def level_grasps(
     pose[:, 3, 3] = 1.0
     depth = np.maximum(-edge[pair] @ up, 0.0)
     return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
+
+
+def closing_headings(cloud: Cloud, up: Float32) -> tuple[Float32, NDArray[np.bool_]]:
+    """Which way, seen from above, the cloud's surface faces at each point.
+
+    Args:
+        cloud: N points.
+        up: (3,) unit.
+
+    Returns:
+        (N, 3) unit directions across `up`, and which of them (N,) can be trusted.
+    """
+    level = cloud.normals - (cloud.normals @ up)[:, None] * up
+    certain = np.linalg.norm(level, axis=1) > MIN_LEVEL
+    flat = np.flatnonzero(~certain)
+    if len(flat):
+        tree = cKDTree(cloud.points)
+        around = tree.query_ball_point(cloud.points[flat], OUTLINE_RADIUS, return_sorted=True)
+        count = np.array([len(rows) for rows in around])  # the point itself at least
+        sums = np.add.reduceat(cloud.points[np.concatenate(around)], np.cumsum(count) - count)
+        outward = cloud.points[flat] - sums / count[:, None]
+        outward -= (outward @ up)[:, None] * up
+        level[flat] = outward
+        certain[flat] = np.linalg.norm(outward, axis=1) > MIN_OUTWARD
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    return (level / np.maximum(length, 1e-9)).astype(np.float32), certain
 
 
 def drawn_back(
