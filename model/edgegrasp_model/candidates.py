@@ -213,7 +213,7 @@ def closing_headings(cloud: Cloud, up: Float32) -> tuple[Float32, NDArray[np.boo
     if len(flat):
         tree = cKDTree(cloud.points)
         around = tree.query_ball_point(cloud.points[flat], OUTLINE_RADIUS, return_sorted=True)
-        count = np.array([len(rows) for rows in around])  # the point itself at least
+        count = np.array([len(rows) for rows in around.tolist()])  # the point itself at least
         sums = np.add.reduceat(cloud.points[np.concatenate(around)], np.cumsum(count) - count)
         outward = cloud.points[flat] - sums / count[:, None]
         outward -= (outward @ up)[:, None] * up

@@ -80,6 +80,7 @@ def hand_batch(
         UP,
         scene.support,
         scene.viewpoint,
+        scene.at_side,
         network.hand_points,
         view,
     )

@@ -38,6 +38,7 @@ class HandBatch:
         up: Float32,
         support: SupportPlane | None,
         viewpoint: Float32 | None,
+        at_side: NDArray[np.bool_] | None,
         num_points: int,
         view: HandView | None = None,
     ) -> Self:
@@ -50,12 +51,15 @@ class HandBatch:
             up: (3,) away from gravity.
             support: Plane that heights are measured from, where it is known.
             viewpoint: (3,) the camera, where there is one and it is known.
+            at_side: (N,) points where a side of the workspace cuts things off.
             num_points: P.
             view: `hand_views` of the same candidates, where the caller has it already.
         """
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
-        description = describe_hands(cloud, candidates, gripper, up, support, viewpoint, view)
+        description = describe_hands(
+            cloud, candidates, gripper, up, support, viewpoint, at_side, view
+        )
         points, count = points_around_fingers(
             cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
         )

@@ -59,6 +59,7 @@ def describe_hands(
     up: Float32,
     support: SupportPlane | None,
     viewpoint: Float32 | None = None,
+    at_side: NDArray[np.bool_] | None = None,
     view: HandView | None = None,
 ) -> Float32:
     """The hand-frame description of each candidate.
@@ -73,6 +74,8 @@ def describe_hands(
         up: (3,) away from gravity.
         support: Plane that heights are measured from; None where it is unknown.
         viewpoint: (3,) the camera; None where it is unknown, or there are several.
+        at_side: (N,) points where a side of the workspace cuts things off: what is between the
+            fingers there may be wider than it seems. None: nowhere.
         view: `hand_views` of the same candidates, where the caller has it already.
 
     Returns:
@@ -88,6 +91,7 @@ def describe_hands(
     columns = [
         *_hits(view, x, y, z, gripper),
         *_between_fingers(view, x, y, z, normal, gripper),
+        _cut_off(view, x, y, z, at_side, gripper),
         *_directions(candidates.T_cloud_hand, viewpoint, up, side),
         *_stance(cloud, candidates, gripper, up, support),
     ]
@@ -111,6 +115,26 @@ def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
     unknown = description.copy()
     unknown[:, -HEIGHTS:] = UNKNOWN_HEIGHT
     return unknown
+
+
+def _cut_off(
+    view: HandView,
+    x: Float32,
+    y: Float32,
+    z: Float32,
+    at_side: NDArray[np.bool_] | None,
+    gripper: Gripper,
+) -> Float32:
+    """Points between the fingers where a side of the workspace cuts things off."""
+    if at_side is None:
+        return np.zeros(view.num_candidates, dtype=np.float32)
+    inside = (
+        (np.abs(x) < gripper.pad_half_width + NEAR)
+        & (np.abs(y) < gripper.max_opening / 2)
+        & (z > gripper.palm_z)
+        & (z < gripper.tip_z + NEAR)
+    )
+    return _Region(view, inside & at_side[view.row]).log_count()
 
 
 def _directions(
@@ -227,5 +251,5 @@ def _stance(
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
 
 
-HAND_DESCRIPTION_SIZE = 50
+HAND_DESCRIPTION_SIZE = 51
 HEIGHTS = 3  # the last of them: heights over the support plane

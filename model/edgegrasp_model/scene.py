@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_model import cloud as clouds
 from edgegrasp_model.canonical_frame import CanonicalFrame
@@ -11,7 +11,7 @@ from edgegrasp_model.cloud import Cloud, Voxels
 from edgegrasp_model.cloud_input import CheckedCloud
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.obstacles import SolidBoxes
-from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.options import DetectOptions, Workspace
 from edgegrasp_model.regions import check_region, inside_region
 from edgegrasp_model.support import (
     SUPPORT_MARGIN,
@@ -25,6 +25,7 @@ Bools = NDArray[np.bool_]
 
 MIN_POINTS = 4  # fewer make no surface
 MIN_NORMAL = 1e-3  # length of the mean of a voxel's normals below which they say nothing
+SIDE_DEPTH = 0.006  # metres inside a side of the workspace where points may belong to what it cuts
 SUPPORT_STREAM = 2  # random stream of one request
 
 
@@ -41,6 +42,7 @@ class Scene:
     support: SupportPlane | None
     obstacles: SolidBoxes
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
+    at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
 
 def build_scene(
@@ -102,9 +104,24 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
         support=None if support is None else _in_frame(support, frame),
+        at_side=at_workspace_side(in_cloud[kept], options.workspace, options.up),
         viewpoint=_only(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
+
+
+def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
+    """Which points (N, 3), in the cloud's frame, lie where a side of the workspace cuts things off.
+
+    Its floor and ceiling are no sides: the one cuts off what the hand does not grasp, the other
+    what is above all.
+    """
+    if workspace is None:
+        return np.zeros(len(points), dtype=bool)
+    level = np.abs(np.asarray(up)) < np.linalg.norm(up) / 2
+    beyond_low = points < np.asarray(workspace.min) + SIDE_DEPTH
+    beyond_high = points > np.asarray(workspace.max) - SIDE_DEPTH
+    return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
 
 
 def _check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:

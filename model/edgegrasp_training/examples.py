@@ -15,10 +15,12 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_description import without_support
 from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.options import SupportPlane, Workspace
+from edgegrasp_model.scene import at_workspace_side
 from edgegrasp_training.views import LabelledView
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
+WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))  # and what they are cut to
 SPARE_POINTS = 2  # times the network's points of a hand are kept, to pick from in each step
 SUPPORT = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)  # the table of the simulated scenes
 
@@ -77,6 +79,7 @@ def tried_grasps(
             UP,
             SUPPORT,
             view.camera_position if viewpoint_known else None,
+            at_workspace_side(view.points, WORKSPACE, UP),
             SPARE_POINTS * config.hand_points,
         )
         description, points = batch.description.numpy(), batch.points.numpy()

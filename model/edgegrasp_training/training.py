@@ -3,6 +3,7 @@
 import csv
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -41,6 +42,7 @@ class TrainingOptions:
     patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
+    averaging: float = 0.998  # share of the old weights in the running mean that is kept and judged
     unknown: float = 0.1  # share of training views without their table, and without their camera
     seed: int = 0
 
@@ -73,6 +75,7 @@ class Trainer:
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
+        self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
@@ -108,7 +111,6 @@ class Trainer:
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
         """Score the validation views; of each at most so many balls, or all of them."""
-        self.network.eval()
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
@@ -120,7 +122,7 @@ class Trainer:
                     rng = np.random.default_rng([self.options.seed, number])
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
                 batch, label = self._pack(grasps, balls)
-                logits.append(self.network(batch.to(self.device)).float().cpu())
+                logits.append(self.average(batch.to(self.device)).float().cpu())
                 labels.append(label)
         logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
         return evaluate_scores(logit, label_array)
@@ -134,7 +136,7 @@ class Trainer:
         """
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
-        self.network.load_state_dict(best.state_dict())
+        self.average.load_state_dict(best.state_dict())
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
@@ -146,7 +148,7 @@ class Trainer:
             "seed": self.options.seed,
         }
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
-        save_checkpoint(path, self.network, metadata)
+        save_checkpoint(path, self.average, metadata)
         card = self.folder / f"{self.metadata.name}.md"
         write_model_card(card, metadata, training, evaluation, command)
         return evaluation
@@ -160,6 +162,10 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
+        # A mean over few steps only at first, so that it does not remember the random weights.
+        kept = min(self.options.averaging, (self.step + 1) / (self.step + 10))
+        for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(weight.detach(), 1.0 - kept)
         return float(loss.detach())
 
     def _training_batch(self, rng: np.random.Generator) -> tuple[BallBatch | HandBatch, Tensor]:
@@ -211,13 +217,14 @@ class Trainer:
         values = np.concatenate([hands.description for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
         self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
+        self.average.load_state_dict(self.network.state_dict())
 
     def _after_evaluation(self, evaluation: Evaluation, train_loss: float) -> None:
         self.since_best += 1
         if evaluation.loss < self.best_loss:
             self.best_loss, self.since_best = evaluation.loss, 0
             save_checkpoint(
-                self.folder / f"{self.metadata.name}.safetensors", self.network, self.metadata
+                self.folder / f"{self.metadata.name}.safetensors", self.average, self.metadata
             )
         elif self.since_best >= self.options.patience:
             self.since_best, self.halved = 0, self.halved + 1
@@ -251,6 +258,7 @@ class Trainer:
             "halved": self.halved,
             "seconds": self.seconds,
             "network": self.network.state_dict(),
+            "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
         }
         partial = self.folder / (STATE_FILE + ".partial")
@@ -262,6 +270,7 @@ class Trainer:
             self.folder / STATE_FILE, weights_only=True, map_location=self.device
         )
         self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.step, self.best_loss = state["step"], state["best_loss"]
         self.since_best, self.halved = state["since_best"], state["halved"]

@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.errors import InvalidCheckpoint
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import HAND
 
@@ -19,7 +20,7 @@ def saved(tmp_path, tiny_config):
     """A hand network with statistics, its metadata, and the file that holds both."""
     config = replace(HAND, crop_radius=0.04)
     network = build_network(config, torch.Generator().manual_seed(7))
-    network.set_statistics(torch.randn(50), torch.rand(50) + 1.0)
+    network.set_statistics(torch.randn(SIZE), torch.rand(SIZE) + 1.0)
     metadata = CheckpointMetadata(
         name="edgegrasp-plus",
         network=config,

@@ -12,6 +12,7 @@ from edgegrasp_model.candidates import Candidates, edge_grasps
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.hand_network import PIECE
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import NetworkConfig
@@ -41,7 +42,7 @@ def look(
     limit: int = 400,
 ) -> HandBatch:
     support = SupportPlane(normal=tuple(up.tolist()), offset=float(up @ [0.0, 0.0, -0.05]))
-    return HandBatch.from_cloud(cloud, candidates, PANDA, up, support, camera, limit)
+    return HandBatch.from_cloud(cloud, candidates, PANDA, up, support, camera, None, limit)
 
 
 def scores(batch: HandBatch, config: NetworkConfig = TINY) -> torch.Tensor:
@@ -146,10 +147,10 @@ def test_the_description_is_standardised_within() -> None:
     batch = look(*scene(5))
     plain = scores(batch)
     network = build_network(TINY, torch.Generator().manual_seed(1)).eval()
-    mean, std = torch.linspace(-3, 3, 50), torch.linspace(0.5, 4, 50)
+    mean, std = torch.linspace(-3, 3, SIZE), torch.linspace(0.5, 4, SIZE)
     network.set_statistics(mean, std)
     shifted = replace(batch, description=batch.description * std + mean)
     with torch.inference_mode():
         torch.testing.assert_close(network(shifted), plain, atol=1e-4, rtol=1e-4)
-        network.set_statistics(mean, torch.zeros(50))  # numbers that never change
+        network.set_statistics(mean, torch.zeros(SIZE))  # numbers that never change
         assert network(shifted).isfinite().all()

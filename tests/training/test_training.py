@@ -11,7 +11,16 @@ from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_training.examples import SUPPORT, UP, pack_balls, pack_hands, rotated, tried_grasps
+from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_training.examples import (
+    SUPPORT,
+    UP,
+    WORKSPACE,
+    pack_balls,
+    pack_hands,
+    rotated,
+    tried_grasps,
+)
 from edgegrasp_training.recipes import RECIPES, recipe
 from edgegrasp_training.training import Trainer, TrainingOptions
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
@@ -141,6 +150,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream() 
         UP,
         SUPPORT,
         view.camera_position,
+        at_workspace_side(view.points, WORKSPACE, UP),
         HAND.hand_points,
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
