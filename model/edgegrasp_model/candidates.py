@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,12 +174,11 @@ def level_grasps(
     up = np.asarray(support.normal, dtype=np.float32)
     contact = cloud.points[contact_index]
     edge = contact - cloud.points[approach_index]  # (M, 3)
-    heading, certain = closing_headings(cloud, up)
+    heading, certain = closing_headings(cloud, support)
     y = heading[contact_index]
     along, sideways = np.einsum("md,md->m", edge, y), np.einsum("md,md->m", edge, np.cross(y, -up))
     pair = np.flatnonzero(
-        (contact @ up - support.offset < LOW)
-        & certain[contact_index]
+        certain[contact_index]
         & (along > MIN_EDGE)
         & (along < gripper.max_opening / 2 - EDGE_MARGIN)
         & (np.abs(sideways) < MAX_SIDEWAYS)
@@ -197,23 +196,25 @@ def level_grasps(
     return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
 
 
-def closing_headings(cloud: Cloud, up: Float32) -> tuple[Float32, NDArray[np.bool_]]:
-    """Which way, seen from above, the cloud's surface faces at each point.
+def closing_headings(cloud: Cloud, support: SupportPlane) -> tuple[Float32, NDArray[np.bool_]]:
+    """Which way, seen from above, the cloud's surface faces at each point low over the support.
 
     Args:
         cloud: N points.
-        up: (3,) unit.
+        support: The plane; of unit normal.
 
     Returns:
-        (N, 3) unit directions across `up`, and which of them (N,) can be trusted.
+        (N, 3) unit directions along the plane, and which of them (N,) can be trusted.
     """
+    up = np.asarray(support.normal, dtype=np.float32)
+    low = cloud.points @ up - support.offset < LOW
     level = cloud.normals - (cloud.normals @ up)[:, None] * up
-    certain = np.linalg.norm(level, axis=1) > MIN_LEVEL
-    flat = np.flatnonzero(~certain)
+    certain = low & (np.linalg.norm(level, axis=1) > MIN_LEVEL)
+    flat = np.flatnonzero(low & ~certain)
     if len(flat):
         tree = cKDTree(cloud.points)
-        around = tree.query_ball_point(cloud.points[flat], OUTLINE_RADIUS, return_sorted=True)
-        count = np.array([len(rows) for rows in around.tolist()])  # the point itself at least
+        around: Any = tree.query_ball_point(cloud.points[flat], OUTLINE_RADIUS, return_sorted=True)
+        count = np.array([len(rows) for rows in around])  # the point itself at least
         sums = np.add.reduceat(cloud.points[np.concatenate(around)], np.cumsum(count) - count)
         outward = cloud.points[flat] - sums / count[:, None]
         outward -= (outward @ up)[:, None] * up
