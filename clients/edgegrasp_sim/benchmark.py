@@ -84,17 +84,19 @@ def run_benchmark(
     make_planner: PlannerFactory,
     *,
     workers: int = 1,
+    ray: str | None = None,
     folder: ResultFolder | None = None,
     on_round: Callable[[Round], None] | None = None,
     gui: bool = False,
 ) -> list[Round]:
-    """Run all rounds that `folder` does not hold yet; outcomes do not depend on `workers`.
+    """Run all rounds that `folder` does not hold yet, wherever: outcomes stay the same.
 
     Args:
         config: what to run.
         make_planner: called once in every process.
         workers: processes; with 1 all runs in this one. The rounds of a worker process that
             dies are run again by another.
+        ray: address of a Ray cluster to run the workers on; see `run_on_ray`.
         folder: keeps each round as it finishes; opened by the caller.
         on_round: told of every round as it is done, in any order.
         gui: show PyBullet's window; with one worker only.
@@ -106,7 +108,7 @@ def run_benchmark(
         ValueError: `workers` below 1, or the planner's pose is no rigid transform.
         FileNotFoundError: the object folder does not hold the scene.
         PlannerUnavailableError: the planner stayed away for longer than the patience.
-        RuntimeError: worker processes keep dying.
+        RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """
     if workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
@@ -115,11 +117,15 @@ def run_benchmark(
     kept = folder.rounds() if folder is not None else []
     rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
     missing = [task for task in tasks if task not in rounds]
-    run = (
-        _run_here(config, make_planner, missing, gui)
-        if workers == 1
-        else _run_pools(config, make_planner, missing, workers)
-    )
+    workers = max(1, min(workers, len(missing)))
+    if ray is not None:
+        from edgegrasp_sim.ray_cluster import run_on_ray
+
+        run = run_on_ray(ray, config, make_planner, missing, workers)
+    elif workers == 1:
+        run = _run_here(config, make_planner, missing, gui)
+    else:
+        run = _run_pools(config, make_planner, missing, workers)
     for done in run:
         rounds[done.seed, done.index] = done
         if folder is not None:
@@ -206,6 +212,13 @@ def objects_digest(objects: ObjectSet) -> str:
     return digest.hexdigest()
 
 
+def available_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _version(distribution: str) -> str | None:
     try:
         return version(distribution)
@@ -213,7 +226,7 @@ def _version(distribution: str) -> str | None:
         return None
 
 
-class _Runner:
+class RoundRunner:
     """A simulation with a planner, for one process."""
 
     def __init__(
@@ -224,6 +237,7 @@ class _Runner:
         self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
 
     def run(self, task: Task) -> Round:
+        """Run the round of a seed and an index."""
         seed, index = task
         config = self.config
         return run_round(
@@ -237,6 +251,7 @@ class _Runner:
         )
 
     def close(self) -> None:
+        """Give back what simulation and planner hold."""
         self.simulation.close()
         if isinstance(self.planner, Closes):
             self.planner.close()
@@ -247,20 +262,20 @@ def _run_here(
 ) -> Iterator[Round]:
     if not tasks:
         return
-    runner = _Runner(config, make_planner, gui)
+    runner = RoundRunner(config, make_planner, gui)
     try:
         yield from map(runner.run, tasks)
     finally:
         runner.close()
 
 
-_worker: _Runner | None = None  # one in each worker process, made by its initialiser
+_worker: RoundRunner | None = None  # one in each worker process, made by its initialiser
 
 
 def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    _worker = _Runner(config, make_planner)
+    _worker = RoundRunner(config, make_planner)
 
 
 def _run_in_worker(task: Task) -> Round:
