@@ -1,12 +1,13 @@
 """What is the same at the edge of both transports, before and after the service itself."""
 
+import asyncio
 import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from edgegrasp_service.errors import HeadersTooLarge
+from edgegrasp_service.errors import HeadersTooLarge, NotReady
 from edgegrasp_service.metrics import Metrics
 from edgegrasp_service.request_id import HEADER, REQUEST_ID, TRACEPARENT, usable_request_id
 from edgegrasp_service.tokens import Tokens
@@ -25,6 +26,12 @@ class Answered:
     long: bool = False  # a stream, whose duration says nothing
 
 
+class GivenUp(Exception):  # noqa: N818
+    """The grace of a stopping server is over; `reason` tells the caller."""
+
+    reason = NotReady("The server stopped before there was an answer. Try another one.")
+
+
 class Edge:
     """Who may ask, what a request is called, and what is counted and logged of it.
 
@@ -38,6 +45,8 @@ class Edge:
         self.metrics = metrics
         self.draining = False
         self.unanswered = 0  # streams are not counted: they may never end
+        self._given_up = False
+        self._tasks: set[asyncio.Task[object]] = set()
 
     @contextmanager
     def request(
@@ -69,6 +78,28 @@ class Edge:
             fields = {"transport": transport, "method": method, "code": answered.code}
             level = logging.DEBUG if method in PROBES else logging.INFO
             logger.log(level, "request", extra={"fields": fields | {"seconds": round(seconds, 6)}})
+
+    @contextmanager
+    def until_given_up(self) -> Iterator[None]:
+        """Do what the running task does, until `give_up`; raises GivenUp then."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        try:
+            yield
+        except asyncio.CancelledError:
+            if not self._given_up:
+                raise
+            task.uncancel()
+            raise GivenUp from None
+        finally:
+            self._tasks.discard(task)
+
+    def give_up(self) -> None:
+        """End what is still under way; those who wait for it are told."""
+        self._given_up = True
+        for task in self._tasks:
+            task.cancel()
 
     def _count(self, answered: Answered, change: int) -> None:
         if not answered.long:

@@ -133,6 +133,7 @@ class Server:
         in_time = await self._service.drain(end - clock())
         if not in_time:
             logger.warning("grace is over: requests in flight are given up")
+            self._edge.give_up()
         self._service.close()
         end = max(end, clock() + CLOSE_SECONDS)
         while self._edge.unanswered and clock() < end:
