@@ -19,6 +19,7 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trials import PATIENCE, Closes, Planner, Round, run_round
+from edgegrasp_sim.window import ShownPlanner, Window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -233,8 +234,10 @@ class RoundRunner:
         self, config: BenchmarkConfig, make_planner: PlannerFactory, gui: bool = False
     ) -> None:
         self.config = config
-        self.planner = make_planner()
+        self.planner: Planner = make_planner()
         self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
+        if gui:
+            self.planner = ShownPlanner(self.planner, Window(self.simulation.world))
 
     def run(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
