@@ -11,7 +11,6 @@ if TYPE_CHECKING:
 
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Round
 
 Option = typer.Option
 MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
@@ -76,6 +75,7 @@ def benchmark(
     GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
     """
     from edgegrasp_cli.planners.making import PlannerChoice, planner_of
+    from edgegrasp_cli.progress import with_progress
     from edgegrasp_client import GraspClientError
     from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
     from edgegrasp_sim.gate import below_gate
@@ -112,7 +112,7 @@ def benchmark(
         with planner_of(choice, rules.planning) as made:
             if folder is not None:
                 folder.open(manifest(config, made.facts))
-            done = _with_progress(
+            done = with_progress(
                 config,
                 folder,
                 lambda on_round: run_benchmark(
@@ -177,47 +177,6 @@ def _prepare_objects(config: "BenchmarkConfig") -> None:
 
     with Console(stderr=True).status("reading objects"):
         config.object_set()
-
-
-def _with_progress(
-    config: "BenchmarkConfig",
-    folder: "ResultFolder | None",
-    run: "Callable[[Callable[[Round], None]], list[Round]]",
-) -> "list[Round]":
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    tasks = config.tasks()
-    finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
-    attempts = successes = objects = retries = 0
-    with Progress(*columns) as progress:
-        bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
-
-        def on_round(done: "Round") -> None:
-            nonlocal attempts, successes, objects, retries
-            attempts += len(done.attempts)
-            successes += done.successes
-            objects += len(done.objects)
-            retries += done.retries
-            text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
-            if retries:
-                text += f" asked again {retries} times"
-            progress.update(bar, advance=1, description=text)
-
-        return run(on_round)
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
