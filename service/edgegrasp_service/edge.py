@@ -40,7 +40,8 @@ class Edge:
         draining: Whether the server is stopping.
     """
 
-    def __init__(self, tokens: Tokens, metrics: Metrics) -> None:
+    def __init__(self, tokens: Tokens, metrics: Metrics, max_header_bytes: int) -> None:
+        self.max_header_bytes = max_header_bytes
         self.tokens = tokens
         self.metrics = metrics
         self.draining = False
@@ -107,11 +108,19 @@ class Edge:
             self.metrics.in_flight(change)
 
 
-def check_count(count: int, kind: str) -> None:
-    """Pass where there are not too many headers; the libraries below limit their size.
+def check_headers(kind: str, count: int, size: int = 0, most: int = 0) -> None:
+    """Pass where headers are few and short; what they are read with bounds them only roughly.
+
+    Args:
+        kind: What they are called.
+        count: How many.
+        size: Bytes of them all.
+        most: Bytes accepted.
 
     Raises:
-        HeadersTooLarge: There are more than MAX_HEADERS.
+        HeadersTooLarge: They are more than MAX_HEADERS, or larger than `most`.
     """
     if count > MAX_HEADERS:
         raise HeadersTooLarge(kind, f"{count} entries", f"Send at most {MAX_HEADERS}.")
+    if size > most:
+        raise HeadersTooLarge(kind, f"{size} bytes", f"Send at most {most}.")

@@ -9,7 +9,7 @@ import grpc
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.edge import Answered, Edge, check_count
+from edgegrasp_service.edge import Answered, Edge, check_headers
 from edgegrasp_service.errors import ServiceError, report
 from edgegrasp_service.grpc_decoding import Decoded, Undecodable, tolerant
 from edgegrasp_service.grpc_messages import ERROR_METADATA, error_message
@@ -47,7 +47,7 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
         headers = {name: value for name, value in entries if isinstance(value, str)}
         method = METHODS.get(path, "other")
         try:
-            check_count(len(entries), "metadata")
+            check_headers("metadata", len(entries))
             if not path.startswith(f"/{HEALTH}/"):
                 admin = method == "ReloadModels"
                 self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)

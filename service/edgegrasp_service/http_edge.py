@@ -3,7 +3,7 @@
 from fastapi.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from edgegrasp_service.edge import Answered, Edge, GivenUp, check_count
+from edgegrasp_service.edge import Answered, Edge, GivenUp, check_headers
 from edgegrasp_service.errors import ServiceError, UnsupportedMediaType, report
 from edgegrasp_service.http_problem import problem_response
 from edgegrasp_service.request_id import HEADER
@@ -71,7 +71,9 @@ class HttpEdge:
                     await problem_response(report(error.reason))(scope, receive, send_named)
 
     def _check(self, scope: Scope, method: str, headers: dict[str, str]) -> None:
-        check_count(len(scope["headers"]), "headers")
+        size = sum(len(name) + len(value) for name, value in scope["headers"])
+        size += len(scope["raw_path"]) + len(scope["query_string"])
+        check_headers("headers", len(scope["headers"]), size, self._edge.max_header_bytes)
         if method not in OPEN:
             admin = method == "ReloadModels"
             self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)

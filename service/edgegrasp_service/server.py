@@ -66,7 +66,7 @@ class Server:
         self._settings = settings
         self._tls = load_tls(settings)
         self.metrics = Metrics(sorted(METHODS))
-        self._edge = Edge(load_tokens(settings), self.metrics)
+        self._edge = Edge(load_tokens(settings), self.metrics, settings.max_header_bytes)
         self._service = service or GraspService(
             lambda: load_backend(settings), settings, Observers((self.metrics, *observers))
         )
