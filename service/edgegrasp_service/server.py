@@ -20,6 +20,7 @@ from edgegrasp_service.grpc_edge import GrpcEdge
 from edgegrasp_service.grpc_server import GrpcServer
 from edgegrasp_service.http_app import create_app
 from edgegrasp_service.http_edge import HttpEdge
+from edgegrasp_service.http_protocol import HttpProtocol
 from edgegrasp_service.logs import LogWriter, start_logging, write_line
 from edgegrasp_service.metrics import Metrics
 from edgegrasp_service.observer import Observer
@@ -156,7 +157,7 @@ class Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http="h11",  # whatever else is installed: its limit of headers is the one set here
+            http=HttpProtocol,  # whatever else is installed: its bounds are the ones set here
             h11_max_incomplete_event_size=self._settings.max_header_bytes,
             ws="none",
             server_header=False,

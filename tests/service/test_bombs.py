@@ -17,6 +17,7 @@ from grpc import StatusCode, aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_service import http_protocol
 from edgegrasp_service.cloud_decoding import decode_file
 from edgegrasp_service.errors import PayloadTooLarge
 
@@ -68,6 +69,20 @@ async def test_an_endless_http_header_is_not_kept(serving) -> None:
         # Ends because the server closes: there is no end of the header.
         answer = await send(server.http_url, b"GET / HTTP/1.1\r\nx: " + b"a" * MIB)
         assert not answer or answer.startswith(b"HTTP/1.1 400")
+
+
+@pytest.mark.parametrize("before", [b"", b"GET /health/live HTTP/1.1\r\nHost: x\r\n\r\n"])
+async def test_a_header_that_does_not_end_is_not_waited_for(
+    serving, monkeypatch: pytest.MonkeyPatch, before: bytes
+) -> None:
+    monkeypatch.setattr(http_protocol, "HEADER_SECONDS", 0.2)
+    async with serving() as server:
+        sent = before + b"GET /v1/models HTTP/1.1\r\nx: y"
+        answer = await asyncio.wait_for(send(server.http_url, sent), 30)
+        assert answer.count(b"HTTP/1.1") == bool(before)
+        assert await asyncio.wait_for(send(server.http_url, b""), 30) == b""
+        async with httpx.AsyncClient(base_url=server.http_url) as http:
+            assert (await http.get("/health/live")).status_code == 200
 
 
 async def test_many_http_headers_are_refused(serving) -> None:
