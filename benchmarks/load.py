@@ -133,13 +133,32 @@ def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any
                 answers.append(time.perf_counter() - start)
                 if told.code != "OK":
                     raise RuntimeError(f"{transport}: {told.code}")
+            alone.append(in_process.seconds(points, OPTIONS))
         found[transport] = {
             "pairs": pairs,
             "in_process_ms": percentiles(alone),
             "served_ms": percentiles(answers),
-            "overhead_p50_ms": 1000 * (float(np.median(answers)) - float(np.median(alone))),
+            "overhead_p50_ms": 1000 * float(np.median(answers) - np.median(alone)),
+            **undisturbed(np.array(alone), np.array(answers)),
         }
     return found
+
+
+def undisturbed(alone: Any, answers: Any) -> dict[str, Any]:
+    """The same from the pairs during which the machine did little else.
+
+    Those are told by the detector in this process, before and after each answer, not by the
+    answer: where it took at most 5 % longer than its fastest tenth.
+    """
+    quiet = alone <= 1.05 * np.percentile(alone, 10)
+    chosen = quiet[:-1] & quiet[1:]
+    if not chosen.any():
+        return {"undisturbed_pairs": 0, "overhead_p50_undisturbed_ms": None}
+    beyond = float(np.median(answers[chosen]) - np.median(alone[quiet]))
+    return {
+        "undisturbed_pairs": int(chosen.sum()),
+        "overhead_p50_undisturbed_ms": 1000 * beyond,
+    }
 
 
 def closed(server: Served, seconds: float) -> list[dict[str, Any]]:
@@ -278,9 +297,9 @@ def targets(results: dict[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, limit in (("grpc", 3.0), ("rest", 6.0)):
         for kind, both in results["overhead"].items():
-            found[f"{name}: overhead p50 with the {kind}, ms (<= {limit:g})"] = round(
-                both[name]["overhead_p50_ms"], 2
-            )
+            of = ("overhead_p50_ms", "overhead_p50_undisturbed_ms", "undisturbed_pairs", "pairs")
+            key = f"{name}: overhead p50 with the {kind}, ms (<= {limit:g})"
+            found[key] = {figure: both[name][figure] for figure in of}
     dummy = [(f"{row['transport']}, dummy", DEADLINE, row) for row in results["open"]]
     real = [("grpc, network", NETWORK_DEADLINE, row) for row in results.get("network", [])]
     for kind, deadline, row in dummy + real:

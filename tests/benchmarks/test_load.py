@@ -39,6 +39,15 @@ def test_answers_that_come_late_do_not_count_for_more_than_their_time(module) ->
     assert module("load").summary(samples, start=0.0, seconds=1.0)["accepted_per_second"] == 0.5
 
 
+def test_overhead_while_the_machine_does_little_else(module) -> None:
+    """A burst of other work shows in the detector's own time, before or after an answer."""
+    alone = np.array([0.020, 0.020, 0.020, 0.050, 0.020, 0.020])
+    answers = np.array([0.023, 0.024, 0.090, 0.080, 0.025])
+    found = module("load").undisturbed(alone, answers)
+    assert found["undisturbed_pairs"] == 3
+    assert found["overhead_p50_undisturbed_ms"] == pytest.approx(4.0)
+
+
 def test_percentiles_of_nothing(module) -> None:
     assert module("load").percentiles([]) is None
 

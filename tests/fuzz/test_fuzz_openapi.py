@@ -25,8 +25,13 @@ def test_the_server_keeps_to_its_document(start_server, tmp_path: Path) -> None:
     if not program.exists():
         pytest.skip("schemathesis is not installed")
     long = settings.get_current_profile_name() == "fuzz"
-    with start_server("--backend", "dummy", "--log-level", "error") as server:
+    token = "fuzz-0123456789abcdef0123456789abcdef"
+    file = tmp_path / "tokens"
+    file.write_text(token)
+    flags = ("--backend", "dummy", "--log-level", "error", "--admin-token-file", str(file))
+    with start_server(*flags) as server:
         command = [program, "run", f"{server.http_url}/openapi.json", "--no-color", "--seed", "1"]
+        command += ["--header", f"Authorization: Bearer {token}"]
         done = subprocess.run(
             [*command, "--checks", ",".join(CHECKS), *(LONG if long else SHORT)],
             cwd=tmp_path,
