@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from edgegrasp_sim.families import FAMILIES, write_family
+from edgegrasp_sim.families import DROPPED, FAMILIES, write_family
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 
@@ -114,7 +114,7 @@ def families(
         Case("family", name, scene, changed, {"model": model}, folders[name])
         for scene in scenes
         for model in models
-        for name in FAMILIES
+        for name in (FAMILIES if scene is SceneKind.PACKED else DROPPED)
     ]
 
 
