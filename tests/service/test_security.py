@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import ssl
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,11 @@ from edgegrasp_client import (
     Tls,
 )
 from edgegrasp_service import tokens
+from edgegrasp_service.core import GraspService
+from edgegrasp_service.dummy import DummyCatalogue
 from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
+from edgegrasp_service.probe import is_ready
+from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.tls import load_tls
 from edgegrasp_service.tokens import Tokens, load_tokens
@@ -332,3 +337,36 @@ def test_the_client_refuses_what_cannot_be() -> None:
                 GraspClient(address, **security)
     with pytest.raises(InvalidRequestError, match="alone"):
         Tls(certificate=missing)
+
+
+@pytest.mark.parametrize("secure", ["plain", "tls", "client certificates"])
+async def test_the_containers_health_check(serving, server_tls, pem, secure: str) -> None:
+    given: dict[str, Any] = {} if secure == "plain" else dict(server_tls)
+    if secure == "client certificates":
+        given["tls_client_ca"] = pem["ca"]
+    async with serving(**given, tokens=[USER]) as server:
+        port = int(server.http_url.rpartition(":")[2])
+        settings = Settings(**given, http_port=port)
+        assert await asyncio.to_thread(is_ready, settings)
+    assert not is_ready(settings)
+
+
+async def test_the_health_check_waits_for_weights() -> None:
+    may_load = threading.Event()
+
+    def load() -> DummyCatalogue:
+        assert may_load.wait(20)
+        return DummyCatalogue()
+
+    settings = Settings(http_port=0, grpc_port=0, grace_seconds=1.0)
+    server = Server(settings, GraspService(load, settings))
+    opened, ready, stop = (asyncio.Event() for _ in range(3))
+    running = asyncio.create_task(server.serve(stop, opened.set, ready.set))
+    await opened.wait()
+    port = int(server.http_url.rpartition(":")[2])
+    assert not await asyncio.to_thread(is_ready, Settings(http_port=port))
+    may_load.set()
+    await ready.wait()
+    assert await asyncio.to_thread(is_ready, Settings(http_port=port, host="0.0.0.0"))
+    stop.set()
+    await running
