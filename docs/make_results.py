@@ -56,8 +56,9 @@ EXPERIMENTS = {
         "Robustness",
         "edgegrasp experiment robustness --rounds 100 --objects OBJECTS --output DIR",
         "One thing is changed at a time; the protocol has 1 mm noise, a polar angle of 45 to 60 "
-        "degrees and 4 mm voxels, the weights their own voxel size. View `giga` is a fixed side "
-        "view with the noise of a depth camera.",
+        "degrees, the weights have a voxel size of their own. `giga` is a fixed side view with "
+        "noise that also moves a whole image by some 3 % of its depth (19 mm); its camera alone "
+        "has the protocol's noise.",
     ),
     "families": (
         "Objects of other families",

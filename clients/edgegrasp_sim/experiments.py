@@ -79,9 +79,18 @@ def robustness(
             for value in FLIPPED_PERCENT:
                 planner = named | {"flipped_normals": value / 100}
                 cases.append(Case("normals flipped (%)", value, scene, protocol, planner))
-            for other in (protocol, load_protocol("giga")):
-                cases.append(Case("view", other.name, scene, other, named))
+            cases += [Case("view", v.name, scene, v, named) for v in _views(protocol)]
     return cases
+
+
+def _views(protocol: Protocol) -> list[Protocol]:
+    """A protocol, the same with the camera of `giga`, and `giga` with its noise."""
+    giga = load_protocol("giga")
+    return [
+        protocol,
+        replace(protocol, name=f"{protocol.name}, giga's camera", camera=giga.camera),
+        giga,
+    ]
 
 
 def samples(

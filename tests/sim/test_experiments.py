@@ -39,14 +39,16 @@ def test_robustness_changes_one_thing_at_a_time(tmp_path: Path) -> None:
         groups.setdefault(case.group, []).append(case)
     noise = [case.protocol.noise.point_std for case in groups["noise (mm)"]]
     assert (min(noise), max(noise)) == (0.0, 0.003)
-    polar = {
-        case.protocol.camera.polar_degrees for case in groups["camera's polar angle (degrees)"]
-    }
+    angles = groups["camera's polar angle (degrees)"]
+    polar = {case.protocol.camera.polar_degrees for case in angles}
     assert {(15.0, 15.0), (75.0, 75.0)} <= polar
     assert {c.planner["voxel_size"] for c in groups["voxel size (mm)"]} >= {0.003, 0.004, 0.006}
     flipped = [case.planner["flipped_normals"] for case in groups["normals flipped (%)"]]
     assert (min(flipped), max(flipped)) == (0.0, 0.5)
-    assert {case.protocol.name for case in groups["view"]} == {"edgegrasp", "giga"}
+    giga = load_protocol("giga")
+    plain, moved, full = (case.protocol for case in groups["view"][:3])
+    assert (plain, full) == (PAPER, giga)
+    assert (moved.camera, moved.noise) == (giga.camera, PAPER.noise)
     for case in (*groups["noise (mm)"], *angles):
         rules = case.protocol
         changed = [part for part in ("scene", "round", "camera", "noise", "planning")
