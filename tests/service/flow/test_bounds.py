@@ -210,3 +210,19 @@ async def test_a_turn_that_comes_as_its_owner_leaves_is_passed_on() -> None:
     assert done == [0, 2]
     await asyncio.wait([second])
     await admission.empty()
+
+
+async def test_large_bodies_are_refused_in_words_too(serve, cloud) -> None:
+    """A client that sends all of its body before it reads gets the answer, and may go on."""
+    running = await serve(max_concurrent_requests=1, max_queue_length=0)
+    running.stages.shut("prepare")
+    small, large = {"points": cloud.tolist()}, HD.astype(np.float32).tobytes() * 2
+    url = running.server.http_url
+    async with httpx.AsyncClient(base_url=url) as first, httpx.AsyncClient(base_url=url) as http:
+        accepted = asyncio.create_task(first.post("/v1/grasps", json=small, timeout=20))
+        await running.until(lambda: running.stages.begun["prepare"] == 1)
+        refused = await http.post("/v1/grasps", content=large, timeout=20)
+        assert refused.status_code == 429
+        running.stages.open("prepare")
+        assert (await accepted).status_code == 200
+        assert (await http.post("/v1/grasps", json=small)).status_code == 200
