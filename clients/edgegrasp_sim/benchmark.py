@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -32,6 +33,7 @@ PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
 
 MAX_CRASHES = 3  # in a row without a finished round between them
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
 
 
@@ -307,6 +309,19 @@ def _run_pools(
                 ) from None
 
 
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started meanwhile use one thread each: with all cores busy, more only wait."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update({name: value or "1" for name, value in before.items()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
 def _run_pool(
     config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
@@ -316,7 +331,8 @@ def _run_pool(
         workers, context, initializer=_start_worker, initargs=(config, make_planner)
     )
     try:
-        futures = [pool.submit(_run_in_worker, task) for task in tasks]
+        with _one_thread_each():
+            futures = [pool.submit(_run_in_worker, task) for task in tasks]
         for future in as_completed(futures):
             yield future.result()
     finally:
