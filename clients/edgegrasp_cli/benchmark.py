@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from edgegrasp_cli.connection import TlsCa, TlsCertificate, TlsKey, TokenFile, UseTls
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -40,6 +42,11 @@ def benchmark(
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
+    token_file: TokenFile = None,
+    tls: UseTls = False,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     weights: Annotated[list[Path] | None, Option(help="Weights besides those that ship.")] = None,
     model: Annotated[
         str, Option(help="Weights to use: a name or a .safetensors file; empty: the default.")
@@ -89,6 +96,7 @@ def benchmark(
         model,
         tuple(path.resolve() for path in weights or ()),
         server,
+        (token_file, tls, tls_ca, tls_certificate, tls_key),
         collision,
         num_approach_points,
         num_candidates,

@@ -3,7 +3,7 @@
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -22,6 +22,9 @@ TlsCa = Annotated[Path | None, typer.Option(help="TLS, trusting the authorities 
 TlsCertificate = Annotated[Path | None, typer.Option(help="One's own certificate, PEM.")]
 TlsKey = Annotated[Path | None, typer.Option(help="The key of one's own certificate, PEM.")]
 
+# The values of these flags, in this order: token file, TLS or not, authorities, certificate, key.
+Connection: TypeAlias = tuple[Path | None, bool, Path | None, Path | None, Path | None]
+NO_CONNECTION: Connection = (None, False, None, None, None)
 FLAGS = ("token_file", "tls", "tls_ca", "tls_certificate", "tls_key")
 
 

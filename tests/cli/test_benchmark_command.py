@@ -189,3 +189,19 @@ def wait_until_closed(port: int) -> None:
             if probe.connect_ex(("127.0.0.1", port)) != 0:
                 return
         time.sleep(0.01)
+
+
+def test_a_server_that_asks_for_a_token_gets_it(
+    start_server: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("EDGEGRASP_CLIENT_TOKEN", raising=False)
+    token = tmp_path / "token"
+    token.write_text("user-token-0123456789\n")
+    with start_server("--backend", "dummy", "--token-file", str(token)) as server:
+        asked = ("--server", server.grpc_address)
+        known = benchmark(tmp_path / "known", "server", *asked, "--token-file", token, rounds=1)
+        assert known["attempts"] > 0
+        words = ("benchmark", "--rounds", "1", "--seed", "0", "--workers", "1", *asked)
+        result = CliRunner().invoke(app, list(words))
+        assert result.exit_code == 1
+        assert "authorization: got nothing" in result.output

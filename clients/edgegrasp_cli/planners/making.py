@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from edgegrasp_cli.connection import NO_CONNECTION, Connection, connect
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trials import Planner
 
+CONNECT_SECONDS = 30.0
 SUFFIX = ".safetensors"
 
 
@@ -22,6 +24,7 @@ class PlannerChoice:
         model: weights by name, or a `.safetensors` file; empty: the default.
         weights: files or folders besides those that ship.
         server: `host:port` or `http://host:port`; None: one is started.
+        connection: how to know the server and what to show it; see `Connection`.
         collision: `avoid`, `penalise` or `ignore`.
         num_approach_points: None: the protocol's.
         num_candidates: None: the protocol's.
@@ -33,6 +36,7 @@ class PlannerChoice:
     model: str = ""
     weights: tuple[Path, ...] = ()
     server: str | None = None
+    connection: Connection = NO_CONNECTION
     collision: str = "penalise"
     num_approach_points: int | None = None
     num_candidates: int | None = None
@@ -181,7 +185,6 @@ def _metadata(weights: tuple[Path, ...], model: str) -> Any:
 @contextmanager
 def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[MadePlanner]:
     from edgegrasp_cli.planners.server import ServerPlannerFactory, model_used
-    from edgegrasp_client import GraspClient
     from edgegrasp_client.local_server import Addresses, local_server
 
     if choice.server and choice.model.endswith(SUFFIX):
@@ -191,11 +194,15 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[MadePlanner
     flags = [text for path in weights for text in ("--weights", str(path))]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
-        with GraspClient(addresses.grpc_address) as client:
+        with connect(addresses.grpc_address, CONNECT_SECONDS, *choice.connection) as client:
             used = model_used(client, model)
         yield MadePlanner(
             ServerPlannerFactory(
-                addresses.grpc_address, rules, {"model": model, **options}, used.digest
+                addresses.grpc_address,
+                rules,
+                {"model": model, **options},
+                used.digest,
+                choice.connection,
             ),
             {
                 "name": "server",
