@@ -147,6 +147,32 @@ async def test_while_draining_both_transports_say_so(transport: str, cloud: np.n
     await serving
 
 
+async def test_a_watcher_sees_a_server_become_ready() -> None:
+    may_load = threading.Event()
+
+    def load() -> DummyCatalogue:
+        assert may_load.wait(20)
+        return DummyCatalogue()
+
+    settings = load_settings(http_port=0, grpc_port=0, grace_seconds=0.0)
+    server = Server(settings, GraspService(load, settings))
+    opened, stop = asyncio.Event(), asyncio.Event()
+    serving = asyncio.create_task(server.serve(stop, opened=opened.set))
+    await opened.wait()
+    async with aio.insecure_channel(server.grpc_address) as channel:
+        stub = health_pb2_grpc.HealthStub(channel)
+        names = ("", "edgegrasp.v1.GraspService")
+        requests = [health_pb2.HealthCheckRequest(service=name) for name in names]
+        watches = [stub.Watch(request) for request in requests]
+        states = [[(await watch.read()).status for watch in watches]]
+        may_load.set()
+        states.append([(await watch.read()).status for watch in watches])
+        stop.set()
+        states.append([(await watch.read()).status for watch in watches])
+    assert states == [[Status.NOT_SERVING] * 2, [Status.SERVING] * 2, [Status.NOT_SERVING] * 2]
+    await serving
+
+
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
 async def test_when_grace_is_over_callers_are_told(transport: str, cloud: np.ndarray) -> None:
     catalogue = Held()
