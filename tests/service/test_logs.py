@@ -127,6 +127,12 @@ def test_json_lines_name_requests(tmp_path: Path, cloud: np.ndarray) -> None:
         server = Serving(stdout=subprocess.DEVNULL, stderr=log, folder=tmp_path)
         server.wait()
         server.ask(cloud, "robot-1/42")
+        with grpc.insecure_channel(
+            server.address
+        ) as channel:  # gRPC would say something of its own
+            call = channel.unary_unary("/edgegrasp.v1.GraspService/ListModels", bytes, bytes)
+            with pytest.raises(grpc.RpcError, match="gzip"):
+                call(bytes(5000), timeout=20, compression=grpc.Compression.Gzip)
         assert server.stop() == 0
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     ours = [line for line in lines if line.get("request_id") == "robot-1/42"]
