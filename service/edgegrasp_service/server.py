@@ -192,7 +192,7 @@ def run(settings: Settings) -> None:
             provider = otlp_provider(settings.otlp_endpoint)
             ends.callback(provider.shutdown)
             observers.append(Tracer(provider))
-        _warn_of_strangers(settings)
+        warn_of_strangers(settings)
         asyncio.run(_serve_until_signalled(settings, tuple(observers), log))
 
 
@@ -217,7 +217,7 @@ async def _serve_until_signalled(
     await server.serve(stop, opened, ready)
 
 
-def _warn_of_strangers(settings: Settings) -> None:
+def warn_of_strangers(settings: Settings) -> None:
     """Say what is open to whoever can reach this machine."""
     try:
         local = ipaddress.ip_address(settings.host).is_loopback
