@@ -16,7 +16,7 @@ COPY clients clients
 COPY model model
 COPY proto proto
 COPY service service
-RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt '.[service]'
+RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt '.[service,otel]'
 
 
 FROM python:3.11-slim
@@ -32,12 +32,13 @@ COPY --from=build /venv /venv
 
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
-    EDGEGRASP_HOST=0.0.0.0
+    EDGEGRASP_HOST=0.0.0.0 \
+    EDGEGRASP_LOG_FORMAT=json
 
 USER edgegrasp
 EXPOSE 8000 50051
 
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
-    CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8000/health/ready', timeout=2)"]
+    CMD ["python", "-m", "edgegrasp_service.probe"]
 
 ENTRYPOINT ["edgegrasp", "serve"]

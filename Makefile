@@ -39,6 +39,9 @@ format: $(INSTALLED) ## rewrite the code in the project's style
 test: $(INSTALLED) ## run the tests
 	$(BIN)/pytest -q
 
+fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
+	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz
+
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
 

@@ -1,20 +1,21 @@
 """`edgegrasp benchmark`."""
 
 import sys
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+from edgegrasp_cli.connection import TlsCa, TlsCertificate, TlsKey, TokenFile, UseTls
 
-    from edgegrasp_sim.benchmark import BenchmarkConfig, PlannerFactory
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Round
 
 Option = typer.Option
+MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
 
 
 def benchmark(
@@ -24,21 +25,32 @@ def benchmark(
     ] = "edgegrasp",
     planner: Annotated[
         str,
-        Option(help="server, in-process, edge-sample, oracle, an installed one, module:callable."),
+        Option(
+            help="server, in-process, edge-sample, oracle, oracle-own, an installed one, "
+            "module:callable."
+        ),
     ] = "server",
     rounds: Annotated[int | None, Option(help="Rounds for each seed; else the protocol's.")] = None,
     seed: Annotated[
         list[int] | None, Option(help="Seed of scenes, views and noise; may be repeated.")
     ] = None,
     objects: Annotated[
-        Path | None, Option(help="Folder SCENE/SPLIT/*.urdf; else the built-in objects.")
+        Path | None,
+        Option(help="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects."),
     ] = None,
     split: Annotated[str, Option(help="Which of its objects: test or train.")] = "test",
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
+    token_file: TokenFile = None,
+    tls: UseTls = False,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     weights: Annotated[list[Path] | None, Option(help="Weights besides those that ship.")] = None,
-    model: Annotated[str, Option(help="Weights to use; empty: the default.")] = "",
+    model: Annotated[
+        str, Option(help="Weights to use: a name or a .safetensors file; empty: the default.")
+    ] = "",
     num_approach_points: Annotated[
         int | None, Option(help="Approach points sampled; else the protocol's.")
     ] = None,
@@ -46,7 +58,12 @@ def benchmark(
         int | None, Option(help="Candidates scored at most; else the protocol's.")
     ] = None,
     collision: Annotated[str, Option(help="avoid, penalise or ignore.")] = "penalise",
-    workers: Annotated[int, Option(help="Processes that simulate; results stay the same.")] = 1,
+    workers: Annotated[
+        int | None, Option(help="Processes that simulate; else one for each core. Same results.")
+    ] = None,
+    ray: Annotated[
+        str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")
+    ] = None,
     patience: Annotated[
         float, Option(help="Seconds to go on asking a server that is away.")
     ] = 300.0,
@@ -64,6 +81,8 @@ def benchmark(
 
     GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
     """
+    from edgegrasp_cli.planners.making import PlannerChoice, planner_of
+    from edgegrasp_cli.progress import with_progress
     from edgegrasp_client import GraspClientError
     from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
     from edgegrasp_sim.gate import below_gate
@@ -72,14 +91,16 @@ def benchmark(
     from edgegrasp_sim.results import ResultFolder, summarise
     from edgegrasp_sim.trials import PlannerUnavailableError
 
-    overrides = {
-        name: value
-        for name, value in (
-            ("num_approach_points", num_approach_points),
-            ("num_candidates", num_candidates),
-        )
-        if value is not None
-    }
+    choice = PlannerChoice(
+        planner,
+        model,
+        tuple(path.resolve() for path in weights or ()),
+        server,
+        (token_file, tls, tls_ca, tls_certificate, tls_key),
+        collision,
+        num_approach_points,
+        num_candidates,
+    )
     try:
         rules = load_protocol(protocol)
         config = BenchmarkConfig(
@@ -87,27 +108,26 @@ def benchmark(
             rules.rounds if rounds is None else rounds,
             tuple(seed or rules.seeds),
             rules,
-            objects,
+            objects.resolve() if objects is not None else None,
             split,
             patience,
         )
-        if gui and workers > 1:
-            raise ValueError(f"workers is {workers}; the window shows one: use 1")
-        config.object_set()  # a wrong folder shall fail before a server is started
+        processes = _processes(
+            workers, gui=gui, ray=ray, own_server=planner == "server" and server is None
+        )
+        _prepare_objects(config)  # a wrong folder shall fail before a server is started
         folder = ResultFolder(output) if output is not None else None
-        with _planner(
-            planner, config, server, tuple(weights or ()), model, overrides, collision
-        ) as (make_planner, description):
-            facts = manifest(config, description)
+        with planner_of(choice, rules.planning) as made:
             if folder is not None:
-                folder.open(facts)
-            done = _with_progress(
+                folder.open(manifest(config, made.facts))
+            done = with_progress(
                 config,
                 folder,
                 lambda on_round: run_benchmark(
                     config,
-                    make_planner,
-                    workers=workers,
+                    made.make,
+                    workers=processes,
+                    ray=ray,
                     folder=folder,
                     on_round=on_round,
                     gui=gui,
@@ -130,129 +150,41 @@ def benchmark(
         folder.finish(done)
         if report:
             _write_report(folder)
-    _print_summary(summary, description.get("model") or planner)
+    _print_summary(summary, made.title)
     if gate is not None:
         _check_gate(lambda: below_gate(summary, gate))
 
 
-@contextmanager
-def _planner(
-    name: str,
-    config: "BenchmarkConfig",
-    server: str | None,
-    weights: tuple[Path, ...],
-    model: str,
-    overrides: dict[str, int],
-    collision: str,
-) -> "Iterator[tuple[PlannerFactory, dict[str, Any]]]":
-    """What makes the planner, and how to describe it in the manifest."""
-    rules = config.protocol.planning
-    options = {"model": model, "collision": collision, **overrides}
-    if name == "server":
-        with _server_planner(server, weights, rules, options) as made:
-            yield made
-    elif name == "in-process":
-        from edgegrasp_cli.planners.in_process import InProcessPlannerFactory
-        from edgegrasp_model.catalogue import ModelCatalogue
-        from edgegrasp_model.errors import EdgeGraspError
+def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: bool) -> int:
+    """How many worker processes to use.
 
-        try:
-            used = ModelCatalogue.load(weights).get(model).metadata
-        except EdgeGraspError as error:
-            raise ValueError(str(error)) from error
-        del options["model"]
-        facts = {"model": used.name, "digest": used.digest, "options": options}
-        yield (
-            InProcessPlannerFactory(weights, model, rules, options),
-            {"name": name, **facts},
+    Raises:
+        ValueError: flags that do not go together.
+    """
+    from edgegrasp_sim.benchmark import available_cores
+
+    if gui and (workers or 1) > 1:
+        raise ValueError(f"workers is {workers}; the window shows one: use 1")
+    if gui and ray is not None:
+        raise ValueError(f"ray is {ray!r}; the window is this machine's: leave it out")
+    if ray not in (None, "local") and own_server:
+        raise ValueError(
+            f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
+            "--server, or --planner in-process"
         )
-    elif name in ("edge-sample", "oracle"):
-        from edgegrasp_cli.planners.edge_sample import CandidateSampler, EdgeSampleFactory
-        from edgegrasp_cli.planners.oracle import MAX_TRIES, OracleFactory
-
-        sampler = CandidateSampler(
-            overrides.get("num_approach_points", rules.num_approach_points),
-            overrides.get("num_candidates", rules.num_candidates),
-            rules.voxel_size,
-        )
-        if name == "oracle":
-            yield OracleFactory(sampler), {"name": name, "max_tries": MAX_TRIES, **overrides}
-        else:
-            yield EdgeSampleFactory(sampler), {"name": name, **overrides}
-    else:
-        from edgegrasp_cli.planners import NamedPlanner
-
-        make_planner = NamedPlanner(name)
-        make_planner()  # a wrong name shall fail here, not in every worker
-        yield make_planner, {"name": name}
+    if gui:
+        return 1
+    if workers is None:
+        return MAX_RAY_WORKERS if ray is not None else available_cores()
+    return workers
 
 
-@contextmanager
-def _server_planner(
-    server: str | None, weights: tuple[Path, ...], rules: Any, options: dict[str, Any]
-) -> "Iterator[tuple[PlannerFactory, dict[str, Any]]]":
-    from contextlib import nullcontext
+def _prepare_objects(config: "BenchmarkConfig") -> None:
+    """Read the objects; meshes are taken apart at this moment, once for all workers."""
+    from rich.console import Console
 
-    from edgegrasp_cli.planners.server import ServerPlannerFactory, model_used
-    from edgegrasp_client import GraspClient
-    from edgegrasp_client.local_server import Addresses, local_server
-
-    flags = [text for path in weights for text in ("--weights", str(path))]
-    own = nullcontext(Addresses("", server)) if server else local_server(*flags)
-    with own as addresses:
-        with GraspClient(addresses.grpc_address) as client:
-            used = model_used(client, options["model"])
-        yield (
-            ServerPlannerFactory(addresses.grpc_address, rules, options, used.digest),
-            {
-                "name": "server",
-                "model": used.name,
-                "digest": used.digest,
-                "voxel_size": used.voxel_size,
-                "options": {name: value for name, value in options.items() if name != "model"},
-            },
-        )
-
-
-def _with_progress(
-    config: "BenchmarkConfig",
-    folder: "ResultFolder | None",
-    run: "Callable[[Callable[[Round], None]], list[Round]]",
-) -> "list[Round]":
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    tasks = config.tasks()
-    finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
-    attempts = successes = objects = retries = 0
-    with Progress(*columns) as progress:
-        bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
-
-        def on_round(done: "Round") -> None:
-            nonlocal attempts, successes, objects, retries
-            attempts += len(done.attempts)
-            successes += done.successes
-            objects += len(done.objects)
-            retries += done.retries
-            text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
-            if retries:
-                text += f" asked again {retries} times"
-            progress.update(bar, advance=1, description=text)
-
-        return run(on_round)
+    with Console(stderr=True).status("reading objects"):
+        config.object_set()
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:

@@ -7,10 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
+from edgegrasp_cli.connection import (
+    FLAGS,
+    TlsCa,
+    TlsCertificate,
+    TlsKey,
+    TokenFile,
+    UseTls,
+    connect,
+)
 from edgegrasp_cli.detection_output import as_json, print_table
 
 Option = typer.Option
-NOT_OPTIONS = ("file", "server", "timeout", "weights", "grippers", "as_document", "options")
+NOT_OPTIONS = (
+    *("file", "server", "timeout", *FLAGS, "weights", "grippers", "as_document", "options"),
+)
 
 
 def detect(
@@ -19,6 +30,11 @@ def detect(
         str | None, Option(help="host:port (gRPC) or http://host:port; else in this process.")
     ] = None,
     timeout: Annotated[float, Option(help="Seconds to wait for a server.")] = 60.0,
+    token_file: TokenFile = None,
+    tls: UseTls = False,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     weights: Annotated[
         list[Path] | None, Option(help="Weights file or folder, where there is no server.")
     ] = None,
@@ -76,8 +92,9 @@ def detect(
         if name not in NOT_OPTIONS and value is not None
     }
     fields = _options(options, given)
+    connection = (timeout, token_file, tls, tls_ca, tls_certificate, tls_key)
     if server:
-        detection = _by_server(server, file, timeout, fields)
+        detection = _by_server(server, file, connection, fields)
     else:
         detection = _in_this_process(file, weights or [], grippers or [], fields)
     if as_document:
@@ -100,11 +117,13 @@ def _options(file: Path | None, given: dict[str, str]) -> dict[str, Any]:
         sys.exit(f"edgegrasp detect: {file or 'options'}: {error}")
 
 
-def _by_server(address: str, file: Path, timeout: float, options: dict[str, Any]) -> Any:
-    from edgegrasp_client import GraspClient, GraspClientError
+def _by_server(
+    address: str, file: Path, connection: tuple[Any, ...], options: dict[str, Any]
+) -> Any:
+    from edgegrasp_client import GraspClientError
 
     try:
-        with GraspClient(address, timeout=timeout) as client:
+        with connect(address, *connection) as client:
             return client.detect(file, **options)
     except GraspClientError as error:
         sys.exit(f"edgegrasp detect: {error}")

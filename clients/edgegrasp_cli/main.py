@@ -18,6 +18,7 @@ COMMANDS = {
     "detect": ("service", "Find grasps in a point cloud file."),
     "models": ("service", "List the weights that can be used."),
     "benchmark": ("sim", "Clear simulated clutter with a planner's grasps and count successes."),
+    "experiment": ("train", "Run benchmarks that differ in one thing each, side by side."),
     "replay": ("sim", "Make one recorded attempt of a benchmark again."),
     "compare": ("sim", "Compare two benchmarks scene by scene."),
     "generate-data": ("train", "Make labelled edge grasps in simulation."),

@@ -2,9 +2,18 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from edgegrasp_cli.connection import (
+    TlsCa,
+    TlsCertificate,
+    TlsKey,
+    TokenFile,
+    UseTls,
+    connect,
+)
 
 if TYPE_CHECKING:
     from edgegrasp_client import Model
@@ -14,6 +23,12 @@ def models(
     server: Annotated[
         str | None, typer.Option(help="host:port (gRPC) or http://host:port; else in this process.")
     ] = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for a server.")] = 60.0,
+    token_file: TokenFile = None,
+    tls: UseTls = False,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     weights: Annotated[
         list[Path] | None, typer.Option(help="Weights file or folder, besides those that ship.")
     ] = None,
@@ -22,8 +37,9 @@ def models(
     from rich.console import Console
     from rich.table import Table
 
+    connection = (timeout, token_file, tls, tls_ca, tls_certificate, tls_key)
     table = Table("model", "architecture", "parameters", "crop radius (m)", "gripper", "digest")
-    for row in _of_server(server) if server else _of_this_process(weights or []):
+    for row in _of_server(server, connection) if server else _of_this_process(weights or []):
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
             row.architecture,
@@ -35,11 +51,11 @@ def models(
     Console().print(table)
 
 
-def _of_server(address: str) -> "list[Model]":
-    from edgegrasp_client import GraspClient, GraspClientError
+def _of_server(address: str, connection: tuple[Any, ...]) -> "list[Model]":
+    from edgegrasp_client import GraspClientError
 
     try:
-        with GraspClient(address) as client:
+        with connect(address, *connection) as client:
             return client.models()
     except GraspClientError as error:
         sys.exit(f"edgegrasp models: {error}")

@@ -1,6 +1,7 @@
 """`edgegrasp serve`: every setting of the server but its secrets is a flag."""
 
 import inspect
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,8 @@ def serve(config: Path | None, print_config: bool, **flags: Any) -> None:
     or else from the defaults. Tokens come from files, or EDGEGRASP_TOKENS.
     """
     given = {name: value for name, value in flags.items() if value not in (None, [])}
+    # gRPC's own lines are no JSON, and a pipe that nobody reads would stop it: no lines.
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_service.settings import load_settings_and_origins
 

@@ -15,6 +15,7 @@ from edgegrasp_client.errors import (
     DeadlineError,
     GraspClientError,
     InvalidRequestError,
+    OverloadedError,
     PayloadTooLargeError,
     ProtocolError,
     ServerFailedError,
@@ -45,6 +46,7 @@ from edgegrasp_client.options import (
 from edgegrasp_client.point_cloud2 import PointCloud2, PointField
 from edgegrasp_client.results import DebugInfo, Detection, Evaluation, Grasp, Model, Scoring
 from edgegrasp_client.security import Tls
+from edgegrasp_client.stream import StreamAnswer, StreamRequest
 
 __all__ = [
     "AccessDeniedError",
@@ -71,6 +73,7 @@ __all__ = [
     "Mask",
     "Model",
     "OrientedBox",
+    "OverloadedError",
     "PayloadTooLargeError",
     "PointCloud2",
     "PointField",
@@ -82,6 +85,8 @@ __all__ = [
     "ServerFailedError",
     "ServerUnavailableError",
     "Sphere",
+    "StreamAnswer",
+    "StreamRequest",
     "SupportPlane",
     "Suppression",
     "Swing",

@@ -1,17 +1,15 @@
 """The client, for asyncio."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import AsyncIterable, AsyncIterator, Iterable, Sequence
 from types import TracebackType
-from typing import Any, Protocol, Self, Unpack
+from typing import Any, Self, Unpack
 
-import grpc
 import httpx
 from grpc import aio
 from numpy.typing import NDArray
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import grpc_wire, rest_wire
+from edgegrasp_client.async_transports import GrpcTransport, RestTransport, Transport
 from edgegrasp_client.client import DEFAULT_ADDRESS, POLL_SECONDS, is_rest
 from edgegrasp_client.cloud_encoding import Cloud
 from edgegrasp_client.depth_image import DepthImage
@@ -19,7 +17,8 @@ from edgegrasp_client.errors import DeadlineError
 from edgegrasp_client.inputs import Given, Inputs
 from edgegrasp_client.options import DetectOptions, plain_options
 from edgegrasp_client.results import Detection, Model, Scoring
-from edgegrasp_client.security import Tls, channel_credentials, ssl_context, token_metadata
+from edgegrasp_client.security import Tls
+from edgegrasp_client.stream import StreamAnswer, StreamRequest
 
 
 class AsyncGraspClient:
@@ -47,11 +46,11 @@ class AsyncGraspClient:
         http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._transport: _Transport
+        self._transport: Transport
         if is_rest(address):
-            self._transport = _RestTransport(address, token, tls, http_transport)
+            self._transport = RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = _GrpcTransport(address, token, tls, channel)
+            self._transport = GrpcTransport(address, token, tls, channel)
 
     async def detect(
         self,
@@ -125,6 +124,31 @@ class AsyncGraspClient:
         plain = plain_options(options)
         return await self._transport.score(inputs, given, plain, self._seconds(timeout))
 
+    def detect_stream(
+        self,
+        requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
+        *,
+        timeout: float | None = None,
+    ) -> AsyncIterator[StreamAnswer]:
+        """Find grasps in one cloud after the other, over one stream.
+
+        The next request is sent while earlier ones are at work; where the server is behind, this
+        does not run ahead of it. Over REST, each request waits for the answer before it, on one
+        connection.
+
+        Args:
+            requests: Read as they can be sent, by `GraspClient` over gRPC in a thread of its own;
+                an error in it ends the stream once what went before is answered.
+            timeout: Seconds for each request that does not say; None: the client's own.
+
+        Yields:
+            An answer to each request, in their order; the error of one does not end the stream.
+
+        Raises:
+            GraspClientError: The stream itself failed, so that no more answers come.
+        """
+        return self._transport.detect_stream(_asynchronous(requests), self._seconds(timeout))
+
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name.
 
@@ -171,123 +195,12 @@ class AsyncGraspClient:
         return self._timeout if timeout is None else timeout
 
 
-class _Transport(Protocol):
-    async def detect(
-        self, inputs: Inputs, options: Mapping[str, Any], timeout: float
-    ) -> Detection: ...
-
-    async def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring: ...
-
-    async def models(self, timeout: float) -> list[Model]: ...
-
-    async def ready(self, timeout: float) -> bool: ...
-
-    async def close(self) -> None: ...
-
-
-def _open_channel(address: str, tls: Tls | None) -> aio.Channel:
-    if tls is None:
-        return aio.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
-    credentials = channel_credentials(tls)
-    return aio.secure_channel(address, credentials, grpc_wire.CHANNEL_OPTIONS)
-
-
-class _GrpcTransport:
-    def __init__(
-        self, address: str, token: str | None, tls: Tls | None, channel: aio.Channel | None
-    ) -> None:
-        self._owned = channel is None
-        self._channel = channel or _open_channel(address, tls)
-        self._metadata = token_metadata(token)
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
-        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
-
-    async def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
-        request = grpc_wire.request_message(inputs, options)
-        try:
-            answer = await self._stub.DetectGrasps(
-                request, timeout=timeout, metadata=self._metadata
-            )
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.detection_from_message(answer)
-
-    async def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring:
-        request = grpc_wire.score_message(inputs, given, options)
-        try:
-            answer = await self._stub.ScoreGrasps(request, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.scoring_from_message(answer)
-
-    async def models(self, timeout: float) -> list[Model]:
-        try:
-            request = grasp_pb2.ListModelsRequest()
-            answer = await self._stub.ListModels(request, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.models_from_message(answer)
-
-    async def ready(self, timeout: float) -> bool:
-        try:
-            return bool(await self._check(b"", timeout=timeout) == grpc_wire.SERVING)
-        except grpc.RpcError:
-            return False
-
-    async def close(self) -> None:
-        if self._owned:
-            await self._channel.close(None)
-
-
-class _RestTransport:
-    def __init__(
-        self,
-        address: str,
-        token: str | None,
-        tls: Tls | None,
-        transport: httpx.AsyncBaseTransport | None,
-    ) -> None:
-        self._http = httpx.AsyncClient(
-            base_url=address,
-            headers=dict(token_metadata(token)),
-            verify=ssl_context(tls),
-            transport=transport,
-        )
-
-    async def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
-        post = rest_wire.detect_post(inputs, options)
-        response = await self._post(rest_wire.GRASPS, post, timeout)
-        return rest_wire.detection_from_response(response)
-
-    async def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring:
-        post = rest_wire.score_post(inputs, given, options)
-        response = await self._post(rest_wire.SCORE, post, timeout)
-        return rest_wire.scoring_from_response(response)
-
-    async def _post(self, path: str, post: dict[str, Any], timeout: float) -> httpx.Response:
-        try:
-            return await self._http.post(path, **post, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-
-    async def models(self, timeout: float) -> list[Model]:
-        try:
-            response = await self._http.get(rest_wire.MODELS, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-        return rest_wire.models_from_response(response)
-
-    async def ready(self, timeout: float) -> bool:
-        try:
-            return (await self._http.get(rest_wire.READY, timeout=timeout)).is_success
-        except httpx.HTTPError:
-            return False
-
-    async def close(self) -> None:
-        await self._http.aclose()
+async def _asynchronous(
+    requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
+) -> AsyncIterator[StreamRequest]:
+    if isinstance(requests, AsyncIterable):
+        async for request in requests:
+            yield request
+    else:
+        for request in requests:
+            yield request

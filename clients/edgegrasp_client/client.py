@@ -1,23 +1,23 @@
 """The client, synchronous."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from types import TracebackType
-from typing import Any, Protocol, Self, Unpack
+from typing import Any, Self, Unpack
 
 import grpc
 import httpx
 from numpy.typing import NDArray
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import grpc_wire, rest_wire
 from edgegrasp_client.cloud_encoding import Cloud
 from edgegrasp_client.depth_image import DepthImage
 from edgegrasp_client.errors import DeadlineError
 from edgegrasp_client.inputs import Given, Inputs
 from edgegrasp_client.options import DetectOptions, plain_options
 from edgegrasp_client.results import Detection, Model, Scoring
-from edgegrasp_client.security import Tls, channel_credentials, ssl_context, token_metadata
+from edgegrasp_client.security import Tls
+from edgegrasp_client.stream import StreamAnswer, StreamRequest
+from edgegrasp_client.transports import GrpcTransport, RestTransport, Transport
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
@@ -48,11 +48,11 @@ class GraspClient:
         http_transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._transport: _Transport
+        self._transport: Transport
         if is_rest(address):
-            self._transport = _RestTransport(address, token, tls, http_transport)
+            self._transport = RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = _GrpcTransport(address, token, tls, channel)
+            self._transport = GrpcTransport(address, token, tls, channel)
 
     def detect(
         self,
@@ -126,6 +126,28 @@ class GraspClient:
         plain = plain_options(options)
         return self._transport.score(inputs, given, plain, self._seconds(timeout))
 
+    def detect_stream(
+        self, requests: Iterable[StreamRequest], *, timeout: float | None = None
+    ) -> Iterator[StreamAnswer]:
+        """Find grasps in one cloud after the other, over one stream.
+
+        The next request is sent while earlier ones are at work; where the server is behind, this
+        does not run ahead of it. Over REST, each request waits for the answer before it, on one
+        connection.
+
+        Args:
+            requests: Read as they can be sent, by `GraspClient` over gRPC in a thread of its own;
+                an error in it ends the stream once what went before is answered.
+            timeout: Seconds for each request that does not say; None: the client's own.
+
+        Yields:
+            An answer to each request, in their order; the error of one does not end the stream.
+
+        Raises:
+            GraspClientError: The stream itself failed, so that no more answers come.
+        """
+        return self._transport.detect_stream(requests, self._seconds(timeout))
+
     def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name.
 
@@ -174,121 +196,3 @@ class GraspClient:
 def is_rest(address: str) -> bool:
     """Whether an address names the REST transport."""
     return address.startswith(("http://", "https://"))
-
-
-class _Transport(Protocol):
-    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection: ...
-
-    def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring: ...
-
-    def models(self, timeout: float) -> list[Model]: ...
-
-    def ready(self, timeout: float) -> bool: ...
-
-    def close(self) -> None: ...
-
-
-def _open_channel(address: str, tls: Tls | None) -> grpc.Channel:
-    if tls is None:
-        return grpc.insecure_channel(address, grpc_wire.CHANNEL_OPTIONS)
-    credentials = channel_credentials(tls)
-    return grpc.secure_channel(address, credentials, grpc_wire.CHANNEL_OPTIONS)
-
-
-class _GrpcTransport:
-    def __init__(
-        self, address: str, token: str | None, tls: Tls | None, channel: grpc.Channel | None
-    ) -> None:
-        self._owned = channel is None
-        self._channel = channel or _open_channel(address, tls)
-        self._metadata = token_metadata(token)
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
-        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
-
-    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
-        request = grpc_wire.request_message(inputs, options)
-        try:
-            answer = self._stub.DetectGrasps(request, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.detection_from_message(answer)
-
-    def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring:
-        request = grpc_wire.score_message(inputs, given, options)
-        try:
-            answer = self._stub.ScoreGrasps(request, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.scoring_from_message(answer)
-
-    def models(self, timeout: float) -> list[Model]:
-        try:
-            request = grasp_pb2.ListModelsRequest()
-            answer = self._stub.ListModels(request, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return grpc_wire.models_from_message(answer)
-
-    def ready(self, timeout: float) -> bool:
-        try:
-            return bool(self._check(b"", timeout=timeout) == grpc_wire.SERVING)
-        except grpc.RpcError:
-            return False
-
-    def close(self) -> None:
-        if self._owned:
-            self._channel.close()
-
-
-class _RestTransport:
-    def __init__(
-        self,
-        address: str,
-        token: str | None,
-        tls: Tls | None,
-        transport: httpx.BaseTransport | None,
-    ) -> None:
-        self._http = httpx.Client(
-            base_url=address,
-            headers=dict(token_metadata(token)),
-            verify=ssl_context(tls),
-            transport=transport,
-        )
-
-    def detect(self, inputs: Inputs, options: Mapping[str, Any], timeout: float) -> Detection:
-        post = rest_wire.detect_post(inputs, options)
-        response = self._post(rest_wire.GRASPS, post, timeout)
-        return rest_wire.detection_from_response(response)
-
-    def score(
-        self, inputs: Inputs, given: Given, options: Mapping[str, Any], timeout: float
-    ) -> Scoring:
-        post = rest_wire.score_post(inputs, given, options)
-        response = self._post(rest_wire.SCORE, post, timeout)
-        return rest_wire.scoring_from_response(response)
-
-    def _post(self, path: str, post: dict[str, Any], timeout: float) -> httpx.Response:
-        try:
-            return self._http.post(path, **post, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-
-    def models(self, timeout: float) -> list[Model]:
-        try:
-            response = self._http.get(rest_wire.MODELS, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-        return rest_wire.models_from_response(response)
-
-    def ready(self, timeout: float) -> bool:
-        try:
-            return self._http.get(rest_wire.READY, timeout=timeout).is_success
-        except httpx.HTTPError:
-            return False
-
-    def close(self) -> None:
-        self._http.close()

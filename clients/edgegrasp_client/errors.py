@@ -6,6 +6,7 @@ GraspClientError
       + PayloadTooLargeError    the request exceeds the server's limits
   + AccessDeniedError           no token, none the server knows, or one that is good for less
   + ServerUnavailableError      no connection, weights still loading, or the server is stopping
+      + OverloadedError         the server is full: retry_after
   + DeadlineError               no answer within the timeout
   + ServerFailedError           the server failed on a good request
   + ProtocolError               the answer is none of this service: is the address right?
@@ -49,6 +50,19 @@ class ServerUnavailableError(GraspClientError):
     """No connection, weights still loading, or the server is stopping; trying again may help."""
 
 
+class OverloadedError(ServerUnavailableError):
+    """The server is full.
+
+    Args:
+        message: The whole sentence.
+        retry_after: Seconds until another try is worth it.
+    """
+
+    def __init__(self, message: str, retry_after: float = 1.0) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
+
+
 class DeadlineError(GraspClientError):
     """There was no answer within the timeout."""
 
@@ -73,12 +87,26 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "decoder-missing": ServerFailedError,
     "detector-failed": ServerFailedError,
     "not-ready": ServerUnavailableError,
+    "overloaded": OverloadedError,
+    "worker-lost": ServerUnavailableError,
+    "cancelled": ServerUnavailableError,
+    "deadline-exceeded": DeadlineError,
 }
 
 
-def error_of_kind(kind: str, message: str, field: str, value: str, fix: str) -> GraspClientError:
+def error_of_kind(
+    kind: str,
+    message: str,
+    field: str,
+    value: str,
+    fix: str,
+    *,
+    retry_after: float | None = None,
+) -> GraspClientError:
     """The exception for an error the server describes."""
     error = _BY_KIND.get(kind, ProtocolError)
+    if issubclass(error, OverloadedError) and retry_after is not None:
+        return error(message, retry_after)
     if issubclass(error, InvalidRequestError):
         return error(message, field, value, fix)
     return error(message)

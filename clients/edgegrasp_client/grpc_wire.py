@@ -33,12 +33,16 @@ from edgegrasp_client.results import (
     Model,
     Scoring,
 )
+from edgegrasp_client.stream import StreamAnswer, StreamRequest
 
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
     ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
     ("grpc.max_reconnect_backoff_ms", 1000),
+    # A server that vanished without a word is found out, and streams to it end.
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
 )
 
 # grpc.health.v1: an empty request asks about the whole server; field 1 = 1 means SERVING.
@@ -146,8 +150,34 @@ def error_from_call(error: Any) -> GraspClientError:
                 detail = grasp_pb2.ErrorDetail.FromString(bytes(value))
             except DecodeError:
                 break
-            return error_of_kind(detail.kind, message, detail.field, detail.value, detail.fix)
+            return _error(message, detail)
     return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
+
+
+def stream_message(
+    request: StreamRequest, number: int, timeout: float
+) -> grasp_pb2.DetectGraspsStreamRequest:
+    """A request of a stream; raises InvalidRequestError for what no message can hold."""
+    return grasp_pb2.DetectGraspsStreamRequest(
+        request_id=request.name(number),
+        request=request_message(request.inputs, request.options),
+        timeout=timeout if request.timeout is None else request.timeout,
+    )
+
+
+def stream_answer(message: grasp_pb2.DetectGraspsStreamResponse) -> StreamAnswer:
+    """The answer to one request of a stream."""
+    if message.HasField("detection"):
+        return StreamAnswer(message.request_id, detection_from_message(message.detection))
+    error = _error(message.error.message, message.error.detail)
+    return StreamAnswer(message.request_id, error=error)
+
+
+def _error(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
+    retry_after = detail.retry_after if detail.HasField("retry_after") else None
+    return error_of_kind(
+        detail.kind, message, detail.field, detail.value, detail.fix, retry_after=retry_after
+    )
 
 
 def _floats(values: Any) -> Float32:

@@ -35,7 +35,8 @@ def local_server(*flags: str) -> Iterator[Addresses]:
     program = Path(sysconfig.get_path("scripts")) / "edgegrasp"
     if not program.is_file():
         raise ServerUnavailableError(f"{program} is missing: pip install 'edgegrasp[service]'")
-    command = [str(program), "serve", "--http-port", "0", "--grpc-port", "0", *flags]
+    ports = ("--http-port", "0", "--grpc-port", "0")
+    command = [str(program), "serve", *ports, "--log-level", "warning", *flags]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None

@@ -58,6 +58,11 @@ def detect_post(inputs: Inputs, options: Mapping[str, Any]) -> dict[str, Any]:
     return {"content": file.data, "headers": headers, "params": query}
 
 
+def with_deadline(post: dict[str, Any], timeout: float) -> dict[str, Any]:
+    """The arguments, and until when the server need not answer any more."""
+    return post | {"headers": {**post.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}}
+
+
 def score_post(inputs: Inputs, given: Given, options: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of an httpx post; raises InvalidRequestError for what no request can hold."""
     arrays = {name: array for name, array in vars(given).items() if array is not None}
@@ -175,10 +180,9 @@ def _body(response: httpx.Response) -> dict[str, Any]:
     kind = str(body.get("type", ""))
     if not kind.startswith(_KIND_PREFIX):
         raise _foreign(response)
-    raise error_of_kind(
-        kind.removeprefix(_KIND_PREFIX),
-        *(str(body.get(name, "")) for name in ("detail", "field", "value", "fix")),
-    )
+    told = [str(body.get(name, "")) for name in ("detail", "field", "value", "fix")]
+    kind = kind.removeprefix(_KIND_PREFIX)
+    raise error_of_kind(kind, *told, retry_after=body.get("retry_after"))
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:

@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -19,6 +20,7 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trials import PATIENCE, Closes, Planner, Round, run_round
+from edgegrasp_sim.window import ShownPlanner, Window
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,6 +33,7 @@ PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
 
 MAX_CRASHES = 3  # in a row without a finished round between them
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
 
 
@@ -84,17 +87,19 @@ def run_benchmark(
     make_planner: PlannerFactory,
     *,
     workers: int = 1,
+    ray: str | None = None,
     folder: ResultFolder | None = None,
     on_round: Callable[[Round], None] | None = None,
     gui: bool = False,
 ) -> list[Round]:
-    """Run all rounds that `folder` does not hold yet; outcomes do not depend on `workers`.
+    """Run all rounds that `folder` does not hold yet, wherever: outcomes stay the same.
 
     Args:
         config: what to run.
         make_planner: called once in every process.
         workers: processes; with 1 all runs in this one. The rounds of a worker process that
             dies are run again by another.
+        ray: address of a Ray cluster to run the workers on; see `run_on_ray`.
         folder: keeps each round as it finishes; opened by the caller.
         on_round: told of every round as it is done, in any order.
         gui: show PyBullet's window; with one worker only.
@@ -106,7 +111,7 @@ def run_benchmark(
         ValueError: `workers` below 1, or the planner's pose is no rigid transform.
         FileNotFoundError: the object folder does not hold the scene.
         PlannerUnavailableError: the planner stayed away for longer than the patience.
-        RuntimeError: worker processes keep dying.
+        RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """
     if workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
@@ -115,11 +120,15 @@ def run_benchmark(
     kept = folder.rounds() if folder is not None else []
     rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
     missing = [task for task in tasks if task not in rounds]
-    run = (
-        _run_here(config, make_planner, missing, gui)
-        if workers == 1
-        else _run_pools(config, make_planner, missing, workers)
-    )
+    workers = max(1, min(workers, len(missing)))
+    if ray is not None:
+        from edgegrasp_sim.ray_cluster import run_on_ray
+
+        run = run_on_ray(ray, config, make_planner, missing, workers)
+    elif workers == 1:
+        run = _run_here(config, make_planner, missing, gui)
+    else:
+        run = _run_pools(config, make_planner, missing, workers)
     for done in run:
         rounds[done.seed, done.index] = done
         if folder is not None:
@@ -206,6 +215,13 @@ def objects_digest(objects: ObjectSet) -> str:
     return digest.hexdigest()
 
 
+def available_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _version(distribution: str) -> str | None:
     try:
         return version(distribution)
@@ -213,17 +229,20 @@ def _version(distribution: str) -> str | None:
         return None
 
 
-class _Runner:
+class RoundRunner:
     """A simulation with a planner, for one process."""
 
     def __init__(
         self, config: BenchmarkConfig, make_planner: PlannerFactory, gui: bool = False
     ) -> None:
         self.config = config
-        self.planner = make_planner()
+        self.planner: Planner = make_planner()
         self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
+        if gui:
+            self.planner = ShownPlanner(self.planner, Window(self.simulation.world))
 
     def run(self, task: Task) -> Round:
+        """Run the round of a seed and an index."""
         seed, index = task
         config = self.config
         return run_round(
@@ -237,6 +256,7 @@ class _Runner:
         )
 
     def close(self) -> None:
+        """Give back what simulation and planner hold."""
         self.simulation.close()
         if isinstance(self.planner, Closes):
             self.planner.close()
@@ -247,20 +267,20 @@ def _run_here(
 ) -> Iterator[Round]:
     if not tasks:
         return
-    runner = _Runner(config, make_planner, gui)
+    runner = RoundRunner(config, make_planner, gui)
     try:
         yield from map(runner.run, tasks)
     finally:
         runner.close()
 
 
-_worker: _Runner | None = None  # one in each worker process, made by its initialiser
+_worker: RoundRunner | None = None  # one in each worker process, made by its initialiser
 
 
 def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    _worker = _Runner(config, make_planner)
+    _worker = RoundRunner(config, make_planner)
 
 
 def _run_in_worker(task: Task) -> Round:
@@ -289,6 +309,19 @@ def _run_pools(
                 ) from None
 
 
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started meanwhile use one thread each: with all cores busy, more only wait."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update({name: value or "1" for name, value in before.items()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
 def _run_pool(
     config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
@@ -298,7 +331,8 @@ def _run_pool(
         workers, context, initializer=_start_worker, initargs=(config, make_planner)
     )
     try:
-        futures = [pool.submit(_run_in_worker, task) for task in tasks]
+        with _one_thread_each():
+            futures = [pool.submit(_run_in_worker, task) for task in tasks]
         for future in as_completed(futures):
             yield future.result()
     finally:

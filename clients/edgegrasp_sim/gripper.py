@@ -12,6 +12,8 @@ from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.world import TIME_STEP, Body, WorldAnchor, couple_joints
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from edgegrasp_sim.world import World
 
 MAX_OPENING = 0.08  # metres between the fingers
@@ -83,11 +85,11 @@ class Gripper:
             finger.reset(0.5 * MAX_OPENING)
             finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
 
-    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> bool:
+    def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
         """Drag the hand in a straight line, `step_length` metres in each time step.
 
-        Returns:
-            Whether the hand cut into something by more than `COLLISION_DEPTH` on the way.
+        Yields:
+            After every time step; a caller that stops asking leaves the hand where it is.
         """
         T_world_com = T_world_hand @ T_HAND_HANDCOM
         quaternion = quaternion_xyzw(T_world_com)
@@ -95,21 +97,28 @@ class Gripper:
         way = T_world_com[:3, 3] - position
         distance = float((way @ way) ** 0.5)
         steps = max(1, int(distance / step_length))
-        collided = False
         for _ in range(steps):
             position = position + way / steps
             self._anchor.move(position, quaternion)
             self.world.step()
-            collided = collided or any(
-                contact.distance < -COLLISION_DEPTH for contact in self.body.contacts()
-            )
-        return collided
+            yield
 
-    def close(self) -> None:
-        """Close the fingers with full force for half a second."""
+    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> None:
+        """Drag the hand all the way there, see `steps_to`."""
+        for _ in self.steps_to(T_world_hand, step_length=step_length):
+            pass
+
+    def cuts_in(self) -> bool:
+        """Whether the hand overlaps something by more than `COLLISION_DEPTH`."""
+        return any(contact.distance < -COLLISION_DEPTH for contact in self.body.contacts())
+
+    def closing_steps(self) -> Iterator[None]:
+        """Close the fingers with full force for half a second; yields after every time step."""
         for finger in self.fingers:
             finger.drive_to(0.0, FINGER_FORCE)
-        self.world.step(round(CLOSE_SECONDS / TIME_STEP))
+        for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
+            self.world.step()
+            yield
 
 
 def _create_hand(client: int) -> int:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import pybullet_data
 
+from edgegrasp_sim.meshes import MESH_SUFFIXES, prepare_mesh
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -57,19 +59,36 @@ class ObjectSet:
 
     @classmethod
     def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> ObjectSet:
-        """The objects `<root>/<scene>/<split>/*.urdf`, sorted by name (VGN's layout).
+        """The objects of a folder, sorted by name.
+
+        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), or in `root` itself
+        where there is no such folder. Where there are none, they are the meshes there, `.obj` or
+        `.stl`: see `prepare_mesh`.
 
         Raises:
-            FileNotFoundError: there is no such folder or no URDF file in it.
+            FileNotFoundError: there is no such folder, or nothing of the kind in it.
+            ValueError: two meshes have one name, or one cannot be used.
+            RuntimeError: there are meshes, and what prepares them is not installed.
         """
-        folder = root / scene / split
+        folder, name = root / scene / split, f"{scene}/{split}"
+        if not folder.is_dir():
+            folder, name = root, root.name
         urdfs = sorted(folder.glob("*.urdf"))
-        if not urdfs:
+        if urdfs:
+            return cls(name, tuple(ObjectModel(path.stem, path) for path in urdfs))
+        files = folder.iterdir() if folder.is_dir() else ()
+        meshes = sorted(path for path in files if path.suffix.lower() in MESH_SUFFIXES)
+        if not meshes:
             raise FileNotFoundError(
-                f"no *.urdf files in {folder}; an object folder holds <scene>/<split>/<name>.urdf "
-                "with scene packed or pile and split train or test"
+                f"no *.urdf, *.obj or *.stl files in {folder}; an object folder holds "
+                "<scene>/<split>/<name>.urdf with scene packed or pile and split train or test, "
+                "or the files themselves"
             )
-        return cls(f"{scene}/{split}", tuple(ObjectModel(path.stem, path) for path in urdfs))
+        names = [path.stem for path in meshes]
+        if twice := sorted({each for each in names if names.count(each) > 1}):
+            raise ValueError(f"{folder} holds several meshes named {', '.join(twice)}; keep one")
+        models = [ObjectModel(path.stem, prepare_mesh(path)) for path in meshes]
+        return cls(name, tuple(models))
 
     @classmethod
     def builtin(cls, scene: SceneKind) -> ObjectSet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 BLUE, ORANGE, GREY, RED = "#2f6db3", "#e08a1e", "#9aa3ad", "#b3372f"
 BINS = 10
+LABEL_WIDTH = 13  # letters
 MIN_IN_BIN = 5  # attempts; fewer say nothing about a score
 
 
@@ -43,12 +45,12 @@ def rates_plot(summary: dict[str, Any], published: Sequence[dict[str, Any]]) -> 
     for row in published:
         mean, *deviation = row["grasp_success_rate"]
         place = len(labels)
-        labels.append(f"{row['method']}\nGSR, published")
+        labels.append(fill(f"{row['method']}, published", LABEL_WIDTH))
         axes.bar(place, mean, 0.5, color=GREY)
         if deviation:
             axes.errorbar(place, mean, deviation, color="black", capsize=5)
     axes.set(ylim=(0, 100), ylabel="%", xticks=range(len(labels)))
-    axes.set_xticklabels(labels)
+    axes.set_xticklabels(labels, fontsize=7.5)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
     return figure
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import tempfile
-import tomllib
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
@@ -17,6 +16,7 @@ from edgegrasp_sim.film import film_round
 from edgegrasp_sim.grasping import FailureCause
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.plots import failures_plot, rates_plot, scores_plot, times_plot
+from edgegrasp_sim.published import published as published_results
 from edgegrasp_sim.replay import Replay
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from edgegrasp_sim.results import ResultFolder
     from edgegrasp_sim.trials import Attempt, Round
 
-PUBLISHED = Path(__file__).parent / "published.toml"
 PICTURES = 6
 PICTURE_WIDTH = 1250  # pixels
 STYLE = """
@@ -89,7 +88,7 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     facts = folder.manifest()
     summary = folder.finish(rounds)
     attempts = [attempt for item in rounds for attempt in item.attempts]
-    published = _published(facts["run"])
+    published = published_results(facts["run"]["protocol"]["name"], summary["scene"])
     with Replay(folder, objects) as replay:
         film = _film(replay, rounds)
         pictures = list(_failure_pictures(replay, rounds))
@@ -131,12 +130,6 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     path = folder.path / "report.html"
     path.write_text(page)
     return path
-
-
-def _published(run: dict[str, Any]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = tomllib.loads(PUBLISHED.read_text())["result"]
-    here = (run["scene"], run["protocol"]["name"])
-    return [row for row in rows if (row["scene"], row["protocol"]) == here]
 
 
 def _planner_name(facts: dict[str, Any]) -> str:

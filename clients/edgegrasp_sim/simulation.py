@@ -292,17 +292,21 @@ class ClutterSimulation:
         self._forget_rest_state()
         self._restore(state)
 
-    def try_grasp(self, T_world_hand: ArrayLike, *, shake: bool = False) -> GraspResult:
+    def try_grasp(
+        self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
+    ) -> GraspResult:
         """See what would come of a grasp; the scene stays as it is.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
             shake: also shake what is held, see `GraspResult.held_after_shaking`.
+            to_the_end: take every step of it, as `execute_grasp` does. Without, the try ends once
+                its outcome is clear: twice as fast, and another outcome for 1 grasp in 100.
 
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
         """
-        result = self._run(T_world_hand, retreat_empty=False, shake=shake)
+        result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()
         return result
 
@@ -325,12 +329,12 @@ class ClutterSimulation:
             self._copy.reset_from_poses(placements)
             self._copied = placements
         self._copy.start_contact_fails = self.start_contact_fails
-        return self._copy.try_grasp(T_world_hand)
+        return self._copy.try_grasp(T_world_hand, to_the_end=True)
 
     def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
         """Grasp: what is held leaves the scene, the rest comes to rest.
 
-        The outcome is that of `try_grasp`.
+        The outcome is that of `try_grasp(..., to_the_end=True)`.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
@@ -338,7 +342,7 @@ class ClutterSimulation:
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
         """
-        result = self._run(T_world_hand, retreat_empty=True)
+        result = self._run(T_world_hand, to_the_end=True)
         self._forget_rest_state()
         self._hand.park()
         if result.held is not None:
@@ -354,7 +358,7 @@ class ClutterSimulation:
         return self._gripper
 
     def _run(
-        self, T_world_hand: ArrayLike, *, retreat_empty: bool, shake: bool = False
+        self, T_world_hand: ArrayLike, *, to_the_end: bool, shake: bool = False
     ) -> GraspResult:
         T = require_pose(T_world_hand, "T_world_hand")
         self._restore_rest()
@@ -363,7 +367,7 @@ class ClutterSimulation:
             T,
             {item.body.uid: item for item in self._objects},
             start_contact_fails=self.start_contact_fails,
-            retreat_empty=retreat_empty,
+            to_the_end=to_the_end,
             shake=shake,
         )
 

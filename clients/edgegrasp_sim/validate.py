@@ -49,6 +49,7 @@ def measure_agreement(
     *,
     grasps_per_scene: int | None = None,
     start_contact_fails: bool = False,
+    to_the_end: bool = False,
 ) -> Agreement:
     """Repeat the grasps of `<shared>/reference/grasp_outcomes/<kind>.json`.
 
@@ -57,6 +58,7 @@ def measure_agreement(
         kind: of the scenes.
         grasps_per_scene: only the first so many; all by default.
         start_contact_fails: see `ClutterSimulation`.
+        to_the_end: see `ClutterSimulation.try_grasp`.
 
     Raises:
         FileNotFoundError: the outcomes or an object are missing.
@@ -79,7 +81,9 @@ def measure_agreement(
                 ]
             )
             poses = np.asarray(scene["T_world_handcom"])[:grasps_per_scene]
-            results = [simulation.try_grasp(pose @ T_HANDCOM_HAND) for pose in poses]
+            results = [
+                simulation.try_grasp(pose @ T_HANDCOM_HAND, to_the_end=to_the_end) for pose in poses
+            ]
             agreed.append(
                 sum(
                     result.success == bool(success)
@@ -101,10 +105,18 @@ def main() -> None:
         action="store_true",
         help="fail grasps whose start pose overlaps something, unlike the reference",
     )
+    parser.add_argument(
+        "--to-the-end",
+        action="store_true",
+        help="take every step of every grasp, also once its outcome is clear",
+    )
     arguments = parser.parse_args()
     for kind in SceneKind:
         agreement = measure_agreement(
-            arguments.shared, kind, start_contact_fails=arguments.start_contact_fails
+            arguments.shared,
+            kind,
+            start_contact_fails=arguments.start_contact_fails,
+            to_the_end=arguments.to_the_end,
         )
         scenes = ", ".join(
             f"{agreed}/{tried}"

@@ -9,6 +9,8 @@ EdgeGraspError
 
 import reprlib
 from collections.abc import Iterable
+from itertools import islice
+from typing import Any
 
 
 class EdgeGraspError(Exception):
@@ -37,10 +39,25 @@ def brief(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-_SHORT = reprlib.Repr()
-_SHORT.maxlevel = 8
-_SHORT.maxdict = _SHORT.maxlist = _SHORT.maxtuple = 20  # members
-_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 90  # characters
+class _Short(reprlib.Repr):
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel = 8
+        self.maxdict = self.maxlist = self.maxtuple = 20  # members
+        self.maxstring = self.maxlong = self.maxother = 90  # characters
+
+    def repr_dict(self, value: dict[Any, Any], level: int) -> str:
+        """In the order it came in, which the base class changes."""
+        if level <= 0:
+            return "{...}"
+        members = [
+            f"{self.repr1(name, level - 1)}: {self.repr1(part, level - 1)}"
+            for name, part in islice(value.items(), self.maxdict)
+        ]
+        return "{" + ", ".join(members + ["..."] * (len(value) > self.maxdict)) + "}"
+
+
+_SHORT = _Short()
 
 
 class UnknownModel(EdgeGraspError):  # noqa: N818

@@ -4,6 +4,9 @@ Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. 
 (M, 3, C), see `vn_layers`; P points in B balls, E grasps.
 """
 
+from importlib.util import find_spec
+from types import ModuleType
+
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
@@ -33,6 +36,9 @@ class VNPointNetConv(nn.Module):
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, inputs) to (P, 3, width)."""
+        if (fused := _fused_inference(features)) is not None:
+            fused_vectors: Tensor = fused.convolution(self, features, batch)
+            return fused_vectors
         # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
         widths = [features.shape[2], 1]
         feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
@@ -82,6 +88,9 @@ class VNGlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
+        if (fused := _fused_inference(local)) is not None:
+            fused_ball: Tensor = fused.ball_feature(self, local, batch)
+            return fused_ball
         hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
         pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
         joined = self.join(local, pooled, batch.ball_of_point)  # (P, 3, 381)
@@ -124,3 +133,13 @@ class VNEdgeGraspNet(nn.Module):
         invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (E, 512, 3) -> (E, 1536)
         logits: Tensor = self.classifier(invariant).squeeze(1)  # (E, 1) -> (E,)
         return logits
+
+
+def _fused_inference(values: Tensor) -> ModuleType | None:
+    """`vn_fused` where it serves: inference in float32 on a processor, with Numba installed."""
+    plain = torch.is_grad_enabled() or values.device.type != "cpu" or values.dtype != torch.float32
+    if plain or find_spec("numba") is None:
+        return None
+    from edgegrasp_model import vn_fused
+
+    return vn_fused

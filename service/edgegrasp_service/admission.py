@@ -44,19 +44,28 @@ class Admission:
         self._empty = asyncio.Event()
         self._empty.set()
 
+    def check_room(self) -> None:
+        """Raise Overloaded unless there is a place for one more."""
+        if self._places >= self._max_places:
+            raise Overloaded(
+                f"The server is full: {self._places} requests are in it. "
+                f"Try again in {_whole_seconds(self._wait)} s.",
+                _whole_seconds(self._wait),
+            )
+
+    @property
+    def _wait(self) -> float:
+        """Seconds that those who are in take, at the latest pace."""
+        return self._places * (self._pace or 0.0)
+
     def enter(self, call: Call) -> "Place":
         """Take a place, to be used as a context manager.
 
         Raises:
             Overloaded: There is none, or its turn would come after its deadline.
         """
-        wait = self._places * (self._pace or 0.0)
-        if self._places >= self._max_places:
-            raise Overloaded(
-                f"The server is full: {self._places} requests are in it. "
-                f"Try again in {_whole_seconds(wait)} s.",
-                _whole_seconds(wait),
-            )
+        self.check_room()
+        wait = self._wait
         if call.remaining is not None and self._places and wait * MARGIN > call.remaining:
             raise Overloaded(
                 f"The deadline is {call.remaining:.3g} s away, and {self._places} requests come "

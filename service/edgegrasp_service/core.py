@@ -156,6 +156,16 @@ class GraspService:
             pool.shutdown(wait=False, cancel_futures=True)
         self._worker.close()
 
+    def check_open(self) -> None:
+        """Pass where there is a place for one more request.
+
+        Raises:
+            NotReady: Weights are not loaded yet, or the server is stopping.
+            Overloaded: There is no place.
+        """
+        self._ready_catalogue()
+        self._admission.check_room()
+
     def admit(self, call: Call) -> Place:
         """Take a place for a call, a context manager; before anything is read of it.
 

@@ -24,7 +24,8 @@ Row = tuple[Finite, Finite, Finite, Finite]
 def _rigid(pose: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
     matrix = np.array(pose)
     rotation = matrix[:3, :3]
-    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
     if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
     return pose
@@ -144,9 +145,10 @@ def _points(depth: NDArray[np.float64], view: DepthImage) -> NDArray[np.float32]
     """(H, W, 3) in the cloud's frame."""
     row, column = np.indices(depth.shape)
     camera = view.intrinsics
-    x = (column - camera.cx) / camera.fx * depth
-    y = (row - camera.cy) / camera.fy * depth
     pose = np.array(view.T_cloud_camera)
-    points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
-    in_cloud: NDArray[np.float32] = points.astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no point is refused as such
+        x = (column - camera.cx) / camera.fx * depth
+        y = (row - camera.cy) / camera.fy * depth
+        points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
+        in_cloud: NDArray[np.float32] = points.astype(np.float32)
     return in_cloud

@@ -9,8 +9,9 @@ import grpc
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.edge import Answered, Edge, check_count
+from edgegrasp_service.edge import Answered, Edge, check_headers
 from edgegrasp_service.errors import ServiceError, report
+from edgegrasp_service.grpc_decoding import Decoded, Undecodable, tolerant
 from edgegrasp_service.grpc_messages import ERROR_METADATA, error_message
 from edgegrasp_service.request_id import HEADER
 from edgegrasp_service.tokens import HEADER as AUTHORIZATION
@@ -46,7 +47,7 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
         headers = {name: value for name, value in entries if isinstance(value, str)}
         method = METHODS.get(path, "other")
         try:
-            check_count(len(entries), "metadata")
+            check_headers("metadata", len(entries))
             if not path.startswith(f"/{HEALTH}/"):
                 admin = method == "ReloadModels"
                 self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)
@@ -74,7 +75,9 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
             with self._edge.request("grpc", method, headers, answered) as request_id:
                 try:
                     await context.send_initial_metadata(((HEADER, request_id),))
-                    answer = await behavior(request, context)
+                    if isinstance(request, Undecodable):
+                        await refusal(request.error)(request, context)
+                    answer = await behavior(_checked(request, kind), context)
                     answered.code = "OK"
                 except BaseException as error:
                     answered.code = _code(error, context)
@@ -93,7 +96,9 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
             with self._edge.request("grpc", method, headers, answered) as request_id:
                 try:
                     await context.send_initial_metadata(((HEADER, request_id),))
-                    async for answer in behavior(request, context):
+                    if isinstance(request, Undecodable):
+                        await refusal(request.error)(request, context)
+                    async for answer in behavior(_checked(request, kind), context):
                         yield answer
                     answered.code = "OK"
                 except BaseException as error:
@@ -114,6 +119,10 @@ def refusal(error: Exception) -> Callable[[Any, Any], Awaitable[None]]:
     return refuse
 
 
+def _checked(request: Any, kind: str) -> Any:
+    return Decoded(request) if kind.startswith("stream") else request
+
+
 def _code(error: BaseException, context: Any) -> str:
     if isinstance(error, asyncio.CancelledError | GeneratorExit):
         return "CANCELLED"
@@ -127,6 +136,6 @@ def _handler(kind: str, behavior: Any, original: Handler) -> Handler:
         return make(behavior)
     return make(
         behavior,
-        request_deserializer=original.request_deserializer,
+        request_deserializer=tolerant(original.request_deserializer),
         response_serializer=original.response_serializer,
     )

@@ -14,6 +14,7 @@ from edgegrasp_service.body_limit import MAX_DROPPED_BYTES
 from edgegrasp_service.call import Call
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.errors import AddressInUse, report
+from edgegrasp_service.grpc_door import GrpcDoor
 from edgegrasp_service.grpc_edge import GrpcEdge
 from edgegrasp_service.grpc_messages import (
     ERROR_METADATA,
@@ -133,8 +134,10 @@ class GrpcServer:
             # A client that vanished without a word is found out, and its streams end.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),
+            ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
         ]
-        self._server = aio.server(interceptors=interceptors, options=options)
+        every = (*interceptors, GrpcDoor(service))
+        self._server = aio.server(interceptors=every, options=options)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         servicer = GraspServicer(service, reloader)
         grasp_pb2_grpc.add_GraspServiceServicer_to_server(servicer, self._server)

@@ -3,7 +3,7 @@
 from fastapi.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from edgegrasp_service.edge import Answered, Edge, check_count
+from edgegrasp_service.edge import Answered, Edge, GivenUp, check_headers
 from edgegrasp_service.errors import ServiceError, UnsupportedMediaType, report
 from edgegrasp_service.http_problem import problem_response
 from edgegrasp_service.request_id import HEADER
@@ -24,6 +24,7 @@ METHODS = {
     "/docs": "Docs",
     "/openapi.json": "Docs",
 }
+UNANSWERED = "499"  # the caller went away; as nginx logs it
 OPEN = ("Live", "Ready")  # without a token: who restarts a server need not know one
 
 
@@ -44,7 +45,7 @@ class HttpEdge:
             for name, value in scope["headers"]
         }
         method = METHODS.get(scope["path"], "other")
-        answered = Answered("499")
+        answered = Answered(UNANSWERED)
         with self._edge.request("http", method, headers, answered) as request_id:
 
             async def send_named(message: Message) -> None:
@@ -62,10 +63,17 @@ class HttpEdge:
                 await problem_response(report(error))(scope, receive, send_named)
                 return
             app = self._metrics(headers) if method == "Metrics" else self._app
-            await app(scope, receive, send_named)
+            try:
+                with self._edge.until_given_up():
+                    await app(scope, receive, send_named)
+            except GivenUp as error:
+                if answered.code == UNANSWERED:
+                    await problem_response(report(error.reason))(scope, receive, send_named)
 
     def _check(self, scope: Scope, method: str, headers: dict[str, str]) -> None:
-        check_count(len(scope["headers"]), "headers")
+        size = sum(len(name) + len(value) for name, value in scope["headers"])
+        size += len(scope["raw_path"]) + len(scope["query_string"])
+        check_headers("headers", len(scope["headers"]), size, self._edge.max_header_bytes)
         if method not in OPEN:
             admin = method == "ReloadModels"
             self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)

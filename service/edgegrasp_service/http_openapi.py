@@ -6,7 +6,7 @@ from pydantic import BaseModel
 
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.depth_images import Depth, DepthImage
-from edgegrasp_service.http_request import FILE_TYPES, GIVEN
+from edgegrasp_service.http_request import FILE_TYPES, GIVEN, TIMEOUT
 from edgegrasp_service.point_cloud2 import PointCloud2
 from edgegrasp_service.sent_arrays import PER_POINT
 
@@ -117,7 +117,17 @@ def _given() -> dict[str, Any]:
 
 _OPTIONS = _inline_schema(DetectOptions)
 
+_HEADERS = [
+    {
+        "name": TIMEOUT,
+        "in": "header",
+        "required": False,
+        "description": "Seconds from now until nobody wants the answer any more.",
+        "schema": {"type": "number", "exclusiveMinimum": 0},
+    },
+]
+
 OPENAPI_DETECT = _request_body(_OPTIONS, {}, files=True) | {
-    "parameters": _query_parameters(_OPTIONS)
+    "parameters": _query_parameters(_OPTIONS) + _HEADERS
 }
-OPENAPI_SCORE = _request_body(_OPTIONS, _given(), files=False)
+OPENAPI_SCORE = _request_body(_OPTIONS, _given(), files=False) | {"parameters": _HEADERS}

@@ -1,5 +1,6 @@
 """Read the bodies of the POST routes: JSON, a point cloud file, or a form with parts."""
 
+import gc
 import json
 import math
 from collections import Counter
@@ -37,6 +38,7 @@ from edgegrasp_service.sent_cloud import (
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
 JSON_OR_FORM = ("application/json", "multipart/form-data")
 MAX_PART_BYTES = 2**31
+MAX_SHORT_LISTS = 20_000  # edges take 6 bytes each
 
 # Clouds of a JSON body; a form has the part `cloud`, a file, in the place of `points`.
 SOURCES: dict[str, Callable[[Any], Source | DepthCloud]] = {
@@ -205,7 +207,17 @@ def _object(field: str, text: bytes) -> dict[str, Any]:
 
 
 def _json(field: str, text: bytes) -> Any:
+    lists = text.count(b"[") + text.count(b"{")
+    # Most lists are points, of 8 bytes or more. An empty one takes 3 bytes, and 64 in memory.
+    if lists > len(text) // 7 + MAX_SHORT_LISTS:
+        value = f"{lists} lists and objects in {len(text)} bytes"
+        raise InvalidRequest(field, value, "Send lists that hold numbers.")
+    collecting = gc.isenabled()
+    gc.disable()  # it would look through millions of lists again and again, and find nothing
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
+    finally:
+        if collecting:
+            gc.enable()

@@ -1,16 +1,11 @@
 """What Prometheus reads at /metrics. Every label has few values, whatever callers send."""
 
+import contextlib
 import http
 from collections.abc import Callable, Iterator, Sequence
 
 import grpc
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    ProcessCollector,
-)
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
@@ -18,7 +13,7 @@ from prometheus_client.registry import Collector
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.call import Call
 from edgegrasp_service.core import ModelInfo
-from edgegrasp_service.errors import ErrorReport
+from edgegrasp_service.errors import ErrorReport, NotReady
 from edgegrasp_service.observer import STAGES, Observer
 
 OTHER = "other"
@@ -139,7 +134,10 @@ class _ModelCollector(Collector):
     def collect(self) -> Iterator[GaugeMetricFamily]:
         labels = ("name", "digest", "architecture", "default")
         family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
-        for model in self._models():
+        models: Sequence[ModelInfo] = ()
+        with contextlib.suppress(NotReady):  # still loading, or stopping
+            models = self._models()
+        for model in models:
             facts = (model.name, model.digest, model.architecture, str(model.default).lower())
             family.add_metric(facts, 1.0)
         yield family

@@ -2,6 +2,7 @@
 
 import io
 import math
+import struct
 import zipfile
 from typing import Any
 
@@ -14,6 +15,8 @@ from edgegrasp_service.errors import PayloadTooLarge
 Array = NDArray[Any]
 
 NPZ_ARRAYS = ("points", "normals", "colors", "segment_ids", "view_ids")
+DIRECTORY_END, DIRECTORY_END_64 = b"PK\5\6", b"PK\6\7"  # of a zip file
+MAX_DIRECTORY = 65536  # bytes
 NPZ_FIX = (
     "Send what numpy.savez(file, points=points) writes; beside points may stand "
     "normals, colors, segment_ids and view_ids."
@@ -74,6 +77,7 @@ def read_npz(data: bytes, max_points: int) -> dict[str, Array]:
         PayloadTooLarge: More than `max_points` points.
     """
     try:
+        _check_directory(data)
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             if "points" not in members and len(members) == 1:
@@ -94,6 +98,15 @@ def read_npz(data: bytes, max_points: int) -> dict[str, Array]:
         name: read_npy(content, max_points, "cloud" if name == "points" else name)
         for name, content in contents.items()
     }
+
+
+def _check_directory(data: bytes) -> None:
+    """Raise ValueError for a directory of more members than any cloud has; all are read at once."""
+    ends = {data.rfind(DIRECTORY_END), data.find(DIRECTORY_END, len(data) - 22)} - {-1}
+    for end in ends:  # zipfile takes either
+        (size,) = struct.unpack_from("<L", data, end + 12)
+        if size > MAX_DIRECTORY or data[end - 20 : end - 16] == DIRECTORY_END_64:
+            raise ValueError(f"a directory of {size} bytes, or one for files beyond 4 GB")
 
 
 def _unpacked(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:

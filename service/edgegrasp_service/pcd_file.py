@@ -11,7 +11,7 @@ import numpy as np
 
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import DecoderMissing
+from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge
 from edgegrasp_service.point_records import (
     columns,
     read_ascii_records,
@@ -24,7 +24,8 @@ SCALARS = {
     "I1": "<i1", "I2": "<i2", "I4": "<i4", "I8": "<i8",
     "U1": "<u1", "U2": "<u2", "U4": "<u4", "U8": "<u8",
 }  # fmt: skip
-MAX_HEADER_LINE = 16384
+MAX_HEADER = 65536  # bytes; a line costs 50 times its own
+MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own
 NORMALS = ("normal_x", "normal_y", "normal_z")
 COLORS = ("rgb", "rgba")  # packed in 4 bytes
 FIX = "Send a whole PCD file with the fields x, y and z."
@@ -83,7 +84,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
-        end = data.find(b"\n", start, start + MAX_HEADER_LINE)
+        end = data.find(b"\n", start, MAX_HEADER)
         if end < 0:
             raise _invalid(f"{len(data)} bytes that are no whole PCD file")
         words = data[start:end].decode("latin-1").split()
@@ -119,6 +120,10 @@ def _read_compressed(data: bytes, body: bytes, count: int, record: np.dtype[Any]
     sizes = struct.unpack_from("<II", body) if len(body) >= 8 else (0, 0)
     if len(body) - 8 < sizes[0] or sizes[1] != count * record.itemsize:
         raise _invalid(f"{len(body)} bytes of compressed data, which are not all of a PCD file")
+    if sizes[1] > MAX_UNPACKED:
+        value = f"a PCD file of {sizes[1]} bytes once unpacked"
+        fix = f"Send at most {MAX_UNPACKED} bytes, or fields x, y and z alone."
+        raise PayloadTooLarge("cloud", value, fix)
     try:
         import open3d
     except ImportError as error:

@@ -20,6 +20,7 @@ TYPES = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDERS: dict[str, Literal["<", ">"]] = {"binary_little_endian": "<", "binary_big_endian": ">"}
+MAX_HEADER = 65536  # bytes; a line costs 50 times its own
 FIX = "Send a whole PLY file with vertices of float x, y, z."
 
 
@@ -36,7 +37,8 @@ def read_ply(data: bytes, check_count: Callable[[int], None]) -> CloudInput:
     Raises:
         InvalidRequest: The file is truncated, or no PLY file with vertices.
     """
-    header, end, body = data.partition(b"end_header")
+    header, end, _ = data[:MAX_HEADER].partition(b"end_header")
+    body = data[len(header) + len(end) :]
     lines = [line.split() for line in header.decode("latin-1").splitlines()]
     if not end or lines[:1] != [["ply"]]:
         raise _invalid(f"{len(data)} bytes that are no whole PLY file")

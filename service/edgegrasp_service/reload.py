@@ -8,7 +8,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.core import GraspService, ModelInfo
 from edgegrasp_service.edge import Edge
 from edgegrasp_service.errors import NotReady, PermissionDenied, ReloadFailed
-from edgegrasp_service.tokens import ADMIN_FIX, HEADER, Tokens
+from edgegrasp_service.tokens import ADMIN_FIX, HEADER, IS_ADMIN, Tokens
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class Reloader:
 
 
 async def reload_models(reloader: Reloader | None) -> list[ModelInfo]:
-    """As `Reloader.reload`; raises PermissionDenied where there is none."""
-    if reloader is None:
-        raise PermissionDenied(HEADER, "a call that this server takes from nobody", ADMIN_FIX)
+    """As `Reloader.reload`; raises PermissionDenied without one, or without an admin token."""
+    if reloader is None or not IS_ADMIN.get():
+        raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
     return await reloader.reload()

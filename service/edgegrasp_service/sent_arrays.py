@@ -81,16 +81,15 @@ def numbers_from_lists(field: str, values: list[Any], holes: bool = False) -> Ar
     Raises:
         InvalidRequest: Rows of different lengths, or something other than numbers.
     """
+    ragged = "Send [x, y, z] rows." if holes else "Send rows of one length."
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
     except ValueError:
-        raise InvalidRequest(
-            field, "rows of different lengths", "Send rows of one length."
-        ) from None
+        raise InvalidRequest(field, "rows of different lengths", ragged) from None
     kinds = set(map(type, array.ravel().tolist()))
     if list in kinds:
-        raise InvalidRequest(field, "rows of different lengths", "Send rows of one length.")
+        raise InvalidRequest(field, "rows of different lengths", ragged)
     allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
     if not kinds <= allowed:
         bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))

@@ -20,6 +20,7 @@ from edgegrasp_service.grpc_edge import GrpcEdge
 from edgegrasp_service.grpc_server import GrpcServer
 from edgegrasp_service.http_app import create_app
 from edgegrasp_service.http_edge import HttpEdge
+from edgegrasp_service.http_protocol import HttpProtocol
 from edgegrasp_service.logs import LogWriter, start_logging, write_line
 from edgegrasp_service.metrics import Metrics
 from edgegrasp_service.observer import Observer
@@ -66,7 +67,7 @@ class Server:
         self._settings = settings
         self._tls = load_tls(settings)
         self.metrics = Metrics(sorted(METHODS))
-        self._edge = Edge(load_tokens(settings), self.metrics)
+        self._edge = Edge(load_tokens(settings), self.metrics, settings.max_header_bytes)
         self._service = service or GraspService(
             lambda: load_backend(settings), settings, Observers((self.metrics, *observers))
         )
@@ -133,6 +134,7 @@ class Server:
         in_time = await self._service.drain(end - clock())
         if not in_time:
             logger.warning("grace is over: requests in flight are given up")
+            self._edge.give_up()
         self._service.close()
         end = max(end, clock() + CLOSE_SECONDS)
         while self._edge.unanswered and clock() < end:
@@ -155,7 +157,7 @@ class Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http="h11",  # whatever else is installed: its limit of headers is the one set here
+            http=HttpProtocol,  # whatever else is installed: its bounds are the ones set here
             h11_max_incomplete_event_size=self._settings.max_header_bytes,
             ws="none",
             server_header=False,
@@ -190,7 +192,7 @@ def run(settings: Settings) -> None:
             provider = otlp_provider(settings.otlp_endpoint)
             ends.callback(provider.shutdown)
             observers.append(Tracer(provider))
-        _warn_of_strangers(settings)
+        warn_of_strangers(settings)
         asyncio.run(_serve_until_signalled(settings, tuple(observers), log))
 
 
@@ -215,7 +217,7 @@ async def _serve_until_signalled(
     await server.serve(stop, opened, ready)
 
 
-def _warn_of_strangers(settings: Settings) -> None:
+def warn_of_strangers(settings: Settings) -> None:
     """Say what is open to whoever can reach this machine."""
     try:
         local = ipaddress.ip_address(settings.host).is_loopback

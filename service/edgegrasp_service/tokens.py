@@ -4,12 +4,17 @@ import hashlib
 import hmac
 import re
 from collections.abc import Iterable
+from contextvars import ContextVar
 from pathlib import Path
 
 from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
 from edgegrasp_service.settings import Settings
 
 HEADER = "authorization"
+
+# Whether the running request showed an admin token: what needs one asks here, so that no other
+# spelling of an address comes around the check at the edge.
+IS_ADMIN: ContextVar[bool] = ContextVar("is_admin", default=False)
 FIX = "Send `authorization: Bearer TOKEN` with a token of this server."
 ADMIN_FIX = "Send an admin token; where the server has none, send its process SIGHUP instead."
 
@@ -60,6 +65,7 @@ class Tokens:
             raise PermissionDenied(HEADER, "a token that is good for detection only", ADMIN_FIX)
         if not is_admin and (admin or not is_user):
             raise Unauthenticated(HEADER, "a token that this server does not know", FIX)
+        IS_ADMIN.set(is_admin)
 
 
 def load_tokens(settings: Settings) -> Tokens:

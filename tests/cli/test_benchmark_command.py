@@ -42,6 +42,7 @@ def attempts(folder: Path) -> list[dict[str, str]]:
 
 def benchmark(folder: Path, planner: str, *flags: object, rounds: int = 2) -> dict:
     where = ("--scene", "packed", "--seed", 0, "--rounds", rounds, "--output", folder)
+    where = (*where, "--workers", 1)
     run("benchmark", "--no-report", "--planner", planner, *where, *flags)
     return figures(folder)
 
@@ -72,7 +73,7 @@ def test_a_planner_of_one_s_own_needs_only_its_name(
 
 def test_the_shipped_weights_are_not_below_the_gate() -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400)
-    where = ("--scene", "packed", "--seed", 0, "--rounds", 4)
+    where = ("--scene", "packed", "--seed", 0, "--rounds", 4, "--workers", 1)
     assert "not below the gate" in run(
         "benchmark", "--planner", "in-process", *where, *few, "--gate", SMOKE_GATE
     )
@@ -83,7 +84,8 @@ def test_a_result_below_the_gate_fails(oracle: Path, tmp_path: Path) -> None:
     for name in ("grasp_success_rate", "declutter_rate"):
         gate[name] |= {"value": 0.99, "wilson_95": [0.98, 1.0]}
     (tmp_path / "gate.json").write_text(json.dumps(gate))
-    where = ("--scene", "packed", "--seed", 0, "--rounds", 2, "--gate", tmp_path / "gate.json")
+    where = ("--scene", "packed", "--seed", 0, "--rounds", 2, "--workers", 1)
+    where = (*where, "--gate", tmp_path / "gate.json")
     result = CliRunner().invoke(
         app, [str(part) for part in ("benchmark", "--planner", "edge-sample", *where)]
     )
@@ -187,3 +189,19 @@ def wait_until_closed(port: int) -> None:
             if probe.connect_ex(("127.0.0.1", port)) != 0:
                 return
         time.sleep(0.01)
+
+
+def test_a_server_that_asks_for_a_token_gets_it(
+    start_server: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("EDGEGRASP_CLIENT_TOKEN", raising=False)
+    token = tmp_path / "token"
+    token.write_text("user-token-0123456789\n")
+    with start_server("--backend", "dummy", "--token-file", str(token)) as server:
+        asked = ("--server", server.grpc_address)
+        known = benchmark(tmp_path / "known", "server", *asked, "--token-file", token, rounds=1)
+        assert known["attempts"] > 0
+        words = ("benchmark", "--rounds", "1", "--seed", "0", "--workers", "1", *asked)
+        result = CliRunner().invoke(app, list(words))
+        assert result.exit_code == 1
+        assert "authorization: got nothing" in result.output

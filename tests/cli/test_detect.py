@@ -4,6 +4,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+import trustme
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
@@ -133,3 +134,38 @@ def test_models(dummy_server) -> None:
     code, output = run("models", "--server", "127.0.0.1:1")
     assert code == 1
     assert "edgegrasp models: " in output
+
+
+@pytest.fixture
+def pem(tmp_path: Path) -> dict[str, str]:
+    """Files: a CA, and a certificate of it for this machine."""
+    authority = trustme.CA()
+    issued = authority.issue_cert("127.0.0.1")
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    issued.private_key_and_cert_chain_pem.write_to_path(tmp_path / "own.pem")
+    return {name: str(tmp_path / f"{name}.pem") for name in ("ca", "own")}
+
+
+def test_a_server_with_tls_and_tokens(
+    file: str, pem: dict[str, str], tmp_path: Path, start_server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token = tmp_path / "token"
+    token.write_text("user-token-0123456789\n")
+    certificates = ("--tls-certificate", pem["own"], "--tls-key", pem["own"])
+    flags = (*certificates, "--tls-client-ca", pem["ca"], "--token-file", str(token))
+    with start_server("--backend", "dummy", *flags) as server:
+        shown = (*certificates, "--tls-ca", pem["ca"])
+        for address in (server.grpc_address, server.http_url):
+            asked = ("--server", address, *shown)
+            code, output = run("detect", file, *asked, "--token-file", str(token), "--json")
+            assert code == 0, output
+            assert len(json.loads(output)["grasps"]) == 10
+            monkeypatch.setenv("EDGEGRASP_CLIENT_TOKEN", "user-token-0123456789")
+            assert run("models", *asked)[0] == 0
+            monkeypatch.delenv("EDGEGRASP_CLIENT_TOKEN")
+            code, output = run("models", *asked)
+            assert (code, "authorization: got nothing" in output) == (1, True)
+            code, output = run("detect", file, "--server", address, "--tls-ca", pem["ca"])
+            assert code == 1
+    code, output = run("models", "--server", "127.0.0.1:1", "--token-file", str(tmp_path / "none"))
+    assert (code, "token file" in output) == (1, True)

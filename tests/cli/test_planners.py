@@ -1,18 +1,25 @@
 """What planners ask for and take, by the protocol."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edgegrasp_cli.planners import NamedPlanner
-from edgegrasp_cli.planners.edge_sample import CandidateSampler
+from edgegrasp_cli.planners.making import PlannerChoice, planner_of
 from edgegrasp_cli.planners.oracle import OraclePlanner
+from edgegrasp_cli.planners.own_candidates import OwnCandidates
+from edgegrasp_cli.planners.paper_candidates import PaperCandidates, clean_cloud, paper_grasps
 from edgegrasp_cli.planners.requests import choose, request_options
+from edgegrasp_model.catalogue import WEIGHTS_FOLDER
+from edgegrasp_model.cloud import Cloud
+from edgegrasp_sim.gripper import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
-from edgegrasp_sim.trials import RoundDriver
+from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
 
 PAPER, ROBOT = load_protocol("edgegrasp").planning, load_protocol("robot").planning
 
@@ -54,33 +61,112 @@ def test_requests_follow_the_protocol() -> None:
     assert np.shape(six["viewpoint"]) == (6, 3)
 
 
-def test_random_candidates_keep_the_reference_s_constraints() -> None:
-    observation = seen_under("edgegrasp")
-    sampler = CandidateSampler(64, 4000, 0.004)
-    poses = sampler(observation, np.random.default_rng(0))
-    assert 0 < len(poses) <= 4000
-    assert (poses[:, 2, 2] < 0.1).all()  # the hand does not come from below
-    tips = poses[:, 2, 3] + 0.1122 * poses[:, 2, 2]
-    assert (tips > observation.table_height).all()
-    again = sampler(observation, np.random.default_rng(0))
-    assert np.array_equal(poses, again)
-    assert (
-        len(
-            sampler(
-                replace(
-                    observation, cloud=observation.cloud[:5], view_ids=observation.view_ids[:5]
-                ),
-                np.random.default_rng(0),
-            )
-        )
-        == 0
+GOLDEN = ("packed_00", "packed_03", "pile_04", "pile_07", "pile_09")
+MOST_KEPT = 1500  # candidates that the reference kept of a scene
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_random_candidates_are_the_reference_s(shared_dir: Path, name: str) -> None:
+    golden = np.load(shared_dir / "reference" / "golden" / f"{name}.npz")
+    edges = golden["ball_edges"].astype(np.int64)
+    pair, poses = paper_grasps(
+        Cloud(golden["points"], golden["normals"]), edges[:, 0], edges[:, 1], 0.05
+    )
+    kept = golden["edge_rows"]
+    if len(kept) < MOST_KEPT:
+        assert set(pair) == set(kept)
+    assert set(kept) <= set(pair)
+    place = np.searchsorted(pair, kept)
+    np.testing.assert_allclose(
+        poses[place] @ translation(0.0, 0.0, 0.04), golden["T_world_handcom"], atol=2e-6
     )
 
 
+@pytest.mark.parametrize("name", GOLDEN)
+def test_clouds_of_random_candidates_are_the_reference_s(shared_dir: Path, name: str) -> None:
+    golden = np.load(shared_dir / "reference" / "golden" / f"{name}.npz")
+    cloud = clean_cloud(golden["dense_cloud"], 0.0045)
+    assert cloud is not None
+    assert len(cloud.points) == len(golden["points"])
+    order, golden_order = (np.lexsort(np.round(p, 5).T) for p in (cloud.points, golden["points"]))
+    np.testing.assert_allclose(cloud.points[order], golden["points"][golden_order], atol=1e-6)
+    ours, theirs = (
+        normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        for normals in (cloud.normals[order], golden["normals"][golden_order])
+    )
+    alike = np.abs(np.einsum("nd,nd->n", ours, theirs))  # of either sign
+    assert np.quantile(alike, 0.01) > 0.999
+    assert alike.min() > 0.9
+
+
+def test_random_candidates_follow_the_seed_and_stay_above_the_table() -> None:
+    observation = seen_under("edgegrasp")
+    sampler = PaperCandidates(64, 4000, 0.004)
+    poses = sampler(observation, np.random.default_rng(0))
+    assert 0 < len(poses) <= 4000
+    assert (poses[:, 2, 2] < 0.1 + 1e-5).all()  # the hand does not come from below
+    tips = poses[:, 2, 3] + FINGERTIP * poses[:, 2, 2]
+    assert (tips > observation.table_height).all()
+    assert np.array_equal(poses, sampler(observation, np.random.default_rng(0)))
+    assert not np.array_equal(poses, sampler(observation, np.random.default_rng(1)))
+    few = replace(observation, cloud=observation.cloud[:5], view_ids=observation.view_ids[:5])
+    assert len(sampler(few, np.random.default_rng(0))) == 0
+
+
+def test_our_own_candidates_are_those_of_a_detection() -> None:
+    observation = seen_under("edgegrasp")
+    options = {"collision": "avoid", "num_approach_points": 16, "num_candidates": 300}
+    sampler = OwnCandidates(PAPER, options)
+    poses = sampler(observation, np.random.default_rng(0))
+    assert 0 < len(poses) <= 300
+    assert np.array_equal(poses, sampler(observation, np.random.default_rng(0)))
+    assert (poses[:, 2, 2] < 1e-5 - 1.0).any()  # level grasps, straight down, are among them
+
+
 def test_an_oracle_without_a_scene_says_so() -> None:
-    oracle = OraclePlanner(CandidateSampler(64, 4000, 0.004))
+    oracle = OraclePlanner(PaperCandidates(64, 4000, 0.004))
     with pytest.raises(RuntimeError, match="use_trial"):
         oracle(seen_under("edgegrasp"), 0)
+
+
+FEW = {"num_approach_points": 8, "num_candidates": 100}
+
+
+def planned(**changes: object) -> PlannedGrasp:
+    choice = PlannerChoice("in-process", **FEW | changes)
+    with planner_of(choice, PAPER) as made:
+        grasp = made.make()(seen_under("edgegrasp"), 3)
+    assert grasp is not None
+    return grasp
+
+
+def test_normals_can_be_flipped_and_voxels_changed_in_process() -> None:
+    plain = planned()
+    # So few that none is: the way over given normals changes nothing.
+    unchanged = planned(flipped_normals=1e-9)
+    np.testing.assert_allclose(unchanged.T_world_hand, plain.T_world_hand, atol=1e-5)
+    assert unchanged.score == pytest.approx(plain.score, abs=1e-4)
+    assert abs(planned(flipped_normals=0.5).score - plain.score) > 1e-3
+    assert not np.allclose(planned(voxel_size=0.006).T_world_hand, plain.T_world_hand, atol=1e-3)
+    with (
+        pytest.raises(ValueError, match="need in-process"),
+        planner_of(PlannerChoice("edge-sample", voxel_size=0.006), PAPER),
+    ):
+        pass
+
+
+def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
+    ablation = tmp_path / "no-augmentation.safetensors"
+    ablation.write_bytes((WEIGHTS_FOLDER / "edgegrasp-plus.safetensors").read_bytes())
+    with planner_of(PlannerChoice("in-process", str(ablation)), PAPER) as made:
+        assert len(made.facts["digest"]) == 64
+    assert planned(model=str(ablation)).score == planned().score
+    missing = PlannerChoice("in-process", str(tmp_path / "none.safetensors"))
+    with pytest.raises(ValueError, match="no such file"), planner_of(missing, PAPER):
+        pass
+    elsewhere = PlannerChoice("server", str(ablation), server="127.0.0.1:1")
+    with pytest.raises(ValueError, match="server's own weights"), planner_of(elsewhere, PAPER):
+        pass
 
 
 @pytest.mark.parametrize("name", ["guess", "json:", ":loads", "json:no_such", "math:pi"])

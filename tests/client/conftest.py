@@ -24,6 +24,12 @@ class FromAsync:
         method = getattr(self._client, name)
         return lambda *args, **kwargs: self._run(method(*args, **kwargs))
 
+    def detect_stream(self, *args: Any, **kwargs: Any) -> list[Any]:
+        async def collect() -> list[Any]:
+            return [answer async for answer in self._client.detect_stream(*args, **kwargs)]
+
+        return self._run(collect())
+
     def close(self) -> None:
         self._run(self._client.close())
         self._loop.close()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 settings.register_profile(
     "fuzz",
-    max_examples=2500,
+    max_examples=1500,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )

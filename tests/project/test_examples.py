@@ -84,6 +84,20 @@ def test_python_example_names_what_is_wrong(server: Addresses, tmp_path: Path) -
     assert done.stderr.startswith("error: cloud: got ")
 
 
+def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(
+    server: Addresses, cloud_file: Path
+) -> None:
+    few = cloud_file.with_name("few.npy")
+    np.save(few, np.zeros((3, 3), np.float32))
+    names = [str(cloud_file), str(few), str(cloud_file)]
+    for address in (server.grpc_address, server.http_url):
+        done = run(sys.executable, EXAMPLES / "04_stream_of_clouds.py", *names, "--server", address)
+        first, second, third = done.stdout.splitlines()
+        assert first == third
+        assert first.startswith(f"{cloud_file}: score 0.")
+        assert second.startswith(f"{few}: cloud: got ")
+
+
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_curl_example_prints_five_grasps(server: Addresses, cloud_file: Path) -> None:
     done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, server.http_url)

@@ -148,7 +148,7 @@ def test_bad_json(name: str, raw_rest) -> None:
     assert raw_rest.post(json={"points": GOOD.tolist()}).code == "200"
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b'{"points": [[0, 0, ', b"\xff\xfe", b"[" * 100_000])
+@pytest.mark.parametrize("text", [b"", b"{", b'{"points": [[0, 0, ', b"\xff\xfe", b"[" * 10_000])
 def test_truncated_json(text: bytes, raw_rest) -> None:
     answer = raw_rest.post(content=text, headers={"content-type": "application/json"})
     assert (answer.code, answer.field) == ("400", "body")

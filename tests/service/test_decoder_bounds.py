@@ -61,3 +61,20 @@ def test_half_a_character_is_told_in_whole_ones() -> None:
     told = report(InvalidRequest("\ud800", "an unknown field", "Remove it."))
     assert told.field == "\\ud800"
     assert told.detail.encode() == rb"\ud800: got an unknown field. Remove it."
+
+
+def test_more_lists_than_points_have(raw_rest) -> None:
+    """30 MB of empty lists once took 800 MB, and ten seconds in which nobody was answered."""
+    content = b'{"points": [' + b"[]," * 200_000 + b"[]]}"
+    answer = raw_rest.post(content=content, headers={"content-type": "application/json"})
+    assert (answer.code, answer.field) == ("400", "body")
+    assert answer.value == f"200003 lists and objects in {len(content)} bytes"
+
+
+def test_the_shortest_points_and_edges_there_are(raw_rest) -> None:
+    points = b"[0,0,0]," * 50_000 + b"[0,0,1]"
+    edges = b",".join([b"[0,1]"] * 16_000)
+    for path, beside in (("/v1/grasps", b""), ("/v1/grasps:score", b',"edges":[' + edges + b"]")):
+        content = b'{"points":[' + points + b"]" + beside + b"}"
+        answer = raw_rest.post(path, content=content, headers={"content-type": "application/json"})
+        assert answer.code == "200", answer

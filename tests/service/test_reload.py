@@ -138,11 +138,29 @@ async def test_only_an_admin_token_reloads(serving, service, transport: str) -> 
         assert kinds == ["unauthenticated", "permission-denied", "unauthenticated", "2"]
 
 
+SPELLINGS = ["%0A", "/", "%2F", "?x=1", ";", "%00", "#", "%0A%0A", "//"]
+
+
+@pytest.mark.parametrize("tail", SPELLINGS)
+async def test_no_spelling_of_the_address_comes_around_the_token(
+    serving, service, shelf: Shelf, tail: str
+) -> None:
+    async with serving(service, tokens=[USER], admin_tokens=[ADMIN]) as server:
+        headers = {"authorization": f"Bearer {USER}"}
+        async with httpx.AsyncClient(base_url=server.http_url, headers=headers) as http:
+            for start in ("/v1/models:reload", "/v1/models%3Areload", "/v1/./models:reload"):
+                answer = await http.post(start + tail, follow_redirects=True)
+                assert answer.status_code in (403, 404, 405), answer.text
+    assert shelf.loads == 1
+
+
 async def test_without_admin_tokens_nobody_reloads(serving, service, shelf, transport: str) -> None:
     async with serving(service, tokens=[USER]) as server:
         for token in (None, USER):
             kind, detail = await Admin(server, transport).reload(token)
             assert (kind, "SIGHUP" in detail) == ("permission-denied", True)
+        async with httpx.AsyncClient(base_url=server.http_url) as http:
+            assert (await http.post("/v1/models:reload%0A")).status_code in (401, 403)
     assert shelf.loads == 1
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import ssl
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,13 @@ from edgegrasp_client import (
     ServerUnavailableError,
     Tls,
 )
-from edgegrasp_service import tokens
-from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
+from edgegrasp_service.core import GraspService
+from edgegrasp_service.dummy import DummyCatalogue
+from edgegrasp_service.errors import InvalidSettings
+from edgegrasp_service.probe import is_ready
+from edgegrasp_service.server import Server, warn_of_strangers
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.tls import load_tls
-from edgegrasp_service.tokens import Tokens, load_tokens
 
 USER = "user-token-0123456789"
 SECOND = "second-token-0123456789"
@@ -251,74 +254,6 @@ async def test_only_this_machine_by_default(serving) -> None:
         assert server.http_url.startswith("http://127.0.0.1:")
 
 
-class TestTokens:
-    @pytest.mark.parametrize(
-        ("header", "admin", "error"),
-        [
-            (f"Bearer {USER}", False, None),
-            (f"bearer  {SECOND} ", False, None),
-            (f"Bearer {ADMIN}", False, None),
-            (f"Bearer {ADMIN}", True, None),
-            (f"Bearer {USER}", True, PermissionDenied),
-            (f"Bearer {WRONG}", True, Unauthenticated),
-            (None, True, Unauthenticated),
-            (None, False, Unauthenticated),
-            ("", False, Unauthenticated),
-            ("Bearer", False, Unauthenticated),
-            (f"Basic {USER}", False, Unauthenticated),
-            (USER, False, Unauthenticated),
-            ("Bearer \udcff\xff", False, Unauthenticated),
-        ],
-    )
-    def test_check(self, header: str | None, admin: bool, error: type[Exception] | None) -> None:
-        known = Tokens([USER, SECOND], [ADMIN])
-        if error is None:
-            known.check(header, admin=admin)
-        else:
-            with pytest.raises(error):
-                known.check(header, admin=admin)
-
-    def test_without_tokens_all_but_administration_is_open(self) -> None:
-        Tokens().check(None)
-        with pytest.raises(PermissionDenied, match="SIGHUP"):
-            Tokens().check(f"Bearer {ADMIN}", admin=True)
-
-    def test_comparison_takes_as_long_whichever_token_it_is(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        compared: list[tuple[int, int]] = []
-
-        def compare(first: bytes, second: bytes) -> bool:
-            compared.append((len(first), len(second)))
-            return first == second
-
-        known = Tokens([USER, SECOND], [ADMIN])
-        monkeypatch.setattr(tokens.hmac, "compare_digest", compare)
-        known.check(f"Bearer {USER}")
-        assert compared == [(32, 32)] * 3
-
-    @pytest.mark.parametrize(
-        ("text", "sentence"),
-        [
-            ("short\n", "got 5 letters as token 1"),
-            (f"{USER}\ntwo words of enough letters\n", "token 2"),
-            ("# none\n", "It holds no token"),
-            (b"\xff\xfe", "cannot be read"),
-            (None, "cannot be read"),
-        ],
-    )
-    def test_bad_files_are_named(
-        self, tmp_path: Path, text: str | bytes | None, sentence: str
-    ) -> None:
-        path = tmp_path / "tokens"
-        if text is not None:
-            path.write_bytes(text if isinstance(text, bytes) else text.encode())
-        with pytest.raises(InvalidSettings) as caught:
-            load_tokens(Settings(token_file=path))
-        assert sentence in str(caught.value)
-        assert "short" not in str(caught.value)
-
-
 def test_the_client_refuses_what_cannot_be() -> None:
     missing = Path("none.pem")
     for security in (
@@ -332,3 +267,54 @@ def test_the_client_refuses_what_cannot_be() -> None:
                 GraspClient(address, **security)
     with pytest.raises(InvalidRequestError, match="alone"):
         Tls(certificate=missing)
+
+
+@pytest.mark.parametrize("secure", ["plain", "tls", "client certificates"])
+async def test_the_containers_health_check(serving, server_tls, pem, secure: str) -> None:
+    given: dict[str, Any] = {} if secure == "plain" else dict(server_tls)
+    if secure == "client certificates":
+        given["tls_client_ca"] = pem["ca"]
+    async with serving(**given, tokens=[USER]) as server:
+        port = int(server.http_url.rpartition(":")[2])
+        settings = Settings(**given, http_port=port)
+        assert await asyncio.to_thread(is_ready, settings)
+    assert not is_ready(settings)
+
+
+async def test_the_health_check_waits_for_weights() -> None:
+    may_load = threading.Event()
+
+    def load() -> DummyCatalogue:
+        assert may_load.wait(20)
+        return DummyCatalogue()
+
+    settings = Settings(http_port=0, grpc_port=0, grace_seconds=1.0)
+    server = Server(settings, GraspService(load, settings))
+    opened, ready, stop = (asyncio.Event() for _ in range(3))
+    running = asyncio.create_task(server.serve(stop, opened.set, ready.set))
+    await opened.wait()
+    port = int(server.http_url.rpartition(":")[2])
+    assert not await asyncio.to_thread(is_ready, Settings(http_port=port))
+    may_load.set()
+    await ready.wait()
+    assert await asyncio.to_thread(is_ready, Settings(http_port=port, host="0.0.0.0"))
+    stop.set()
+    await running
+
+
+@pytest.mark.parametrize(
+    ("given", "warned"),
+    [
+        ({}, []),
+        ({"host": "::1"}, []),
+        ({"host": "localhost"}, []),
+        ({"host": "0.0.0.0"}, ["nothing is encrypted", "asks nobody who"]),
+        ({"host": "robot.example", "tokens": [USER]}, ["nothing is encrypted"]),
+    ],
+)
+def test_a_server_that_others_can_reach_warns(
+    given: dict[str, Any], warned: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_strangers(Settings(**given))
+    assert len(caplog.messages) == len(warned)
+    assert all(said in message for said, message in zip(warned, caplog.messages, strict=True))

@@ -2,17 +2,21 @@ from __future__ import annotations
 
 import importlib
 import json
+import multiprocessing
+import sys
+import time
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
-from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
+from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores, manifest, run_benchmark
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.results import ResultFolder, attempts_digest
 from edgegrasp_sim.top_down import plan_top_down
+from edgegrasp_sim.trials import PlannerUnavailableError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,10 +28,19 @@ TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
 make_planner = partial(partial, plan_top_down)
 
 
+def absent(observation: object, seed: int) -> None:
+    raise PlannerUnavailableError("away for good")
+
+
+def make_absent() -> object:
+    return absent
+
+
 DIES_ONCE = """
 import os, signal
 from pathlib import Path
 from edgegrasp_sim.top_down import plan_top_down
+from edgegrasp_sim.trials import PlannerUnavailableError
 
 MARK = Path(__file__).with_suffix(".died")
 
@@ -108,7 +121,64 @@ def test_wrong_settings_are_told(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="each seed once"):
         BenchmarkConfig(SceneKind.PILE, rounds=1, seeds=(1, 1))
     config = BenchmarkConfig(SceneKind.PILE, rounds=1, objects=tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"no \*\.urdf files"):
+    with pytest.raises(FileNotFoundError, match=r"no \*\.urdf, \*\.obj"):
         run_benchmark(config, make_planner, workers=2)
     with pytest.raises(ValueError, match="workers is 0"):
         run_benchmark(config, make_planner, workers=0)
+    assert available_cores() >= 1
+
+
+def test_a_killed_run_goes_on_and_changes_nothing(
+    alone: tuple[BenchmarkConfig, str], tmp_path: Path
+) -> None:
+    config, digest = alone
+    folder = ResultFolder(tmp_path)
+    folder.open(manifest(config, {"name": "top-down"}))
+    process = multiprocessing.get_context("spawn").Process(
+        target=run_benchmark, args=(config, make_planner), kwargs={"folder": folder}
+    )
+    process.start()
+    while not list(folder.path.glob("rounds/*.json")):
+        assert process.is_alive() or process.exitcode == 0
+        time.sleep(0.005)
+    process.kill()
+    process.join()
+    kept = len(folder.rounds())
+    assert 1 <= kept <= 4
+    again: list[object] = []
+    rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
+    assert len(again) == 4 - kept
+    assert attempts_digest(rounds) == attempts_digest(folder.rounds()) == digest
+
+
+# Starting a Ray cluster leaves sockets and processes to the garbage collector.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::FutureWarning"
+)
+def test_a_ray_cluster_changes_nothing(alone: tuple[BenchmarkConfig, str]) -> None:
+    pytest.importorskip("ray", reason="the extra `ray` is not installed")
+    config, digest = alone
+    rounds = run_benchmark(config, make_planner, workers=2, ray="local")
+    assert attempts_digest(rounds) == digest
+
+    with pytest.raises(PlannerUnavailableError, match="away for good"):
+        run_benchmark(replace(config, patience=0.0), make_absent, workers=2, ray="local")
+
+
+def test_a_missing_ray_or_cluster_is_told(
+    alone: tuple[BenchmarkConfig, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, _ = alone
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(RuntimeError, match=r"ray is not .*edgegrasp\[ray\]"):
+        run_benchmark(config, make_planner, ray="local")
+
+    class Ray:
+        @staticmethod
+        def init(**_: object) -> None:
+            raise ConnectionError("nobody answers")
+
+    monkeypatch.setitem(sys.modules, "ray", Ray)
+    with pytest.raises(RuntimeError, match=r"no Ray cluster at '127\.0\.0\.1:1': nobody"):
+        run_benchmark(config, make_planner, ray="127.0.0.1:1")

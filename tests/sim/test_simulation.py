@@ -114,8 +114,34 @@ def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimu
     forward = [simulation.try_grasp(grasp).opening for grasp in grasps]
     backward = [simulation.try_grasp(grasp).opening for grasp in reversed(grasps)]
     assert forward == backward[::-1]
-    last = simulation.try_grasp(grasps[0])
-    assert simulation.execute_grasp(grasps[0]).outcome is last.outcome
+    last = simulation.try_grasp(grasps[0], to_the_end=True)
+    assert simulation.execute_grasp(grasps[0]).opening == last.opening
+
+
+def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(
+    simulation: ClutterSimulation,
+) -> None:
+    simulation.reset("pile", np.random.default_rng(5))
+    rng = np.random.default_rng(1)
+    steps = 0
+
+    def count() -> None:
+        nonlocal steps
+        steps += 1
+
+    grasps = [
+        top_down(x + rng.normal(0, 0.01), y + rng.normal(0, 0.01), max(z - 0.01, 0.055))
+        for x, y, z in (item.position for item in simulation.placements)
+        for _ in range(4)
+    ]
+    simulation.world.on_step = count
+    whole = [simulation.try_grasp(grasp, to_the_end=True).success for grasp in grasps]
+    whole_steps, steps = steps, 0
+    early = [simulation.try_grasp(grasp).success for grasp in grasps]
+    assert any(whole)
+    assert not all(whole)
+    assert np.mean(np.equal(whole, early)) >= 0.95
+    assert steps < 0.7 * whole_steps
 
 
 @pytest.mark.parametrize("scene", SceneKind)

@@ -14,8 +14,11 @@ if TYPE_CHECKING:
 LEAST_AGREEMENT = {SceneKind.PACKED: 0.90, SceneKind.PILE: 0.82}
 
 
+@pytest.mark.parametrize("to_the_end", [False, True])
 @pytest.mark.parametrize("kind", SceneKind)
-def test_outcomes_agree_with_the_reference_simulator(shared_dir: Path, kind: SceneKind) -> None:
-    agreement = measure_agreement(shared_dir, kind, grasps_per_scene=40)
+def test_outcomes_agree_with_the_reference_simulator(
+    shared_dir: Path, kind: SceneKind, to_the_end: bool
+) -> None:
+    agreement = measure_agreement(shared_dir, kind, grasps_per_scene=40, to_the_end=to_the_end)
     assert agreement.tried == (40,) * 4
     assert agreement.share >= LEAST_AGREEMENT[kind]

@@ -2,15 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_cli.planners.edge_sample import CandidateSampler, Float32
+from edgegrasp_cli.planners.paper_candidates import Float32
 from edgegrasp_sim.grasping import GraspResult
 from edgegrasp_sim.gripper import MAX_OPENING
 from edgegrasp_sim.simulation import Observation
 from edgegrasp_sim.trials import PlannedGrasp
+
+# From what is seen to poses `T_world_hand` in random order, (E, 4, 4); can be pickled.
+Sampler: TypeAlias = Callable[[Observation, np.random.Generator], Float32]
 
 MAX_TRIES = 300  # candidates tried in one view
 # Metres along the hand's x and y: a grasp that holds there as well is no close call.
@@ -21,7 +25,7 @@ SHIFTS = ((0.002, 0.0), (-0.002, 0.0), (0.0, 0.002), (0.0, -0.002))
 class OracleFactory:
     """Makes an oracle in each worker process."""
 
-    sampler: CandidateSampler
+    sampler: Sampler
 
     def __call__(self) -> "OraclePlanner":
         """An oracle."""
@@ -34,7 +38,7 @@ class OraclePlanner:
     Without one, it takes the first that holds at all; without that, any.
     """
 
-    def __init__(self, sampler: CandidateSampler) -> None:
+    def __init__(self, sampler: Sampler) -> None:
         self.sampler = sampler
         self._try_grasp: Callable[[ArrayLike], GraspResult] | None = None
 

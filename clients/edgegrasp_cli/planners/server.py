@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from edgegrasp_cli.connection import NO_CONNECTION, Connection, connect
 from edgegrasp_cli.planners.requests import choose, request_options
 from edgegrasp_client import (
     DeadlineError,
@@ -28,12 +29,14 @@ class ServerPlannerFactory:
         rules: of the protocol.
         options: of each request, besides the protocol's.
         digest: of the weights that the server shall answer with.
+        connection: how to know the server and what to show it; see `Connection`.
     """
 
     address: str
     rules: PlanningRules
     options: dict[str, Any]
     digest: str
+    connection: Connection = NO_CONNECTION
 
     def __call__(self) -> "ServerPlanner":
         """A planner for this server."""
@@ -79,7 +82,9 @@ class ServerPlanner:
 
     def _connected(self) -> GraspClient:
         if self._client is None:
-            self._client = GraspClient(self.settings.address, timeout=REQUEST_SECONDS)
+            self._client = connect(
+                self.settings.address, REQUEST_SECONDS, *self.settings.connection
+            )
             used = model_used(self._client, self.settings.options.get("model", ""))
             if used.digest != self.settings.digest:
                 raise GraspClientError(

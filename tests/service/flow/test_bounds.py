@@ -3,10 +3,13 @@
 import asyncio
 import io
 
+import grpc
 import httpx
 import numpy as np
 import pytest
+from grpc import aio
 
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_service.admission import Admission
 from edgegrasp_service.call import Call
 from edgegrasp_service.errors import Overloaded
@@ -46,6 +49,21 @@ async def test_http_refuses_before_the_body_comes(serve) -> None:
         writer.close()
         running.stages.open("prepare")
         assert (await accepted).status_code == 200
+
+
+async def test_grpc_refuses_before_the_message_comes(serve, cloud) -> None:
+    running = await serve(max_concurrent_requests=1, max_queue_length=0)
+    running.stages.shut("prepare")
+    points = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        accepted = stub.DetectGrasps(points)
+        await running.until(lambda: running.stages.begun["prepare"] == 1)
+        # As a stream, this client may send its message whenever it likes: never.
+        call = channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
+        assert await call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        running.stages.open("prepare")
+        assert (await accepted).grasps
 
 
 async def test_turns_come_in_order(serve, connect, cloud) -> None:
@@ -192,3 +210,19 @@ async def test_a_turn_that_comes_as_its_owner_leaves_is_passed_on() -> None:
     assert done == [0, 2]
     await asyncio.wait([second])
     await admission.empty()
+
+
+async def test_large_bodies_are_refused_in_words_too(serve, cloud) -> None:
+    """A client that sends all of its body before it reads gets the answer, and may go on."""
+    running = await serve(max_concurrent_requests=1, max_queue_length=0)
+    running.stages.shut("prepare")
+    small, large = {"points": cloud.tolist()}, HD.astype(np.float32).tobytes() * 2
+    url = running.server.http_url
+    async with httpx.AsyncClient(base_url=url) as first, httpx.AsyncClient(base_url=url) as http:
+        accepted = asyncio.create_task(first.post("/v1/grasps", json=small, timeout=20))
+        await running.until(lambda: running.stages.begun["prepare"] == 1)
+        refused = await http.post("/v1/grasps", content=large, timeout=20)
+        assert refused.status_code == 429
+        running.stages.open("prepare")
+        assert (await accepted).status_code == 200
+        assert (await http.post("/v1/grasps", json=small)).status_code == 200

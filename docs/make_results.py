@@ -1,0 +1,254 @@
+"""Writes docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
+
+Results found below RESULTS_DIR (folders of `edgegrasp benchmark`, `edgegrasp experiment` and
+`edgegrasp train`) are first boiled down to docs/results/, where what is found again replaces what
+was there; the page is written from that folder alone.
+"""
+
+import csv
+import json
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from edgegrasp_sim.experiment_report import experiment_table, percent, title_of
+from edgegrasp_sim.published import published
+from edgegrasp_sim.record import record_of
+from edgegrasp_sim.results import ResultFolder
+
+Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
+
+DOCS = Path(__file__).parent
+KEPT_CURVE_POINTS = 40
+SCENES = ("packed", "pile")
+INTRODUCTION = """\
+# Results
+
+Grasp success rate (GSR) and declutter rate (DR) of simulated clutter removal, in per cent with
+Wilson 95 % intervals; [benchmark.md](benchmark.md) says what a round is. `OBJECTS` are the
+reference system's test objects, which no weights were trained on. Published figures stand as their
+papers give them, mean ± standard deviation over seeds where they say so.
+
+This page is written by `python docs/make_results.py RESULTS_DIR` from the folders that the
+commands below leave; what it keeps of them is in `docs/results/`.
+"""
+# Experiment: heading, command, and what is asked of it.
+EXPERIMENTS = {
+    "baselines": (
+        "Random candidates, and the best that could be made of them",
+        "edgegrasp experiment baselines --rounds 100 --objects OBJECTS --output DIR",
+        "Edge-Sample takes any of the paper's candidates, the oracle one that holds when tried in "
+        "a copy of the scene; `oracle-own` has the pipeline's own candidates to choose from. "
+        "Published for Edge-Sample: packed 44.0 ± 4.0, pile 40.2 ± 3.0.",
+    ),
+    "samples": (
+        "Approach points and candidates",
+        "edgegrasp experiment samples --rounds 100 --objects OBJECTS --output DIR",
+        "The paper's table: 16, 32 or 64 approach points with 1,000, 2,000 or 4,000 candidates.",
+    ),
+    "robustness": (
+        "Robustness",
+        "edgegrasp experiment robustness --rounds 100 --objects OBJECTS --output DIR",
+        "One thing is changed at a time; the protocol has 1 mm noise, a polar angle of 45 to 60 "
+        "degrees, the weights have a voxel size of their own. `giga` is a fixed side view with "
+        "noise that also moves a whole image by some 3 % of its depth (19 mm); its camera alone "
+        "has the protocol's noise.",
+    ),
+    "families": (
+        "Objects of other families",
+        "edgegrasp experiment families --rounds 100 --output DIR",
+        "Prisms: regular (30 to 80 mm), thin (at most 14 mm across), flat (8 to 14 mm high) and "
+        "large (60 to 70 mm across, in a hand that opens 80 mm). Sticks are not dropped on heaps: "
+        "the engine lets them through the table.",
+    ),
+}
+BENCHMARK = (
+    "edgegrasp benchmark --scene packed --rounds 100 --seed 0 --seed 1 --objects OBJECTS "
+    "--num-approach-points 32 --num-candidates 2000 --output DIR"
+)
+NOT_YET = "Not measured yet."
+
+
+def collect(results: Path, kept: Path) -> None:
+    """Boil down every result below a folder into another.
+
+    Raises:
+        FileNotFoundError: there is nothing of the kind.
+    """
+    kept.mkdir(exist_ok=True)
+    experiments = sorted(path.parent for path in results.rglob("experiment.json"))
+    inside = {path / "cases" for path in experiments}
+    benchmarks = [
+        path.parent
+        for path in sorted(results.rglob("summary.json"))
+        if not inside & set(path.parents)
+    ]
+    curves = sorted(results.rglob("log.csv"))
+    if not (experiments or benchmarks or curves):
+        raise FileNotFoundError(f"{results} holds no results of benchmark, experiment or train")
+    for folder in experiments:
+        found = json.loads((folder / "experiment.json").read_text())
+        _write(kept / f"{found['experiment']}.json", found)
+        shutil.copyfile(folder / "picture.png", kept / f"{found['experiment']}.png")
+    _merge(kept / "benchmarks.json", {f.name: record_of(ResultFolder(f)) for f in benchmarks})
+    _merge(kept / "curves.json", {file.parent.name: _curve(file) for file in curves})
+    if drawn := _read(kept / "curves.json"):
+        curves_figure(drawn).savefig(kept / "curves.png")
+
+
+def page(kept: Path) -> str:
+    """The whole page, from the folder of what is kept."""
+    return "\n".join([INTRODUCTION, *_sections(kept)])
+
+
+def _sections(kept: Path) -> Iterator[str]:
+    yield "## Shipped weights and ablations\n"
+    records = _read(kept / "benchmarks.json")
+    for scene in SCENES:
+        yield f"### {scene.capitalize()} scenes\n"
+        yield _benchmark_table([r for r in records.values() if r["scene"] == scene], scene)
+    yield "Each row by its command:\n"
+    commands = sorted({command_of(record) for record in records.values()}) or [BENCHMARK]
+    yield _console(commands)
+    for name, (heading, command, text) in EXPERIMENTS.items():
+        yield f"## {heading}\n"
+        yield text + "\n"
+        found = _read(kept / f"{name}.json")
+        yield _console([found.get("command", command)])
+        if not found:
+            yield NOT_YET + "\n"
+            continue
+        rounds, seeds = found["cases"][0]["rounds"], found["cases"][0]["seeds"]
+        yield f"{rounds} rounds for each of the seeds {', '.join(map(str, seeds))}.\n"
+        yield experiment_table(found)
+        yield f"![{heading}](results/{name}.png)\n"
+    yield "## Training\n"
+    yield from _training(_read(kept / "curves.json"))
+
+
+def command_of(record: dict[str, Any]) -> str:
+    """The command that gives a benchmark's figures again."""
+    planner, options = record["planner"], record["planner"].get("options", {})
+    words = ["edgegrasp", "benchmark", "--scene", record["scene"]]
+    words += ["--protocol", record["protocol"]["name"], "--planner", planner["name"]]
+    if "model" in planner:
+        words += ["--model", planner["model"]]
+    words += ["--rounds", str(record["rounds"])]
+    words += [word for seed in record["seeds"] for word in ("--seed", str(seed))]
+    if not record["objects"]["name"].startswith("builtin/"):
+        words += ["--objects", "OBJECTS"]
+    for name in ("num_approach_points", "num_candidates", "collision"):
+        if name in planner or name in options:
+            words += ["--" + name.replace("_", "-"), str(planner.get(name, options.get(name)))]
+    return shlex.join(words)
+
+
+def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
+    head = ("weights or planner", "protocol", "samples", "rounds", "GSR", "DR", "planning")
+    lines = [head, ("---",) * len(head)]
+    for record in records:
+        options = record["planner"] | record["planner"].get("options", {})
+        numbers = [str(options.get(n, "")) for n in ("num_approach_points", "num_candidates")]
+        seconds = record["planning_seconds_median"]
+        lines.append(
+            (
+                title_of(record["planner"]),
+                record["protocol"]["name"],
+                "-".join(filter(None, numbers)) or "the protocol's",
+                f"{record['rounds']} for each of {', '.join(map(str, record['seeds']))}",
+                percent(record["grasp_success_rate"]),
+                percent(record["declutter_rate"]),
+                f"{seconds:.2f} s" if seconds is not None else "",
+            )
+        )
+    for row in published("edgegrasp", scene):
+        rates = [row["grasp_success_rate"], row.get("declutter_rate", [])]
+        gsr, dr = (" ± ".join(f"{number:.1f}" for number in rate) for rate in rates)
+        title = f"*{row['method']}* ({row['source']})"
+        lines.append((title, "edgegrasp", row.get("samples", ""), "", gsr, dr, ""))
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _training(curves: Curves) -> Iterator[str]:
+    yield (
+        "How the loss on held-out scenes falls: with rotations, without, vector neurons, whole "
+        "clouds in place of balls. Each folder is one `edgegrasp train`.\n"
+    )
+    if not curves:
+        yield NOT_YET + "\n"
+        return
+    lines: list[tuple[str, ...]] = [
+        ("run", "steps", "validation loss", "accuracy", "AUROC"),
+        ("---",) * 5,
+    ]
+    for name, rows in curves.items():
+        last = rows[-1]
+        lines.append(
+            (name, *(f"{last[c]:g}" for c in ("step", "validation_loss", "accuracy", "auroc")))
+        )
+    yield "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    yield "![Loss curves](results/curves.png)\n"
+
+
+def curves_figure(curves: Curves) -> Figure:
+    """Validation loss and AUROC against steps, a line for each run."""
+    figure = Figure(figsize=(9.6, 3.4), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, column, label in zip(
+        figure.subplots(1, 2),
+        ("validation_loss", "auroc"),
+        ("validation loss", "validation AUROC"),
+        strict=True,
+    ):
+        for name, rows in curves.items():
+            axes.plot([r["step"] for r in rows], [r[column] for r in rows], label=name)
+        axes.set(xlabel="step", ylabel=label)
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8)
+    return figure
+
+
+def _curve(file: Path) -> list[dict[str, float]]:
+    """A training log, thinned: numbers by column, the last among them."""
+    with file.open(newline="") as opened:
+        rows = [
+            {name: round(float(value), 5) for name, value in row.items() if value}
+            for row in csv.DictReader(opened)
+        ]
+    step = -(-len(rows) // KEPT_CURVE_POINTS)
+    return rows[::-1][:: max(1, step)][::-1]
+
+
+def _console(commands: Sequence[str]) -> str:
+    return "```console\n" + "".join(f"$ {command}\n" for command in commands) + "```\n"
+
+
+def _read(file: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    return found
+
+
+def _merge(file: Path, found: dict[str, Any]) -> None:
+    if found:
+        _write(file, dict(sorted((_read(file) | found).items())))
+
+
+def _write(file: Path, content: dict[str, Any]) -> None:
+    file.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Collect results where a folder is named, then write the page."""
+    for folder in arguments:
+        collect(Path(folder), DOCS / "results")
+    (DOCS / "results.md").write_text(page(DOCS / "results"))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

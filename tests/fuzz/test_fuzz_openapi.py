@@ -1,0 +1,46 @@
+"""schemathesis: every request that the OpenAPI document allows, and many that it does not."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+SHORT = ("--phases", "fuzzing", "--max-examples", "15")
+LONG = ("--phases", "coverage,fuzzing", "--max-examples", "100", "--max-time", "120")
+CHECKS = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+    "unsupported_method",
+)
+
+
+def test_the_server_keeps_to_its_document(start_server, tmp_path: Path) -> None:
+    program = Path(sys.executable).parent / "schemathesis"
+    if not program.exists():
+        pytest.skip("schemathesis is not installed")
+    long = settings.get_current_profile_name() == "fuzz"
+    token = "fuzz-0123456789abcdef0123456789abcdef"
+    file = tmp_path / "tokens"
+    file.write_text(token)
+    flags = ("--backend", "dummy", "--log-level", "error", "--admin-token-file", str(file))
+    with start_server(*flags) as server:
+        command = [program, "run", f"{server.http_url}/openapi.json", "--no-color", "--seed", "1"]
+        command += ["--header", f"Authorization: Bearer {token}"]
+        done = subprocess.run(
+            [*command, "--checks", ",".join(CHECKS), *(LONG if long else SHORT)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stdout[-5000:]
+        counted = re.search(r"(\d+) generated, (\d+) passed", done.stdout)
+        assert counted, done.stdout[-5000:]
+        assert int(counted[1]) == int(counted[2]) > 20
+        assert server.stop() == 0

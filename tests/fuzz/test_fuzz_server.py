@@ -1,0 +1,217 @@
+"""Whatever is sent to a running server, it answers with less than 500, and stays as large."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgegrasp.v1 import grasp_pb2
+
+from .conftest import (
+    DEPTH_IMAGE,
+    FILES,
+    LISTS,
+    POINT_CLOUD2,
+    POINTS,
+    VALUES,
+    base64_of,
+    changed,
+    mutated,
+)
+from .test_fuzz_decoders import MESSAGES, OPTIONS
+
+MAX_GROWTH = 100  # MB; a request here is a few kB
+PATIENCE = 20
+FLAGS = ("--backend", "dummy", "--max-points", "5000", "--log-level", "error")
+
+
+@dataclass
+class Target:
+    http: httpx.Client
+    channel: grpc.Channel
+    pid: int
+
+    def memory(self) -> float:
+        """Resident, MB."""
+        for line in Path(f"/proc/{self.pid}/status").read_text().splitlines():
+            if line.startswith("VmRSS:"):
+                return int(line.split()[1]) / 1024
+        raise LookupError("VmRSS")
+
+    def post(self, content: bytes, media_type: str, path: str = "/v1/grasps") -> int:
+        headers = {"content-type": media_type}
+        response = self.http.post(path, content=content, headers=headers)
+        status = response.status_code
+        assert status < 500, response.text
+        if status != 200:
+            assert response.headers["content-type"] == "application/problem+json"
+            assert response.json()["status"] == status
+            assert len(response.content) < 10_000
+        return status
+
+    def call(self, method: str, content: bytes) -> grpc.StatusCode:
+        call = self.channel.unary_unary(f"/edgegrasp.v1.GraspService/{method}")
+        code = status_of(lambda: call(content, timeout=PATIENCE))
+        assert code in {grpc.StatusCode.OK, *ANSWERS}
+        return code
+
+
+def status_of(work: Callable[[], object]) -> grpc.StatusCode:
+    try:
+        work()
+    except grpc.RpcError as error:
+        return error.code()
+    return grpc.StatusCode.OK
+
+
+ANSWERS = {
+    grpc.StatusCode.INVALID_ARGUMENT,
+    grpc.StatusCode.NOT_FOUND,
+    grpc.StatusCode.RESOURCE_EXHAUSTED,
+}
+
+
+@pytest.fixture(scope="module")
+def target(start_server) -> Iterator[Target]:
+    with start_server(*FLAGS) as server:
+        http = httpx.Client(base_url=server.http_url, timeout=PATIENCE)
+        with http, grpc.insecure_channel(server.grpc_address) as channel:
+            found = Target(http, channel, server.process.pid)
+            for file_format, good in FILES.items():  # readers are imported with their first file
+                for content in good:
+                    found.post(content, f"application/x-{file_format}")
+            before = found.memory()
+            yield found
+            assert found.post(FILES["npy"][0], "application/x-npy") == 200
+            assert found.memory() - before < MAX_GROWTH
+        assert server.stop() == 0
+
+
+@pytest.mark.parametrize("file_format", FILES)
+@given(data=st.data())
+def test_files(target: Target, file_format: str, data: st.DataObject) -> None:
+    content = data.draw(mutated(FILES[file_format]))
+    target.post(content, f"application/x-{file_format}")
+
+
+DOCUMENTS = {
+    "points": POINTS.tolist(),
+    "point_cloud2": POINT_CLOUD2 | {"data": base64_of(POINT_CLOUD2["data"])},
+    "depth_images": [
+        DEPTH_IMAGE
+        | {"depth": DEPTH_IMAGE["depth"] | {"data": base64_of(DEPTH_IMAGE["depth"]["data"])}}
+    ],
+}
+
+
+@given(
+    st.sampled_from(sorted(DOCUMENTS)).flatmap(
+        lambda name: changed({name: DOCUMENTS[name], "options": OPTIONS})
+    )
+    | st.fixed_dictionaries({"points": LISTS, "options": VALUES, "normals": LISTS})
+    | VALUES,
+    st.sampled_from(["/v1/grasps", "/v1/grasps:score"]),
+)
+def test_json(target: Target, document: object, path: str) -> None:
+    content = json.dumps(document, default=lambda data: data.decode("latin-1"))
+    target.post(content.encode(), "application/json", path)
+
+
+@given(st.binary(max_size=300) | mutated([json.dumps({"points": [[0, 0, 0]] * 40}).encode()]))
+def test_broken_json(target: Target, content: bytes) -> None:
+    target.post(content, "application/json")
+
+
+FORM = b"".join(
+    b'--b\r\nContent-Disposition: form-data; name="%s"%s\r\n\r\n%s\r\n' % part
+    for part in [
+        (b"cloud", b'; filename="c.npy"\r\nContent-Type: application/x-npy', FILES["npy"][0]),
+        (b"options", b"\r\nContent-Type: application/json", b'{"seed": 3}'),
+        (b"segment_ids", b"", json.dumps([0] * 40).encode()),
+    ]
+) + (b"--b--\r\n")
+
+
+def test_the_form_that_is_mutated_is_good(target: Target) -> None:
+    assert target.post(FORM, "multipart/form-data; boundary=b") == 200
+
+
+@given(mutated([FORM]))
+def test_forms(target: Target, content: bytes) -> None:
+    target.post(content, "multipart/form-data; boundary=b")
+
+
+@given(
+    st.dictionaries(st.sampled_from([*OPTIONS, "x"]), st.text(max_size=30), max_size=4),
+    st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=40),
+)
+def test_queries_and_media_types(target: Target, query: dict[str, str], media_type: str) -> None:
+    url = httpx.URL("/v1/grasps", params={k: v for k, v in query.items() if encodable(v)})
+    target.post(FILES["npy"][0], "application/x-npy", str(url))
+    target.post(FILES["npy"][0], media_type.strip(), str(url))
+
+
+def encodable(text: str) -> bool:
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+@given(
+    mutated([message.SerializeToString() for message in MESSAGES]) | st.binary(max_size=100),
+    st.sampled_from(["DetectGrasps", "ScoreGrasps", "ListModels"]),
+)
+def test_messages(target: Target, content: bytes, method: str) -> None:
+    target.call(method, content)
+
+
+@given(st.lists(mutated([message.SerializeToString() for message in MESSAGES[:4]]), max_size=3))
+def test_messages_of_a_stream(target: Target, contents: list[bytes]) -> None:
+    """Each is answered, or ends the stream where it is no message at all."""
+    requests = [
+        grasp_pb2.DetectGraspsStreamRequest(request_id="a").SerializeToString()
+        + b"\x12"
+        + length(content)
+        + content
+        for content in contents
+    ]
+    call = target.channel.stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")
+    answers: list[grasp_pb2.DetectGraspsStreamResponse] = []
+
+    def read() -> None:
+        for response in call(iter(requests), timeout=PATIENCE):
+            answers.append(grasp_pb2.DetectGraspsStreamResponse.FromString(response))
+
+    code = status_of(read)
+    assert code in ANSWERS or (code is grpc.StatusCode.OK and len(answers) == len(contents))
+    for answer in answers:
+        if answer.WhichOneof("answer") == "error":
+            assert answer.error.code in {code.value[0] for code in ANSWERS}
+
+
+def length(content: bytes) -> bytes:
+    """A varint."""
+    value, found = len(content), b""
+    while value > 127:
+        found += bytes([value & 127 | 128])
+        value >>= 7
+    return found + bytes([value])
+
+
+def test_long_words_come_back_short(target: Target) -> None:
+    """Or they would not fit into gRPC's metadata, and nobody would hear what is wrong."""
+    encoded = grasp_pb2.EncodedCloud(format="x" * 100_000, data=b"a")
+    for message in (
+        grasp_pb2.DetectGraspsRequest(encoded=encoded),
+        grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes(), options={"model": "x" * 100_000}),
+        grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes(), options={"sampling": "é" * 90_000}),
+    ):
+        code = target.call("DetectGrasps", message.SerializeToString())
+        assert code in (grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND)
+    assert target.post(b'{"\\ud800": 1}', "application/json") == 400
+    assert target.post(b"[" * 990 + b"]" * 990, "application/json") == 400
+    assert target.post(b'{"points": ' + b"[" * 980 + b"]" * 980 + b"}", "application/json") == 400

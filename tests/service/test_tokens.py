@@ -1,0 +1,81 @@
+"""Which tokens are good for what, and which texts are tokens."""
+
+from pathlib import Path
+
+import pytest
+
+from edgegrasp_service import tokens
+from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.tokens import Tokens, load_tokens
+
+USER = "user-token-0123456789"
+SECOND = "second-token-0123456789"
+ADMIN = "admin-token-0123456789"
+WRONG = "wrong-token-0123456789"
+
+
+@pytest.mark.parametrize(
+    ("header", "admin", "error"),
+    [
+        (f"Bearer {USER}", False, None),
+        (f"bearer  {SECOND} ", False, None),
+        (f"Bearer {ADMIN}", False, None),
+        (f"Bearer {ADMIN}", True, None),
+        (f"Bearer {USER}", True, PermissionDenied),
+        (f"Bearer {WRONG}", True, Unauthenticated),
+        (None, True, Unauthenticated),
+        (None, False, Unauthenticated),
+        ("", False, Unauthenticated),
+        ("Bearer", False, Unauthenticated),
+        (f"Basic {USER}", False, Unauthenticated),
+        (USER, False, Unauthenticated),
+        ("Bearer \udcff\xff", False, Unauthenticated),
+    ],
+)
+def test_check(header: str | None, admin: bool, error: type[Exception] | None) -> None:
+    known = Tokens([USER, SECOND], [ADMIN])
+    if error is None:
+        known.check(header, admin=admin)
+    else:
+        with pytest.raises(error):
+            known.check(header, admin=admin)
+
+
+def test_without_tokens_all_but_administration_is_open() -> None:
+    Tokens().check(None)
+    with pytest.raises(PermissionDenied, match="SIGHUP"):
+        Tokens().check(f"Bearer {ADMIN}", admin=True)
+
+
+def test_comparison_takes_as_long_whichever_token_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[tuple[int, int]] = []
+
+    def compare(first: bytes, second: bytes) -> bool:
+        compared.append((len(first), len(second)))
+        return first == second
+
+    known = Tokens([USER, SECOND], [ADMIN])
+    monkeypatch.setattr(tokens.hmac, "compare_digest", compare)
+    known.check(f"Bearer {USER}")
+    assert compared == [(32, 32)] * 3
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("short\n", "got 5 letters as token 1"),
+        (f"{USER}\ntwo words of enough letters\n", "token 2"),
+        ("# none\n", "It holds no token"),
+        (b"\xff\xfe", "cannot be read"),
+        (None, "cannot be read"),
+    ],
+)
+def test_bad_files_are_named(tmp_path: Path, text: str | bytes | None, sentence: str) -> None:
+    path = tmp_path / "tokens"
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InvalidSettings) as caught:
+        load_tokens(Settings(token_file=path))
+    assert sentence in str(caught.value)
+    assert "short" not in str(caught.value)

@@ -1,0 +1,137 @@
+"""What an experiment varies, and how its figures are shown."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from edgegrasp_sim.experiment_report import experiment_figure, experiment_table
+from edgegrasp_sim.experiments import EXPERIMENTS, Case
+from edgegrasp_sim.families import FAMILIES, write_family
+from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.protocol import load_protocol
+from edgegrasp_sim.published import published
+from edgegrasp_sim.scene import load_object
+from edgegrasp_sim.world import World
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PAPER = load_protocol("edgegrasp")
+
+
+def cases(name: str, folder: Path) -> list[Case]:
+    return EXPERIMENTS[name](PAPER, list(SceneKind), ["edgegrasp-plus"], folder)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_case_has_a_folder_of_its_own(name: str, tmp_path: Path) -> None:
+    names = [case.name for case in cases(name, tmp_path)]
+    assert len(set(names)) == len(names) > 1
+    assert all(len(each) < 100 and "/" not in each and " " not in each for each in names)
+
+
+def test_robustness_changes_one_thing_at_a_time(tmp_path: Path) -> None:
+    groups: dict[str, list[Case]] = {}
+    for case in cases("robustness", tmp_path):
+        groups.setdefault(case.group, []).append(case)
+    noise = [case.protocol.noise.point_std for case in groups["noise (mm)"]]
+    assert (min(noise), max(noise)) == (0.0, 0.003)
+    angles = groups["camera's polar angle (degrees)"]
+    polar = {case.protocol.camera.polar_degrees for case in angles}
+    assert {(15.0, 15.0), (75.0, 75.0)} <= polar
+    assert {c.planner["voxel_size"] for c in groups["voxel size (mm)"]} >= {0.003, 0.004, 0.006}
+    flipped = [case.planner["flipped_normals"] for case in groups["normals flipped (%)"]]
+    assert (min(flipped), max(flipped)) == (0.0, 0.5)
+    giga = load_protocol("giga")
+    plain, moved, full = (case.protocol for case in groups["view"][:3])
+    assert (plain, full) == (PAPER, giga)
+    assert (moved.camera, moved.noise) == (giga.camera, PAPER.noise)
+    for case in (*groups["noise (mm)"], *angles):
+        rules = case.protocol
+        changed = [part for part in ("scene", "round", "camera", "noise", "planning")
+                   if getattr(rules, part) != getattr(PAPER, part)]  # fmt: skip
+        assert len(changed) <= 1
+        assert rules.name != PAPER.name  # not to be taken for the paper's
+        assert set(case.planner) == {"model"}
+
+
+def test_samples_are_those_of_the_paper_s_table(tmp_path: Path) -> None:
+    numbers = {
+        case.value: (case.planner["num_approach_points"], case.planner["num_candidates"])
+        for case in cases("samples", tmp_path)
+    }
+    assert numbers == {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
+
+
+def test_families_are_what_they_are_called(tmp_path: Path) -> None:
+    with World() as world:
+        for name in FAMILIES:
+            objects = ObjectSet.from_folder(write_family(name, tmp_path / name), SceneKind.PACKED)
+            for model, shape in zip(objects.models, FAMILIES[name], strict=True):
+                item = load_object(world, model, (0, 0, 1), (0, 0, 0, 1), 1.0)
+                # The engine's boxes are up to 6 mm wider than what is in them.
+                np.testing.assert_allclose(
+                    np.ptp(item.body.bounds, axis=0), np.add(shape.size, 0.003), atol=0.0035
+                )
+                item.body.remove()
+    assert max(sorted(shape.size)[1] for shape in FAMILIES["thin"]) <= 0.014
+    assert max(shape.size[2] for shape in FAMILIES["flat"]) <= 0.014
+    assert min(min(shape.size) for shape in FAMILIES["large"]) >= 0.06
+    used = {case.objects for case in cases("families", tmp_path)}
+    assert used == {tmp_path / "objects" / name for name in FAMILIES}
+    assert all(case.protocol.scene.pile_scale == (1.0, 1.0) for case in cases("families", tmp_path))
+
+
+def rate(value: float | None) -> dict[str, object]:
+    interval = None if value is None else [max(0.0, value - 0.1), min(1.0, value + 0.1)]
+    return {"value": value, "wilson_95": interval}
+
+
+def result(group: str, value: object, scene: str, model: str, gsr: float | None) -> dict:
+    planner = {"name": "in-process", "model": model}
+    return {
+        "group": group, "value": value, "scene": scene, "planner": planner,
+        "grasp_success_rate": rate(gsr), "declutter_rate": rate(0.5),
+    }  # fmt: skip
+
+
+def test_tables_put_scenes_and_models_side_by_side() -> None:
+    results = {
+        "cases": [
+            result("noise (mm)", 0.0, "packed", "a", 0.9),
+            result("noise (mm)", 0.0, "pile", "a", 0.8),
+            result("noise (mm)", 0.5, "packed", "a", None),
+            result("noise (mm)", 0.0, "packed", "b", 1.0),
+            result("view", "giga", "packed", "a", 0.7),
+        ]
+    }
+    noise, view = experiment_table(results).split("\n\n")
+    lines = noise.splitlines()
+    assert lines[0].startswith("| noise (mm) | packed, a: GSR | DR | pile, a: GSR | DR | packed, b")
+    assert lines[2].startswith("| 0 | 90.0 [80.0, 100.0] | 50.0 [40.0, 60.0] | 80.0 [")
+    assert lines[3] == "| 0.5 | none | 50.0 [40.0, 60.0] |  |  |  |  |"
+    assert "| giga | 70.0 [60.0, 80.0] |" in view
+    figure = experiment_figure(results)
+    assert [axes.get_xlabel() for axes in figure.axes] == ["noise (mm)"] * 2 + ["view"] * 2
+    curves = [line for line in figure.axes[0].containers if line.get_label()]
+    assert [line.get_label() for line in curves] == ["packed, a", "pile, a", "packed, b"]
+
+
+def test_baselines_name_their_planner_in_the_rows() -> None:
+    rows = [
+        {**result("planner", name, "pile", "", 0.4), "planner": {"name": name}}
+        for name in ("edge-sample", "oracle")
+    ]
+    table = experiment_table({"cases": rows})
+    assert table.splitlines()[0] == "| planner | pile: GSR | DR |"
+    assert "| oracle | 40.0 [" in table
+    experiment_figure({"cases": rows})
+
+
+def test_published_figures_are_found_by_protocol_scene_and_samples() -> None:
+    methods = [row["method"] for row in published("edgegrasp", "packed", "64-4k")]
+    assert methods == ["EdgeGraspNet", "VN-EdgeGraspNet"]
+    assert published("giga", "packed") == []
