@@ -205,7 +205,15 @@ async def _serve_until_signalled(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    loop.add_signal_handler(signal.SIGHUP, server.reloader.reload_soon)
+    terminal = _at_a_terminal()
+
+    def hang_up() -> None:
+        if terminal and not _at_a_terminal():  # it was closed, with nobody left to stop this
+            stop.set()
+        else:
+            server.reloader.reload_soon()
+
+    loop.add_signal_handler(signal.SIGHUP, hang_up)
 
     def opened() -> None:
         logger.info("opened %s and gRPC %s, loading", server.http_url, server.grpc_address)
@@ -215,6 +223,10 @@ async def _serve_until_signalled(
         write_line(sys.stdout, line)
 
     await server.serve(stop, opened, ready)
+
+
+def _at_a_terminal() -> bool:
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 def warn_of_strangers(settings: Settings) -> None:
