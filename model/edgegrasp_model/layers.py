@@ -107,6 +107,6 @@ def maximum(values: Tensor, dim: int) -> Tensor:
     return values.max(dim).values if torch.is_grad_enabled() else values.amax(dim)
 
 
-def ball_maximum(values: Tensor, ball_sizes: Sequence[int]) -> Tensor:
+def ball_maximum(values: Tensor, ball_sizes: list[int]) -> Tensor:
     """Maximum of values (P, C) over the points of each ball, in order: (B, C)."""
     return torch.stack([maximum(ball, dim=0) for ball in torch.split(values, ball_sizes)])
