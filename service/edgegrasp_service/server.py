@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 METHODS = {*http_edge.METHODS.values(), *grpc_edge.METHODS.values()}
 
 NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
+KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
 
 
@@ -162,6 +163,7 @@ class Server:
             ws="none",
             server_header=False,
             proxy_headers=False,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=1,  # there was grace before
             ssl_context_factory=None if tls is None else lambda config, default: tls.http,
         )
