@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -42,7 +43,28 @@ def gather_rows(values: Tensor, index: Tensor) -> Tensor:
 
 def in_pieces(values: Tensor) -> tuple[Tensor, ...]:
     """Splits values (M, ...) so that the neighbours of a piece fit the cache: twice as fast."""
-    return torch.split(values, 512)
+    return torch.split(values, 256)
+
+
+class BallPiece(NamedTuple):
+    """The values of a few whole balls: p points in b balls."""
+
+    values: Tensor  # (p, ...)
+    ball_sizes: list[int]  # b of them
+    ball_of_point: Tensor  # (p,) int64, 0..b-1
+
+
+def ball_pieces(values: Tensor, batch: BallBatch) -> list[BallPiece]:
+    """Splits values (P, ...) of a batch's points into balls so few that an MLP stays in cache."""
+    sizes = batch.ball_sizes
+    together = len(sizes) if torch.is_grad_enabled() else 2  # training keeps all of it anyway
+    groups = [sizes[first : first + together] for first in range(0, len(sizes), together)]
+    ends = [sum(group) for group in groups]
+    values_of, ball_of = torch.split(values, ends), torch.split(batch.ball_of_point, ends)
+    return [
+        BallPiece(piece, group, ball - together * number)
+        for number, (piece, group, ball) in enumerate(zip(values_of, groups, ball_of, strict=True))
+    ]
 
 
 def maximum(values: Tensor, dim: int) -> Tensor:
@@ -51,6 +73,6 @@ def maximum(values: Tensor, dim: int) -> Tensor:
     return values.max(dim).values if torch.is_grad_enabled() else values.amax(dim)
 
 
-def ball_maximum(values: Tensor, batch: BallBatch) -> Tensor:
-    """Maximum of values (P, C) over the points of each ball: (num_balls, C)."""
-    return torch.stack([maximum(ball, dim=0) for ball in torch.split(values, batch.ball_sizes)])
+def ball_maximum(values: Tensor, ball_sizes: list[int]) -> Tensor:
+    """Maximum of values (P, C) over the points of each ball, in order: (B, C)."""
+    return torch.stack([maximum(ball, dim=0) for ball in torch.split(values, ball_sizes)])

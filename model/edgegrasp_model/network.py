@@ -15,6 +15,7 @@ from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.layers import (
     SharedLinear,
     ball_maximum,
+    ball_pieces,
     gather_rows,
     in_pieces,
     maximum,
@@ -43,7 +44,7 @@ class PointNetConv(nn.Module):
         u = F.linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
         pooled = []
         for neighbors, v_here in zip(in_pieces(batch.neighbors), in_pieces(v), strict=True):
-            hidden = (gather_rows(u, neighbors) - v_here.unsqueeze(1)).relu_()  # (p, k, width)
+            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
             pooled.append(maximum(F.linear(hidden, self.output.weight), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
         return torch.cat(pooled) + self.output.bias
@@ -60,9 +61,13 @@ class GlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
-        pooled = ball_maximum(self.mlp_1(local), batch)  # (B, 512)
-        joined = F.relu(self.join(local, pooled, batch.ball_of_point))  # (P, 1024)
-        return ball_maximum(self.mlp_2(joined), batch)
+        pieces = ball_pieces(local, batch)
+        pooled = [ball_maximum(self.mlp_1(piece.values), piece.ball_sizes) for piece in pieces]
+        features = []
+        for piece, ball in zip(pieces, pooled, strict=True):  # ball: (b, 512)
+            joined = self.join(piece.values, ball, piece.ball_of_point).relu_()  # (p, 1024)
+            features.append(ball_maximum(self.mlp_2(joined), piece.ball_sizes))
+        return torch.cat(features)
 
 
 class EdgeGraspNet(nn.Module):

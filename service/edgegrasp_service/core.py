@@ -2,9 +2,7 @@
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable, Coroutine, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -30,6 +28,7 @@ from edgegrasp_service.network_worker import LOST, NetworkWorker, out_of_memory
 from edgegrasp_service.observer import Observer
 from edgegrasp_service.sent_cloud import SentCloud, decode_cloud
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.stage_pools import StagePools
 
 logger = logging.getLogger(__name__)
 
@@ -93,14 +92,7 @@ class GraspService:
         self._admission = Admission(
             self.settings.max_concurrent_requests, self.settings.max_queue_length, self.observer
         )
-        # Decoding a large file should not delay another's cloud, nor ranking wait for either.
-        threads = self.settings.prepare_threads
-        self._pools = {
-            "decode": ThreadPoolExecutor(threads, thread_name_prefix="decode"),
-            "prepare": ThreadPoolExecutor(threads, thread_name_prefix="prepare"),
-            "finish": ThreadPoolExecutor(1, thread_name_prefix="finish"),
-        }
-        self._closed = False
+        self._pools = StagePools(self.settings.prepare_threads, self.observer)
         self._worker = NetworkWorker(BatchPolicy.from_settings(self.settings), self.observer)
 
     async def start(self) -> None:
@@ -151,9 +143,7 @@ class GraspService:
 
     def close(self) -> None:
         """Stop the threads once what they run now is done; what waits fails as not ready."""
-        self._closed = True
-        for pool in self._pools.values():
-            pool.shutdown(wait=False, cancel_futures=True)
+        self._pools.close()
         self._worker.close()
 
     def check_open(self) -> None:
@@ -187,13 +177,13 @@ class GraspService:
 
         async def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Detection:
             call = place.call
-            prepared = await self._stage(call, "prepare", detector.prepare, cloud, options)
+            prepared = await self._pools.run(call, "prepare", detector.prepare, cloud, options)
             logits, seconds = np.empty(0, np.float32), 0.0
             if prepared.batch is not None:
                 scored = self._worker.score(call, detector, prepared.batch)
                 logits, seconds = await asyncio.wrap_future(scored)
             prepared.seconds["network"] = seconds
-            return await self._stage(call, "finish", detector.finish, prepared, logits)
+            return await self._pools.run(call, "finish", detector.finish, prepared, logits)
 
         return await self._answer(request, place, work)
 
@@ -234,7 +224,7 @@ class GraspService:
         async def decode_and_work() -> Answer:
             self.observer.stage(call, "admission", call.seconds)
             try:
-                cloud, chosen = await self._stage(
+                cloud, chosen = await self._pools.run(
                     call,
                     "decode",
                     decode_cloud,
@@ -254,31 +244,6 @@ class GraspService:
         answer = await in_time(call, place.begin(decode_and_work))
         self.observer.answered(call, answer)
         return answer
-
-    async def _stage(
-        self, call: Call, name: str, work: Callable[..., Result], *args: object
-    ) -> Result:
-        """Do something in the pool of a stage, if the answer is still wanted then."""
-
-        def checked() -> Result:
-            call.check()
-            start = time.perf_counter()
-            try:
-                return work(*args)
-            except Exception:
-                raise
-            except BaseException:  # a SystemExit would end the event loop that waits for this
-                logger.exception("the stage %s was ended", name)
-                raise WorkerLost(LOST) from None
-            finally:
-                self.observer.stage(call, name, time.perf_counter() - start)
-
-        try:
-            return await asyncio.wrap_future(self._pools[name].submit(checked))
-        except (RuntimeError, asyncio.CancelledError):
-            if not self._closed:
-                raise
-            raise NotReady(STOPPING) from None
 
     def models(self) -> list[ModelInfo]:
         """The weights a request can name.

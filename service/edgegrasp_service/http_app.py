@@ -55,6 +55,9 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
     413: {"description": "Over the server's limits.", **PROBLEM},
     415: {"description": "A body the server does not read.", **PROBLEM},
     429: {"description": "The server is full; Retry-After says for how long.", **PROBLEM},
+    431: {"description": "Headers over the server's limits.", **PROBLEM},
+    500: {"description": "The server failed; its log says why.", **PROBLEM},
+    501: {"description": "The format's reader is not installed on the server.", **PROBLEM},
     503: {"description": "Weights are loading, or the server is stopping.", **PROBLEM},
     504: {"description": "The deadline passed before there was an answer.", **PROBLEM},
 }

@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 METHODS = {*http_edge.METHODS.values(), *grpc_edge.METHODS.values()}
 
 NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
+KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
 
 
@@ -162,6 +163,7 @@ class Server:
             ws="none",
             server_header=False,
             proxy_headers=False,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=1,  # there was grace before
             ssl_context_factory=None if tls is None else lambda config, default: tls.http,
         )
@@ -205,7 +207,15 @@ async def _serve_until_signalled(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    loop.add_signal_handler(signal.SIGHUP, server.reloader.reload_soon)
+    terminal = _at_a_terminal()
+
+    def hang_up() -> None:
+        if terminal and not _at_a_terminal():  # it was closed, with nobody left to stop this
+            stop.set()
+        else:
+            server.reloader.reload_soon()
+
+    loop.add_signal_handler(signal.SIGHUP, hang_up)
 
     def opened() -> None:
         logger.info("opened %s and gRPC %s, loading", server.http_url, server.grpc_address)
@@ -215,6 +225,10 @@ async def _serve_until_signalled(
         write_line(sys.stdout, line)
 
     await server.serve(stop, opened, ready)
+
+
+def _at_a_terminal() -> bool:
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 def warn_of_strangers(settings: Settings) -> None:

@@ -27,7 +27,8 @@ def test_the_page_names_every_setting() -> None:
 
 def test_variables_that_the_pages_name_exist() -> None:
     known = {f"EDGEGRASP_{name.upper()}" for name in Settings.model_fields}
-    for page in (*DOCS.glob("*.md"), DOCS.parent / "README.md"):
+    beside = [DOCS.parent / name for name in ("README.md", "Dockerfile", "docker/compose.yaml")]
+    for page in (*DOCS.glob("*.md"), *beside):
         named = set(re.findall(r"\bEDGEGRASP_[A-Z_]+", page.read_text()))
         assert named <= {*known, "EDGEGRASP_CONFIG", TOKEN_VARIABLE, "EDGEGRASP_"}, page.name
 

@@ -1,6 +1,11 @@
 """SIGTERM: what was accepted is answered, what comes later is told, and the end is clean."""
 
 import asyncio
+import os
+import pty
+import signal
+import subprocess
+import sys
 import threading
 from typing import Any
 
@@ -73,6 +78,39 @@ def test_sigterm_under_load(start_server, cloud: np.ndarray) -> None:
         *answers, last = load.outcomes
         assert set(answers) == {"answer"}, load.outcomes
         assert last in ("503", "UNAVAILABLE", "refused")
+
+
+SERVE_AT_A_TERMINAL = """
+import fcntl, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+from edgegrasp_cli.main import main
+main()
+"""
+
+
+def test_a_closed_terminal_stops_what_was_started_in_it() -> None:
+    terminal, inside = pty.openpty()
+    command = [sys.executable, "-c", SERVE_AT_A_TERMINAL, "serve", "--backend", "dummy"]
+    process = subprocess.Popen(
+        [*command, "--http-port", "0", "--grpc-port", "0"],
+        stdin=inside,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    os.close(inside)
+    try:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[3]
+        process.send_signal(signal.SIGHUP)  # with the terminal there: a reload
+        with httpx.Client(base_url=url) as http:
+            while 'reloads_total{outcome="succeeded"} 1.0' not in http.get("/metrics").text:
+                threading.Event().wait(0.05)
+        os.close(terminal)
+        assert process.wait(timeout=30) == 0
+    finally:
+        process.kill()
+        process.communicate()
 
 
 async def drained(server: Server, **_: Any) -> None:

@@ -8,11 +8,13 @@ import urllib.parse
 from collections.abc import Iterator
 
 import grpc
+import httpx
 import numpy as np
 import pytest
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
+from edgegrasp_service.server import KEEP_ALIVE_SECONDS
 
 PLACES = 2
 WAITING = 2
@@ -162,3 +164,10 @@ def test_half_open_connections_do_not_keep_a_server_from_stopping(
             next(call)
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
         requests.put(None)
+
+
+def test_idle_connections_are_closed_by_clients_first() -> None:
+    """Where the server is first, a request may be on its way and never be answered."""
+    expiry = httpx.Limits().keepalive_expiry
+    assert expiry is not None
+    assert expiry < KEEP_ALIVE_SECONDS / 2

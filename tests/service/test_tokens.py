@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edgegrasp_service import tokens
 from edgegrasp_service.errors import InvalidSettings, PermissionDenied, Unauthenticated
@@ -79,3 +81,9 @@ def test_bad_files_are_named(tmp_path: Path, text: str | bytes | None, sentence:
         load_tokens(Settings(token_file=path))
     assert sentence in str(caught.value)
     assert "short" not in str(caught.value)
+
+
+@given(st.text(st.characters(codec="latin-1")), st.booleans())
+def test_no_header_is_more_than_refused(header: str, admin: bool) -> None:
+    with pytest.raises((PermissionDenied, Unauthenticated)):
+        Tokens([USER], [ADMIN]).check(header, admin=admin)

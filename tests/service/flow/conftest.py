@@ -184,7 +184,8 @@ Serve = Callable[..., Awaitable[Running]]
 
 
 @pytest.fixture
-async def serve() -> AsyncIterator[Serve]:
+async def serve(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Serve]:
+    monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
     running: list[Running] = []
 
     async def start(seconds: float = 0.0, **given: Any) -> Running:
