@@ -9,7 +9,7 @@ INSTALLED := $(VENV)/.installed
 GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json proto/openapi.json
 
 .DEFAULT_GOAL := help
-.PHONY: help venv lint format test fuzz demo proto constraints clean
+.PHONY: help venv lint format test bench fuzz demo proto constraints clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -41,6 +41,9 @@ test: $(INSTALLED) ## run the tests
 
 fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
 	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz
+
+bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the README's table
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --readme README.md
 
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py

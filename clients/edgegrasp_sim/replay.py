@@ -10,6 +10,7 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import protocol_from
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
+from edgegrasp_sim.window import Window
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -54,6 +55,8 @@ class Replay:
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
         self.simulation = ClutterSimulation({self.scene: models}, gui=gui)
+        if gui:
+            Window(self.simulation.world)
 
     def __enter__(self) -> Self:
         return self

@@ -110,4 +110,7 @@ def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None
     assert "edge-sample" in refused("benchmark", "--planner", "guess")
     assert "cannot be loaded" in refused("benchmark", "--planner", "no_such:planner")
     assert "workers is 2" in refused("benchmark", "--gui", "--workers", 2)
+    assert "ray is 'local'" in refused("benchmark", "--gui", "--ray", "local")
+    assert "pass --server" in refused("benchmark", "--ray", "10.0.0.1:6379")
+    assert "no such file" in refused("benchmark", "--model", "absent.safetensors")
     assert "UNAVAILABLE" in refused("benchmark", "--server", "127.0.0.1:1")

@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores, manifest, run_benchmark
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
+from edgegrasp_sim.ray_cluster import RayRunner, _result
 from edgegrasp_sim.results import ResultFolder, attempts_digest
 from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trials import PlannerUnavailableError
@@ -26,14 +28,6 @@ TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
 
 # Called, it gives the planner; spawned workers can import it.
 make_planner = partial(partial, plan_top_down)
-
-
-def absent(observation: object, seed: int) -> None:
-    raise PlannerUnavailableError("away for good")
-
-
-def make_absent() -> object:
-    return absent
 
 
 DIES_ONCE = """
@@ -162,14 +156,29 @@ def test_a_ray_cluster_changes_nothing(alone: tuple[BenchmarkConfig, str]) -> No
     rounds = run_benchmark(config, make_planner, workers=2, ray="local")
     assert attempts_digest(rounds) == digest
 
+
+def test_errors_on_a_cluster_are_those_of_a_process_here() -> None:
+    ray = pytest.importorskip("ray", reason="the extra `ray` is not installed")
+    told = PlannerUnavailableError("away for good")
+
+    def failing(error: Exception) -> SimpleNamespace:
+        def get(_: object) -> None:
+            raise error
+
+        return SimpleNamespace(get=get, exceptions=ray.exceptions)
+
     with pytest.raises(PlannerUnavailableError, match="away for good"):
-        run_benchmark(replace(config, patience=0.0), make_absent, workers=2, ray="local")
+        _result(failing(ray.exceptions.RayTaskError("run", "traceback", told)), None)
+    with pytest.raises(RuntimeError, match="died again and again"):
+        _result(failing(ray.exceptions.ActorDiedError()), None)
 
 
 def test_a_missing_ray_or_cluster_is_told(
     alone: tuple[BenchmarkConfig, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, _ = alone
+    with pytest.raises(ValueError, match="differ between the machines"):
+        RayRunner(config, make_planner, "another digest")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(RuntimeError, match=r"ray is not .*edgegrasp\[ray\]"):
         run_benchmark(config, make_planner, ray="local")

@@ -1,0 +1,50 @@
+"""The README's table of speed, written from the results."""
+
+from pathlib import Path
+from typing import Any
+
+BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"
+
+
+def write_table(readme: Path, results: dict[str, Any]) -> None:
+    """Put the table between the markers.
+
+    Raises:
+        ValueError: The file does not hold both markers.
+    """
+    text = readme.read_text()
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(f"{readme} holds no {BEGIN} … {END}")
+    readme.write_text(f"{before}{BEGIN}\n{table(results)}\n{END}{after}")
+
+
+def table(results: dict[str, Any]) -> str:
+    """The table and what it was measured on."""
+    rows = ["| | ours | textbook | times faster |", "| --- | --- | --- | --- |"]
+    for name, paper in results["paper"].items():
+        for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
+            measured = paper[part]
+            ours, textbook = measured["seconds"]["ours"], measured["seconds"]["textbook"]
+            faster = measured["times_faster"]
+            rows.append(f"| {name}, {words} | {ours:.2f} s | {textbook:.2f} s | {faster:.1f} |")
+    for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
+        small = results["small"][part]["seconds"]["small"]
+        rows.append(f"| `edgegrasp-small`, {words} | {small:.2f} s | | |")
+    machine, server = results["machine"], results["server"]
+    labels = {kind: round(of["labels_per_second"]) for kind, of in results["simulator"].items()}
+    return "\n".join(
+        [
+            *rows,
+            "",
+            f"Processor seconds on one thread of an {machine['processor']} with "
+            f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), medians of "
+            f"{results['small']['network']['rounds']} interleaved runs: a cloud of "
+            f"{results['cloud_points']:,} points, 32 approach points, 2,000 candidates. "
+            f"The server is ready after {server['ready_seconds']:.1f} s and takes "
+            f"{server['rest_mb']:.0f} MB at rest, {server['peak_mb']:.0f} MB at most in ten "
+            f"requests. The simulator labels {labels['packed']} grasps a second and core in packed "
+            f"scenes, {labels['pile']} in piles.",
+        ]
+    )

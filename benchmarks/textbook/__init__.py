@@ -1,0 +1,1 @@
+"""A straightforward implementation of the paper, to measure ours beside: formulas as printed."""
