@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import CHUNK, HandView, Reach, reach_of
+from edgegrasp_model.hand_view import CHUNK, HandView, Reach, reach_of, within_box
 from edgegrasp_model.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene import Scene
@@ -60,8 +60,9 @@ def meets_cloud(
     position = view.position
     hit = np.zeros(len(position), dtype=bool)
     boxes = _grown_boxes(gripper, request)
+    columns = np.ascontiguousarray(position.T)  # (3, P): a row at a time is many times faster
     for low, high in _lengthened(boxes, request):
-        hit |= ((position > low) & (position < high)).all(axis=1)
+        hit |= within_box(columns, low, high)
     result = np.zeros(view.num_candidates, dtype=bool)
     result[view.candidate[hit]] = True
     if request.retreat_direction == "up" and request.retreat_length > 0:

@@ -66,7 +66,7 @@ class HandView:
         if reach == self.reach:
             return self
         low, high = np.asarray(reach, dtype=np.float32)
-        kept = ((self.position > low) & (self.position < high)).all(axis=1)
+        kept = within_box(np.ascontiguousarray(self.position.T), low, high)
         return HandView(
             self.candidate[kept],
             self.row[kept],
@@ -74,6 +74,18 @@ class HandView:
             self.num_candidates,
             reach,
         )
+
+
+def within_box(
+    columns: Float32, low: NDArray[np.floating], high: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """Which points, given as rows x, y, z (3, P), lie between two corners (3,)."""
+    inside: NDArray[np.bool_] = columns[0] > low[0]
+    inside &= columns[0] < high[0]
+    for axis in (1, 2):
+        inside &= columns[axis] > low[axis]
+        inside &= columns[axis] < high[axis]
+    return inside
 
 
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
