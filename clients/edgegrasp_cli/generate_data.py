@@ -1,5 +1,6 @@
 """`edgegrasp generate-data`."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,9 @@ def generate_data(
     """
     from rich.progress import track
 
+    from edgegrasp_training.data_card import write_data_card
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+    from edgegrasp_training.views import find_views
 
     options = GenerationOptions(
         scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights
@@ -42,5 +45,7 @@ def generate_data(
             tried, held = tried + grasps, held + successes
     except FileNotFoundError as error:
         sys.exit(f"edgegrasp generate-data: {error}")
+    command = shlex.join(["edgegrasp", *sys.argv[1:]])
+    write_data_card(output, find_views([output]), command)
     share = f", {100 * held / tried:.1f} % held" if tried else ""
     print(f"{missing} scenes made, {scenes - missing} kept; {tried} grasps tried{share}.")

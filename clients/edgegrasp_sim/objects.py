@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -35,6 +36,13 @@ class ObjectModel:
     name: str
     urdf: Path
     scale: float = 1.0
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its description and of the meshes beside it, in hex."""
+        files = sorted(self.urdf.parent.glob(f"{self.urdf.stem}*"))
+        contents = [hashlib.sha256(file.read_bytes()).digest() for file in files if file.is_file()]
+        return hashlib.sha256(b"".join(contents)).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,6 +152,11 @@ class ClutterSimulation:
         return [item.model.name for item in self._objects]
 
     @property
+    def object_models(self) -> list[ObjectModel]:
+        """What the objects that are left were made from."""
+        return [item.model for item in self._objects]
+
+    @property
     def object_bodies(self) -> list[Body]:
         """Bodies of the objects that are left, to paint or to measure."""
         return [item.body for item in self._objects]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -117,6 +117,12 @@ def generate_scene(
                 noise_std=options.noise_std,
             )
             view = _label(simulation, observation, options, streams[CHOICE_STREAM])
+            models = simulation.object_models
+            view = replace(
+                view,
+                objects=tuple(model.name for model in models),
+                object_digests=tuple(model.digest for model in models),
+            )
             view.save(view_path(folder, index, view_number, options.seed))
             tried += len(view.tried())
             held += int((view.success == 1).sum())

@@ -18,6 +18,7 @@ class Evaluation:
     loss: float  # cross entropy, nats
     accuracy: float
     auroc: float
+    average_precision: float
     temperature: float  # that calibrates the logits
     logit: NDArray[np.float32]  # (E,)
     label: NDArray[np.float32]  # (E,)
@@ -29,6 +30,7 @@ def evaluate_scores(logit: NDArray[np.float32], label: NDArray[np.float32]) -> E
         cross_entropy(logit, label),
         accuracy(logit, label),
         auroc(logit, label),
+        average_precision(logit, label),
         fit_temperature(logit, label),
         logit,
         label,
@@ -54,6 +56,19 @@ def auroc(logit: FloatArray, label: FloatArray) -> float:
     ranks = rankdata(logit)
     excess = ranks[positive].sum() - successes * (successes + 1) / 2
     return float(excess / (successes * failures))
+
+
+def average_precision(logit: FloatArray, label: FloatArray) -> float:
+    """Mean, over the successes, of the share of successes among what scores no less; ties together.
+
+    nan where nothing succeeded.
+    """
+    threshold, place = np.unique(-logit, return_inverse=True)  # best first
+    taken = np.cumsum(np.bincount(place, minlength=len(threshold)))
+    held = np.bincount(place, weights=label, minlength=len(threshold))
+    if held.sum() == 0:
+        return float("nan")
+    return float((held * np.cumsum(held) / taken).sum() / held.sum())
 
 
 def fit_temperature(logit: FloatArray, label: FloatArray) -> float:

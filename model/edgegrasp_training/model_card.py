@@ -1,5 +1,6 @@
 """The model card: where weights come from and how well they did on views they never saw."""
 
+import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,15 @@ from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_training.metrics import Evaluation, reliability
 
+CURVE_ROWS = 20
+
 
 def write_model_card(
     path: Path,
     metadata: CheckpointMetadata,
     training: Mapping[str, Any],
     evaluation: Evaluation,
+    log: Path,
     command: str,
 ) -> None:
     """Write a card in Markdown.
@@ -24,6 +28,7 @@ def write_model_card(
         metadata: Of the trained network.
         training: Provenance: views, labels, steps, seconds and the like.
         evaluation: On the validation views, before calibration.
+        log: CSV file of the evaluations on the way.
         command: That trained it.
     """
     network = metadata.network
@@ -38,6 +43,7 @@ def write_model_card(
         ("validation loss", f"{evaluation.loss:.4f} nats"),
         ("validation accuracy", f"{100 * evaluation.accuracy:.1f} %"),
         ("validation AUROC", f"{evaluation.auroc:.4f}"),
+        ("validation average precision", f"{evaluation.average_precision:.4f}"),
         ("temperature", f"{metadata.temperature:.3f}"),
     ]
     lines = [f"# {metadata.name}", "", "| | |", "| --- | --- |"]
@@ -50,7 +56,18 @@ def write_model_card(
         f"| {predicted:.3f} | {observed:.3f} | {count} |"
         for predicted, observed, count in reliability(calibrated, evaluation.label)
     ]
+    lines += ["", "On the way:", "", *_curve(log)]
     path.write_text("\n".join(lines) + "\n")
+
+
+def _curve(log: Path) -> list[str]:
+    """Some twenty rows of the log as a table, the last among them."""
+    with log.open(newline="") as file:
+        rows = list(csv.reader(file))
+    head, body = [name.replace("_", " ") for name in rows[0]], rows[1:]
+    every = max(1, len(body) // CURVE_ROWS)
+    some = body[(len(body) - 1) % every :: every]
+    return [f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *some]]
 
 
 def _layers(network: NetworkConfig) -> list[tuple[str, object]]:

@@ -150,7 +150,7 @@ class Trainer:
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         save_checkpoint(path, self.average, metadata)
         card = self.folder / f"{self.metadata.name}.md"
-        write_model_card(card, metadata, training, evaluation, command)
+        write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
 
     def _train_step(self) -> float:

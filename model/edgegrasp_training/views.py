@@ -25,6 +25,8 @@ class LabelledView:
     T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: those of the paper's definition
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
+    objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
+    object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
@@ -40,6 +42,9 @@ class LabelledView:
             arrays["T_world_hand"] = self.T_world_hand
         if self.firm is not None:
             arrays["firm"] = self.firm
+        if self.objects:
+            arrays["objects"] = np.array(self.objects)
+            arrays["object_digests"] = np.array(self.object_digests)
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
@@ -62,7 +67,13 @@ def load_view(path: Path) -> LabelledView:
             T_world_hand=arrays.get("T_world_hand"),
             success=arrays["success"].astype(np.int8),
             firm=arrays.get("firm"),
+            objects=_texts(arrays.get("objects")),
+            object_digests=_texts(arrays.get("object_digests")),
         )
+
+
+def _texts(array: NDArray[np.str_] | None) -> tuple[str, ...]:
+    return () if array is None else tuple(str(text) for text in array)
 
 
 def find_views(folders: list[Path]) -> list[Path]:
