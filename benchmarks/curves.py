@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.timing import RUNS, interleaved
+from benchmarks.timing import interleaved
 
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.detector import GraspDetector
@@ -20,6 +20,7 @@ APPROACH_POINTS = (8, 16, 32, 64, 128, 256)
 CANDIDATES = (500, 1_000, 2_000, 4_000, 8_000, 16_000)
 BATCHES = (1, 2, 4, 8)
 THREADS = (1, 2)
+RUNS = 3
 
 
 def measure_curves(detector: GraspDetector, observation: Observation) -> dict[str, Any]:

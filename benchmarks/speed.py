@@ -67,12 +67,14 @@ def main() -> None:
         results["paper"][name] = beside_textbook(config, observation)
         print(name, results["paper"][name], flush=True)
     given.output.mkdir(parents=True, exist_ok=True)
+    path = given.output / "speed.json"
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    if given.readme is not None:
+        write_table(given.readme, results)
     if not given.without_curves:
         results["curves"] = measure_curves(detector(EDGEGRASP_SMALL), observation)
         draw(results["curves"], given.output / "scaling.png")
-    (given.output / "speed.json").write_text(json.dumps(results, indent=1) + "\n")
-    if given.readme is not None:
-        write_table(given.readme, results)
+        path.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def observe() -> Observation:
