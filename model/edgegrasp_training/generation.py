@@ -19,6 +19,7 @@ from edgegrasp_model.preparation import Sample, sample_candidates
 from edgegrasp_model.scene import Scene, build_scene
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
 from edgegrasp_training.views import LabelledView
 
@@ -27,6 +28,8 @@ VOXEL_SIZE = 0.0045  # metres
 SAMPLED_RADIUS = 0.04  # metres; balls that candidates are drawn from
 APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
+OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects: shapes of every sort
+WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
 BEST_SHARE = 0.1  # of the candidates, by score: what a network would have executed
 UNSURE = 0.1, 0.8  # scores that leave the outcome open
 
@@ -103,12 +106,13 @@ def generate_scene(
 ) -> tuple[int, int]:
     """Generate all views of one scene; how many grasps were tried and how many held."""
     kind = SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE
-    sets = None if objects is None else {kind: ObjectSet.from_folder(objects, kind, "train")}
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(4)]
+    source, scales = _variety(kind, streams[SCENE_STREAM])
+    sets = None if objects is None else {kind: ObjectSet.from_folder(objects, source, "train")}
     tried = held = 0
     with ClutterSimulation(sets) as simulation:
         count = 1 + int(streams[SCENE_STREAM].poisson(MEAN_FURTHER_OBJECTS))
-        simulation.reset(kind, streams[SCENE_STREAM], count)
+        simulation.reset(kind, streams[SCENE_STREAM], count, scales)
         for view_number in range(options.views_per_scene):
             observation = simulation.observe(
                 streams[CAMERA_STREAM],
@@ -127,6 +131,15 @@ def generate_scene(
             tried += len(view.tried())
             held += int((view.success == 1).sum())
     return tried, held
+
+
+def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:
+    """Whose objects a scene is made of, and the range of their scales."""
+    source = kind
+    if rng.random() < OTHER_OBJECTS:
+        source = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
+    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
+    return source, (low * WIDER_SCALES[0], high * WIDER_SCALES[1])
 
 
 def _request(observation: Observation, seed: int) -> DetectOptions:
