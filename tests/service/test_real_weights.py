@@ -121,7 +121,7 @@ MANY: dict[str, Any] = {
         "retreat_direction": "up",
         "obstacles": [{"kind": "box", "min": [0.15, -0.2, 0.0], "max": [0.2, 0.2, 0.2]}],
     },
-    "min_score": 0.01,
+    "min_score": 1e-6,
     "top_k": 12,
     "suppression": {"translation": 0.005, "rotation": 0.2},
     "order": "clearance",
