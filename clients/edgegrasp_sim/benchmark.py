@@ -210,7 +210,7 @@ def objects_digest(objects: ObjectSet) -> str:
     digest = hashlib.sha256()
     for model in objects.models:
         digest.update(f"{model.name} {model.scale}".encode())
-        for file in sorted(model.urdf.parent.glob(f"{model.urdf.stem}*")):
+        for file in model.files:
             digest.update(file.read_bytes())
     return digest.hexdigest()
 

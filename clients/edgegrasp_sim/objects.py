@@ -38,10 +38,15 @@ class ObjectModel:
     scale: float = 1.0
 
     @property
+    def files(self) -> list[Path]:
+        """Its description and the meshes beside it, sorted by name."""
+        found = sorted(self.urdf.parent.glob(f"{self.urdf.stem}*"))
+        return [path for path in found if path.is_file()]
+
+    @property
     def digest(self) -> str:
-        """SHA-256 of its description and of the meshes beside it, in hex."""
-        files = sorted(self.urdf.parent.glob(f"{self.urdf.stem}*"))
-        contents = [hashlib.sha256(file.read_bytes()).digest() for file in files if file.is_file()]
+        """SHA-256 of its files, in hex."""
+        contents = [hashlib.sha256(file.read_bytes()).digest() for file in self.files]
         return hashlib.sha256(b"".join(contents)).hexdigest()
 
 
