@@ -142,10 +142,11 @@ class Held(DummyCatalogue):
         return Waiting()
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
-async def test_while_draining_both_transports_say_so(transport: str, cloud: np.ndarray) -> None:
-    catalogue = Held()
-    settings = load_settings(backend="dummy", http_port=0, grpc_port=0, grace_seconds=20.0)
+async def holding(
+    catalogue: Held, grace_seconds: float
+) -> tuple[Server, asyncio.Event, "asyncio.Task[None]"]:
+    """A server that is ready and holds up requests, what stops it, and its end."""
+    settings = load_settings(backend="dummy", http_port=0, grpc_port=0, grace_seconds=grace_seconds)
     server = Server(settings, GraspService(lambda: catalogue, settings))
     ready, stop = asyncio.Event(), asyncio.Event()
     catalogue.may_go_on.set()
@@ -153,6 +154,13 @@ async def test_while_draining_both_transports_say_so(transport: str, cloud: np.n
     await ready.wait()
     catalogue.accepted.clear()
     catalogue.may_go_on.clear()
+    return server, stop, serving
+
+
+@pytest.mark.parametrize("transport", ["grpc", "rest"])
+async def test_while_draining_both_transports_say_so(transport: str, cloud: np.ndarray) -> None:
+    catalogue = Held()
+    server, stop, serving = await holding(catalogue, grace_seconds=20.0)
     async with (
         httpx.AsyncClient(base_url=server.http_url, timeout=20) as http,
         aio.insecure_channel(server.grpc_address) as channel,
@@ -214,14 +222,7 @@ async def test_a_watcher_sees_a_server_become_ready() -> None:
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
 async def test_when_grace_is_over_callers_are_told(transport: str, cloud: np.ndarray) -> None:
     catalogue = Held()
-    settings = load_settings(backend="dummy", http_port=0, grpc_port=0, grace_seconds=0.5)
-    server = Server(settings, GraspService(lambda: catalogue, settings))
-    ready, stop = asyncio.Event(), asyncio.Event()
-    catalogue.may_go_on.set()
-    serving = asyncio.create_task(server.serve(stop, ready=ready.set))
-    await ready.wait()
-    catalogue.accepted.clear()
-    catalogue.may_go_on.clear()
+    server, stop, serving = await holding(catalogue, grace_seconds=0.5)
     async with (
         httpx.AsyncClient(base_url=server.http_url, timeout=20) as http,
         aio.insecure_channel(server.grpc_address) as channel,
