@@ -32,6 +32,9 @@ OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects: sha
 WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
 BEST_SHARE = 0.1  # of the candidates, by score: what a network would have executed
 UNSURE = 0.1, 0.8  # scores that leave the outcome open
+SURE = 0.99  # score of a best grasp above which a view has little to teach
+CLEARED_SHARE = 0.6  # of the scenes, rid first of the objects that a network is sure of
+EASY_SHARE = 0.4  # of the grasps that are tried in a view whose best grasp is sure
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,8 @@ def generate_scene(
     with ClutterSimulation(sets) as simulation:
         count = 1 + int(streams[SCENE_STREAM].poisson(MEAN_FURTHER_OBJECTS))
         simulation.reset(kind, streams[SCENE_STREAM], count, scales)
+        if options.weights is not None and streams[SCENE_STREAM].random() < CLEARED_SHARE:
+            _clear_easy(simulation, _detector(options.weights), options.noise_std, streams)
         for view_number in range(options.views_per_scene):
             observation = simulation.observe(
                 streams[CAMERA_STREAM],
@@ -131,6 +136,29 @@ def generate_scene(
             tried += len(view.tried())
             held += int((view.success == 1).sum())
     return tried, held
+
+
+def _clear_easy(
+    simulation: ClutterSimulation,
+    guide: GraspDetector,
+    noise_std: float,
+    streams: list[np.random.Generator],
+) -> None:
+    """Execute grasps while the network is sure of them: what is left is what it finds hard."""
+    for _ in range(simulation.num_objects - 1):
+        observation = simulation.observe(
+            streams[CAMERA_STREAM],
+            streams[NOISE_STREAM],
+            views=TRAINING_VIEWS,
+            noise_std=noise_std,
+        )
+        if len(observation.cloud) == 0 or simulation.num_objects <= 1:
+            return
+        seed = int(streams[CHOICE_STREAM].integers(2**32))
+        grasps = guide.detect(observation.cloud, _request(observation, seed)).grasps
+        if not grasps or grasps[0].score < SURE:
+            return
+        simulation.execute_grasp(grasps[0].T_cloud_hand)
 
 
 def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:
@@ -213,20 +241,24 @@ def _chosen(
     """Ascending rows of the candidates to try.
 
     Some that a network would execute, as many whose outcome it leaves open, and the rest at
-    random: mostly hands that are free of collision.
+    random: mostly hands that are free of collision. Fewer where the best one is sure to hold.
     """
     left = np.ones(len(sample.candidates), dtype=bool)
-    guided = 0
+    total, guided = options.grasps_per_view, 0
     if logit is not None:
-        each = round(options.guided_share * options.grasps_per_view / 2)
-        free = np.flatnonzero(sample.collision_free)
-        best = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
-        left[rng.permutation(best)[:each]] = False
         score = 1.0 / (1.0 + np.exp(-logit))
+        free = np.flatnonzero(sample.collision_free)
+        ranked = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
+        if len(ranked) > 0 and score[ranked[0]] >= SURE:
+            total = round(EASY_SHARE * total)
+        each = round(options.guided_share * total / 2)
+        first, others = ranked[: each // 2], ranked[each // 2 :]
+        left[first] = False
+        left[rng.permutation(others)[: each - len(first)]] = False
         unsure = np.flatnonzero(left & (score > UNSURE[0]) & (score < UNSURE[1]))
         left[rng.permutation(unsure)[:each]] = False
         guided = int((~left).sum())
-    count = options.grasps_per_view - guided
+    count = total - guided
     free = rng.permutation(np.flatnonzero(left & sample.collision_free))
     hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
     free = free[: max(round(options.free_share * count), count - len(hit))]
