@@ -20,7 +20,8 @@ from edgegrasp_cli.detection_output import as_json, print_table
 
 Option = typer.Option
 NOT_OPTIONS = (
-    *("file", "server", "timeout", *FLAGS, "weights", "grippers", "as_document", "options"),
+    *("file", "server", "timeout", *FLAGS, "weights", "grippers", "device"),
+    *("as_document", "options"),
 )
 
 
@@ -41,6 +42,9 @@ def detect(
     grippers: Annotated[
         list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
     ] = None,
+    device: Annotated[
+        str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")
+    ] = "cpu",
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options: Annotated[
         Path | None, Option(help="JSON file with options; those given beside it win.")
@@ -96,7 +100,7 @@ def detect(
     if server:
         detection = _by_server(server, file, connection, fields)
     else:
-        detection = _in_this_process(file, weights or [], grippers or [], fields)
+        detection = _in_this_process(file, weights or [], grippers or [], device, fields)
     if as_document:
         print(json.dumps(as_json(detection)))
     else:
@@ -130,7 +134,7 @@ def _by_server(
 
 
 def _in_this_process(
-    file: Path, weights: list[Path], grippers: list[Path], options: dict[str, Any]
+    file: Path, weights: list[Path], grippers: list[Path], device: str, options: dict[str, Any]
 ) -> Any:
     from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.options import parse_options
@@ -142,8 +146,9 @@ def _in_this_process(
         cloud = decode_file(file.suffix[1:].lower(), data, max_points=sys.maxsize)
 
         from edgegrasp_model.catalogue import ModelCatalogue  # after what fails fast
+        from edgegrasp_model.on_device.choice import choose_device
 
-        catalogue = ModelCatalogue.load(weights, grippers=grippers)
+        catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
         return catalogue.get(parsed.model).detect(cloud, parsed)
     except (EdgeGraspError, OSError) as error:
         sys.exit(f"edgegrasp detect: {error}")

@@ -38,7 +38,9 @@ def models(
     from rich.table import Table
 
     connection = (timeout, token_file, tls, tls_ca, tls_certificate, tls_key)
-    table = Table("model", "architecture", "parameters", "crop radius (m)", "gripper", "digest")
+    table = Table(
+        "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
+    )
     for row in _of_server(server, connection) if server else _of_this_process(weights or []):
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
@@ -46,6 +48,7 @@ def models(
             f"{row.parameters:,}",
             f"{row.crop_radius:g}",
             row.gripper,
+            row.device,
             row.digest[:12],
         )
     Console().print(table)

@@ -82,3 +82,4 @@ class Model:
     gripper: str
     default: bool  # whether a request that names no model gets these
     hand_description: bool  # whether the network also sees the hand-frame description
+    device: str = ""  # where it computes: "cpu", or a GPU such as "cuda:0"

@@ -97,6 +97,7 @@ class ModelCatalogue:
                 "voxel_size": detector.metadata.voxel_size,
                 "gripper": detector.metadata.gripper,
                 "hand_description": detector.metadata.network.architecture == "hand",
+                "device": str(detector.device),
             }
             for name, detector in sorted(self._detectors.items())
         ]

@@ -5,6 +5,7 @@ EdgeGraspError
   + UnknownModel          no weights of that name are loaded
   + InvalidCheckpoint     a weights file cannot be used
   + InvalidGripper        a gripper file cannot be used
+  + InvalidDevice         the device to compute on is not there
 """
 
 import reprlib
@@ -77,3 +78,15 @@ class InvalidCheckpoint(EdgeGraspError):  # noqa: N818
 
 class InvalidGripper(EdgeGraspError):  # noqa: N818
     """A gripper file cannot be used."""
+
+
+class InvalidDevice(EdgeGraspError):  # noqa: N818
+    """The device to compute on is not there.
+
+    Args:
+        name: What was asked for.
+        fix: What to ask for instead, as an imperative sentence.
+    """
+
+    def __init__(self, name: str, fix: str) -> None:
+        super().__init__(f"device: got {brief(name)}. {fix}")

@@ -83,7 +83,7 @@ def load_backend(settings: Settings) -> Catalogue:
     """Load what `settings.backend` names; takes seconds for weights.
 
     Raises:
-        EdgeGraspError: Weights cannot be used.
+        EdgeGraspError: Weights cannot be used, or the device is not there.
     """
     if settings.backend == "dummy":
         from edgegrasp_service.dummy import DummyCatalogue
@@ -91,7 +91,11 @@ def load_backend(settings: Settings) -> Catalogue:
         return DummyCatalogue(settings.dummy_seconds)
     # Torch takes seconds to import, and the ports should answer meanwhile.
     from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.on_device.choice import choose_device
 
     return ModelCatalogue.load(
-        settings.weights, default=settings.default_model, grippers=settings.grippers
+        settings.weights,
+        settings.default_model,
+        choose_device(settings.device),
+        settings.grippers,
     )

@@ -64,6 +64,7 @@ class ModelInfo:
     gripper: str = ""
     default: bool = False
     hand_description: bool = False
+    device: str = ""
 
 
 class GraspService:

@@ -182,7 +182,8 @@ class DummyCatalogue:
 
     def describe(self) -> Sequence[Mapping[str, Any]]:
         """The facts of the dummy."""
-        return [{"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}]
+        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
+        return [facts | {"device": "cpu"}]
 
     def warm_up(self) -> None:
         """There is nothing to warm up."""

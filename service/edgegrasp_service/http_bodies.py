@@ -97,6 +97,7 @@ class ModelBody(_Body):
     hand_description: bool = Field(
         description="whether the network sees the hand-frame description"
     )
+    device: str = Field(description='where it computes: "cpu", or a GPU such as "cuda:0"')
 
 
 class ModelsBody(_Body):

@@ -132,12 +132,13 @@ class _ModelCollector(Collector):
         self._models = models
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        labels = ("name", "digest", "architecture", "default")
+        labels = ("name", "digest", "architecture", "default", "device")
         family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
         models: Sequence[ModelInfo] = ()
         with contextlib.suppress(NotReady):  # still loading, or stopping
             models = self._models()
         for model in models:
-            facts = (model.name, model.digest, model.architecture, str(model.default).lower())
+            default = str(model.default).lower()
+            facts = (model.name, model.digest, model.architecture, default, model.device)
             family.add_metric(facts, 1.0)
         yield family

@@ -53,6 +53,11 @@ class Settings(BaseSettings):
         default=(), description="gripper files (.toml), named by their stem in requests"
     )
     default_model: str = Field(default="", description="weights used when a request names none")
+    device: str = Field(
+        default="cpu",
+        pattern=r"^(auto|cpu|cuda(:\d+)?)$",
+        description="where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu",
+    )
     max_body_bytes: int = Field(
         default=32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
     )

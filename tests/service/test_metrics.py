@@ -77,8 +77,8 @@ async def test_requests_are_counted_on_both_transports(serving, cloud: np.ndarra
     assert found["edgegrasp_requests_active", ()] == 0.0
     assert found["edgegrasp_ready", ()] == 1.0
     info = [dict(labels) for name, labels in found if name == "edgegrasp_model_info"]
-    assert [(one["name"], one["default"], "digest" in one) for one in info] == [
-        ("dummy", "true", True)
+    assert [(one["name"], one["default"], "digest" in one, one["device"]) for one in info] == [
+        ("dummy", "true", True, "cpu")
     ]
 
 

@@ -106,7 +106,10 @@ async def test_a_reload_changes_the_digest(serving, service, transport: str) -> 
         assert await digest(server) == "2"
         page, _ = server.metrics.page("")
         assert b'edgegrasp_reloads_total{outcome="succeeded"} 1.0' in page
-        assert b'edgegrasp_model_info{architecture="dummy",default="true",digest="2"' in page
+        assert (
+            b'edgegrasp_model_info{architecture="dummy",default="true",device="cpu",digest="2"'
+            in page
+        )
         assert b'digest="1"' not in page
 
 

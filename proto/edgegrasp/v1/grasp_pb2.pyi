@@ -1936,6 +1936,7 @@ class Model(_message.Message):
     GRIPPER_FIELD_NUMBER: _builtins.int
     DEFAULT_FIELD_NUMBER: _builtins.int
     HAND_DESCRIPTION_FIELD_NUMBER: _builtins.int
+    DEVICE_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     """What options.model takes."""
     architecture: _builtins.str
@@ -1954,6 +1955,8 @@ class Model(_message.Message):
     """Whether an empty options.model means these weights."""
     hand_description: _builtins.bool
     """Whether the network also sees the hand-frame description of each candidate."""
+    device: _builtins.str
+    """Where it computes: "cpu", or a GPU such as "cuda:0"."""
     def __init__(
         self,
         *,
@@ -1966,10 +1969,11 @@ class Model(_message.Message):
         gripper: _builtins.str = ...,
         default: _builtins.bool = ...,
         hand_description: _builtins.bool = ...,
+        device: _builtins.str = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["architecture", b"architecture", "crop_radius", b"crop_radius", "default", b"default", "digest", b"digest", "gripper", b"gripper", "hand_description", b"hand_description", "name", b"name", "parameters", b"parameters", "voxel_size", b"voxel_size"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["architecture", b"architecture", "crop_radius", b"crop_radius", "default", b"default", "device", b"device", "digest", b"digest", "gripper", b"gripper", "hand_description", b"hand_description", "name", b"name", "parameters", b"parameters", "voxel_size", b"voxel_size"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
