@@ -19,6 +19,7 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
         "scene": run["scene"],
         "protocol": {name: run["protocol"][name] for name in ("name", "version")},
         "planner": run["planner"],
+        "caution": run["caution"],
         "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
         "rounds": manifest["rounds"],
         "seeds": manifest["seeds"],
