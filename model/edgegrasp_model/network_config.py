@@ -104,10 +104,11 @@ VN_EDGEGRASP = NetworkConfig(
     classifier_widths=(256, 128, 64),
 )
 
-# An eighth of the paper's network (0.39 M parameters), for machines without a GPU.
+# A ninth of the paper's network (0.33 M parameters), for machines without a GPU. The third
+# convolution is narrower too: at 128 channels it alone takes half of what is left to compute.
 EDGEGRASP_SMALL = NetworkConfig(
     architecture="edgegrasp",
-    conv_widths=(32, 64, 128),
+    conv_widths=(32, 64, 64),
     global_widths_1=(128, 128, 128),
     global_widths_2=(256, 256),
     classifier_widths=(256, 128),
