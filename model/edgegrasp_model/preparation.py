@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.ball_batch import BallCrop, crop_balls
 from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
-from edgegrasp_model.collision import UP, collides, collision_reach
+from edgegrasp_model.collision import UP, collides
 from edgegrasp_model.directions import allowed_ways
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import HandView, hand_views
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.sampling import sample_approach_points
@@ -85,9 +85,7 @@ def sample_candidates(
         row = passed[_subset(len(passed), limit, rng_candidates)]
         this.outcome[passed] = CODE[Outcome.NOT_CHECKED]
         candidates = this.candidates.take(row)
-        reach = collision_reach(gripper, options.collision)
-        view = hand_views(scene.cloud, candidates.T_cloud_hand, reach)
-        free = ~collides(scene, view, candidates.T_cloud_hand, gripper, options.collision)
+        free = ~collides(scene, candidates.T_cloud_hand, gripper, options.collision)
         ignored = options.collision.mode == "ignore"
         this.outcome[row] = CODE[Outcome.NOT_SCORED]
         if not ignored:
@@ -102,11 +100,12 @@ def sample_candidates(
     scored = _preferred(free, options, rng_candidates)
     this.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
+    candidates = candidates.take(scored)
     return Sample(
         approach_index,
         crop,
-        candidates.take(scored),
-        view.take(scored),
+        candidates,
+        hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
         free[scored],
         rounds,
         row[scored],
