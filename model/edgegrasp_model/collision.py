@@ -49,13 +49,13 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
 def collision_reach(gripper: Gripper, request: Collision) -> Reach:
     """What of the cloud a hand sees that might meet it."""
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0
-    return reach_of(gripper, around=request.margin, back=_way_back(request), lift=lift)
+    return reach_of(gripper, around=request.margin, back=way_back(request), lift=lift)
 
 
 def meets_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands meet a point of the cloud.  # (E,)."""
-    boxes = _grown_boxes(gripper, request)
-    swept = _lengthened(boxes, request)
+    boxes = grown_boxes(gripper, request)
+    swept = lengthened(boxes, request)
     if (kernels := point_kernels()) is not None:
         hit: Bools = kernels.meets(cloud.points, T_cloud_hand, swept)
     else:
@@ -90,7 +90,7 @@ def meets_support(
     normal = np.asarray(support.normal)
     height = support_clearance(T_cloud_hand, support, gripper)
     rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
-    lowest = np.minimum(height, height + _way_back(request) * rise)
+    lowest = np.minimum(height, height + way_back(request) * rise)
     if request.retreat_direction == "up":
         lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
     return np.asarray(lowest < request.margin - TOUCH)
@@ -100,8 +100,8 @@ def meets_obstacles(
     T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
 ) -> Bools:
     """Which open hands meet a box.  # (E,)."""
-    grown = _grown_boxes(gripper, request)
-    at_rest = SolidBoxes.of_hands(T_cloud_hand, _lengthened(grown, request))
+    grown = grown_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, lengthened(grown, request))
     hit = _meets_any(at_rest, obstacles, None)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         hands = SolidBoxes.of_hands(T_cloud_hand, grown)
@@ -162,13 +162,13 @@ def _cloud_clearance(points: Float32, T_cloud_hand: Float32, gripper: Gripper) -
     return least.numpy()
 
 
-def _way_back(request: Collision) -> float:
+def way_back(request: Collision) -> float:
     """Metres of straight way behind the grasp that the hand passes."""
     out = request.retreat_length if request.retreat_direction == "back" else 0.0
     return max(request.approach_length, out)
 
 
-def _grown_boxes(gripper: Gripper, request: Collision) -> Float64:
+def grown_boxes(gripper: Gripper, request: Collision) -> Float64:
     """Boxes (B, 2, 3) of the open hand with the margin around them."""
     boxes = gripper.boxes(gripper.max_opening)
     boxes[:, 0] -= request.margin
@@ -176,10 +176,10 @@ def _grown_boxes(gripper: Gripper, request: Collision) -> Float64:
     return boxes
 
 
-def _lengthened(boxes: Float64, request: Collision) -> Float64:
+def lengthened(boxes: Float64, request: Collision) -> Float64:
     """Boxes (B, 2, 3) that also cover the ways along the hand's z."""
     swept = boxes.copy()
-    swept[:, 0, 2] -= _way_back(request)
+    swept[:, 0, 2] -= way_back(request)
     return swept
 
 
