@@ -115,7 +115,7 @@ def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str
         {
             "ours": lambda: ours.detect(observation.cloud, options),
             "textbook": lambda: detect(
-                observation.cloud, observation.camera_position, lambda b: textbook(network, b)
+                observation.cloud, observation.table_height, lambda b: textbook(network, b)
             ),
         }
     )
