@@ -36,7 +36,7 @@ class Captured:
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         """What the function returns for these inputs."""
-        if inputs[0].device.type != "cuda":
+        if not self._captures(inputs):
             return self._function(*inputs)
         shapes = tuple((given.shape, given.dtype, given.device) for given in inputs)
         with self._turn, torch.inference_mode():
@@ -48,6 +48,9 @@ class Captured:
                 there.copy_(given)
             captured.graph.replay()
             return captured.output.clone()  # the next replay writes over it
+
+    def _captures(self, inputs: tuple[Tensor, ...]) -> bool:
+        return inputs[0].device.type == "cuda"
 
     def _capture(self, inputs: tuple[Tensor, ...]) -> _Graph:
         own = tuple(given.clone() for given in inputs)
