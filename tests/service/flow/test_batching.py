@@ -168,7 +168,7 @@ async def test_the_network_scores_alike_alone_and_together() -> None:
     async def ask(points: np.ndarray) -> Detection:
         with service.admit(Call("grpc", "DetectGrasps")) as place:
             cloud = SentCloud(PackedCloud(points.tobytes()))
-            return await service.detect(DetectRequest(cloud, OPTIONS), place)
+            return await service.detect(lambda: DetectRequest(cloud, OPTIONS), place)
 
     sent = [box(size) for size in (0.9, 0.8, 1.0, 1.2)]
     asked = [asyncio.create_task(ask(points)) for points in sent]
