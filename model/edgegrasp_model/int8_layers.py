@@ -7,7 +7,7 @@ of rows: oneDNN prepares anew for each, which would take half as long as the pro
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -42,6 +42,7 @@ class Int8Linear(nn.Module):
         self.bias: Tensor
         self.input_scale: Tensor  # of the bytes that go in
         self._packed: Tensor | None = None  # the weights as oneDNN reads them
+        self._zeros = torch.zeros(outputs, dtype=torch.int64)  # what a weight of zero is
 
     def fill(self, weight: Tensor, bias: Tensor | None, largest: float) -> None:
         """Take over a float32 layer.
@@ -60,38 +61,37 @@ class Int8Linear(nn.Module):
         self._packed = None
 
     def bytes_of(self, values: Tensor) -> Tensor:
-        """The layer's input (M, inputs) uint8 from float32; below zero becomes zero."""
-        scale = float(self.input_scale)
-        quantised = torch.quantize_per_tensor(values, scale, 0, torch.quint8)
-        # Its own bytes: `int_repr` would copy them, which takes seven times as long.
-        plain = torch.empty(0, dtype=torch.uint8)
-        return plain.set_(quantised.untyped_storage(), 0, quantised.shape, quantised.stride())
+        """The layer's input (M, inputs) from float32: whole bytes, below zero becomes zero."""
+        return rounded_down(self.scaled(values).add_(0.5))
 
-    def forward(self, values: Tensor, bytes_for: Self | None = None) -> Tensor:
+    def scaled(self, values: Tensor) -> Tensor:
+        """Values in units of the layer's input bytes."""
+        return values * (1.0 / float(self.input_scale))
+
+    def forward(
+        self, values: Tensor, bytes_for: "Int8Linear | None" = None, plus: Tensor | None = None
+    ) -> Tensor:
         """Maps bytes (M, inputs) to (M, outputs) float32.
 
         Args:
             values: Made by `bytes_of`, or by the layer before this one.
             bytes_for: Next layer: the result is rectified, and comes as the bytes it takes.
+            plus: (M, outputs) float32, added before that.
         """
         if self._packed is None:
             self._packed = torch.ops.onednn.qlinear_prepack(self.weight, None)
-        last = bytes_for is None
-        result: Tensor = torch.ops.onednn.qlinear_pointwise(
-            values,
-            float(self.input_scale),
-            0,
-            self._packed,
-            self.weight_scale,
-            torch.zeros(len(self.weight_scale), dtype=torch.int64),
-            self.bias,
-            1.0 if bytes_for is None else float(bytes_for.input_scale),
-            0,
-            torch.float32 if last else torch.uint8,
-            "none" if last else "relu",
-            [],
-            "",
-        )
+        weight = (self._packed, self.weight_scale, self._zeros)
+        source = (values, float(self.input_scale), 0)
+        scale = 1.0 if bytes_for is None else float(bytes_for.input_scale)
+        target = (scale, 0, torch.float32 if bytes_for is None else torch.uint8)
+        rectified = ("none" if bytes_for is None else "relu", [], "")
+        multiply = torch.ops.onednn.qlinear_pointwise
+        result: Tensor
+        if plus is None:
+            result = multiply(*source, *weight, self.bias, *target, *rectified)
+        else:
+            added = (1.0, 0, "add", 1.0)
+            result = multiply.binary(*source, *weight, plus, self.bias, *target, *added, *rectified)
         return result
 
 
@@ -111,12 +111,13 @@ class Int8PointNetConv(nn.Module):
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
         u, v = point_parts(self.hidden, features, batch)
+        u, v = self.output.scaled(u).add_(0.5), self.output.scaled(v)
         neighbors, v = _filled_up(batch.neighbors, CONVOLVED), _filled_up(v, CONVOLVED)
         pooled = []
         for first in range(0, len(v), CONVOLVED):
             part = slice(first, first + CONVOLVED)
             hidden = gather_rows(u, neighbors[part]).sub_(v[part].unsqueeze(1))  # (p, k, width)
-            messages = self.output(self.output.bytes_of(hidden).flatten(0, 1))
+            messages = self.output(rounded_down(hidden).flatten(0, 1))
             pooled.append(messages.view(hidden.shape).amax(dim=1))  # (p, width)
         return torch.cat(pooled)[: len(features)]
 
@@ -145,9 +146,9 @@ class Int8GlobalFeature(nn.Module):
         shared = row_linear(maximum.values, self.ball.weight)  # (B, 1024)
         maximum = _BallMaximum(batch, len(self.last.bias))
         for piece in _pieces(batch):
-            joined = self.join(points[piece.rows])  # (p, 1024)
-            joined += shared.index_select(0, ball_of_point[piece.rows])
-            maximum.add(self.last(self.last.bytes_of(joined)), piece)
+            of_ball = shared.index_select(0, ball_of_point[piece.rows])  # (p, 1024)
+            joined = self.join(points[piece.rows], self.last, of_ball)
+            maximum.add(self.last(joined), piece)
         return maximum.values
 
     def fill(self, layer: GlobalFeature, local: float, hidden: list[float], joined: float) -> None:
@@ -202,6 +203,12 @@ class _BallMaximum:
 def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
     """The linear layers of an MLP, in order."""
     return [layer for layer in mlp if isinstance(layer, nn.Linear)]
+
+
+def rounded_down(values: Tensor) -> Tensor:
+    """Whole bytes of values 0..255, in place; what is beyond becomes the nearest."""
+    # By way of int16: the conversion of float32 to uint8 is not vectorised.
+    return values.clamp_(0, BYTE).to(torch.int16).to(torch.uint8)
 
 
 def point_parts(hidden: nn.Linear, features: Tensor, batch: BallBatch) -> tuple[Tensor, Tensor]:
