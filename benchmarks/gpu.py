@@ -360,7 +360,7 @@ def _textbook_pipeline() -> Callable[..., object] | None:
 
 
 def _loaded(path: Path) -> View:
-    kept = np.load(path)
+    kept = np.load(path, allow_pickle=False)
     return View(kept["cloud"], kept["camera"], float(kept["table"]))
 
 
