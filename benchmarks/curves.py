@@ -1,96 +1,138 @@
-"""How time grows with points, approach points, candidates, threads and batch."""
+"""How time and memory grow: `python -m benchmarks.curves` writes scaling.json and scaling.png.
 
+The small network in the whole pipeline, against the points of the cloud, the approach points, the
+candidates, the scenes of a batch and the threads.
+"""
+
+import argparse
+import json
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.timing import interleaved
+from benchmarks.scenes import detector, observe, request
+from benchmarks.timing import interleaved, machine
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.network_config import EDGEGRASP_SMALL
 from edgegrasp_sim.simulation import Observation
 
-POINTS = (1_000, 10_000, 100_000, 1_000_000)
+RESULTS = Path(__file__).parent / "results"
+POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 APPROACH_POINTS = (8, 16, 32, 64, 128, 256)
 CANDIDATES = (500, 1_000, 2_000, 4_000, 8_000, 16_000)
+MANY_APPROACH_POINTS = 256  # so that there are so many candidates to choose from
 BATCHES = (1, 2, 4, 8)
 THREADS = (1, 2)
-RUNS = 3
+RUNS = 5
+SCATTER = 2e-4  # metres between a point of the scene and those put in its place
 
 
-def measure_curves(detector: GraspDetector, observation: Observation) -> dict[str, Any]:
-    """Median seconds for each value of each quantity; by the clock for threads, else processor."""
-    rng = np.random.default_rng(0)
-    viewpoint = tuple(observation.camera_position.tolist())
+def main() -> None:
+    """Measure every curve, write and draw them."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.curves")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--runs", type=int, default=RUNS)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    start = time.perf_counter()
+    observation = observe()
+    results: dict[str, Any] = {"machine": machine(), "cloud_points": len(observation.cloud)}
+    results["curves"] = {}
+    for name, variants in curves(observation).items():
+        results["curves"][name] = measured(variants, given.runs)
+        print(name, results["curves"][name], flush=True)
+    results["minutes"] = (time.perf_counter() - start) / 60
+    given.output.mkdir(parents=True, exist_ok=True)
+    (given.output / "scaling.json").write_text(json.dumps(results, indent=1) + "\n")
+    draw(results["curves"], given.output / "scaling.png")
 
-    def request(**options: int) -> DetectOptions:
-        asked = {"num_approach_points": 32, "num_candidates": 2_000} | options
-        return DetectOptions(viewpoint=viewpoint, **asked)
 
-    def cloud_of(count: int) -> np.ndarray:
-        rows = rng.integers(len(observation.cloud), size=count)
-        scattered = observation.cloud[rows] + rng.normal(0.0, 2e-4, (count, 3))
-        return scattered.astype(np.float32)
+def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]]]:
+    """What to run for each value of each quantity."""
+    small, cloud = detector(EDGEGRASP_SMALL), observation.cloud
+    batch = small.prepare(cloud, request(observation)).batch
+    assert isinstance(batch, BallBatch)
+    clouds = {count: cloud_of(count, cloud) for count in POINTS}
+    usual = request(observation)
 
-    clouds = {count: cloud_of(count) for count in POINTS}
-    whole = observation.cloud
-    batch = detector.prepare(whole, request()).batch
-    assert batch is not None
+    def batched(count: int) -> None:
+        small.run(BallBatch.concatenate([batch] * count))
+
+    def threaded(count: int) -> None:
+        torch.set_num_threads(count)
+        try:
+            small.detect(cloud, usual)
+        finally:
+            torch.set_num_threads(1)
+
+    def asked(**options: int) -> Callable[[], object]:
+        return partial(small.detect, cloud, request(observation, **options))
+
+    many = {"num_approach_points": MANY_APPROACH_POINTS}
     return {
-        "points": _medians({n: lambda n=n: detector.detect(clouds[n], request()) for n in POINTS}),
-        "approach points": _medians(
-            {
-                n: lambda n=n: detector.detect(whole, request(num_approach_points=n))
-                for n in APPROACH_POINTS
-            }
-        ),
-        "candidates": _medians(
-            {
-                n: lambda n=n: detector.detect(
-                    whole, request(num_candidates=n, num_approach_points=128)
-                )
-                for n in CANDIDATES
-            }
-        ),
-        "scenes in a batch": _medians(
-            {n: lambda n=n: detector.run(BallBatch.concatenate([batch] * n)) for n in BATCHES}
-        ),
-        "threads": {str(n): _clock(n, lambda: detector.run(batch)) for n in THREADS},
+        "points": {n: partial(small.detect, clouds[n], usual) for n in POINTS},
+        "approach points": {n: asked(num_approach_points=n) for n in APPROACH_POINTS},
+        "candidates": {n: asked(num_candidates=n, **many) for n in CANDIDATES},
+        "scenes in a batch": {n: partial(batched, n) for n in BATCHES},
+        "threads": {n: partial(threaded, n) for n in THREADS},
     }
 
 
-def draw(curves: dict[str, Any], path: Path) -> None:
-    """One small plot for each quantity."""
+def cloud_of(count: int, cloud: np.ndarray) -> np.ndarray:
+    """A cloud (count, 3) of the same surfaces."""
+    rng = np.random.default_rng(count)
+    rows = rng.integers(len(cloud), size=count)
+    scattered = cloud[rows] + rng.normal(0.0, SCATTER, (count, 3))
+    return scattered.astype(np.float32)
+
+
+def measured(variants: Mapping[int, Callable[[], object]], runs: int) -> dict[str, Any]:
+    """Median seconds by the clock and the process's peak memory for each value, ascending."""
+    memory = {str(value): peak_memory(run) for value, run in variants.items()}
+    by_name = {str(value): run for value, run in variants.items()}
+    times = interleaved(by_name, runs, clock=time.perf_counter)
+    return {
+        "seconds": {value: statistics.median(seconds) for value, seconds in times.items()},
+        "memory_mb": memory,
+    }
+
+
+def peak_memory(run: Callable[[], object]) -> float:
+    """Most resident memory of this process while something runs, MB."""
+    Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
+    run()
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024
+    raise LookupError("VmHWM")
+
+
+def draw(curves: Mapping[str, Any], path: Path) -> None:
+    """Time above memory, a column for each quantity."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12, 2.6), layout="constrained")
-    for axes, (name, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
-        axes.plot([int(value) for value in curve], list(curve.values()), "o-")
-        axes.set(xscale="log", yscale="log", xlabel=name)
-        axes.grid(visible=True, which="both", alpha=0.3)
-    figure.axes[0].set_ylabel("seconds")
+    figure = Figure(figsize=(14, 4.6), layout="constrained")
+    axes = figure.subplots(2, len(curves), sharex="col")
+    for (above, below), (name, curve) in zip(axes.T, curves.items(), strict=True):
+        for plot, key in ((above, "seconds"), (below, "memory_mb")):
+            values = [int(value) for value in curve[key]]
+            plot.plot(values, list(curve[key].values()), "o-")
+            plot.set(xscale="log", ylim=(0, None))
+            plot.grid(visible=True, alpha=0.3)
+        below.set(xlabel=name)
+        if name != "points":
+            below.set_xticks(values, [f"{value:,}" for value in values], minor=False)
+            below.minorticks_off()
+    axes[0, 0].set_ylabel("seconds")
+    axes[1, 0].set_ylabel("peak memory, MB")
     figure.savefig(path, dpi=90)
 
 
-def _medians(variants: dict[int, Callable[[], object]]) -> dict[str, float]:
-    times = interleaved({str(value): run for value, run in variants.items()}, RUNS)
-    return {value: statistics.median(seconds) for value, seconds in times.items()}
-
-
-def _clock(threads: int, run: Callable[[], object]) -> float:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        seconds = []
-        for _ in range(RUNS):
-            start = time.perf_counter()
-            run()
-            seconds.append(time.perf_counter() - start)
-        return statistics.median(seconds)
-    finally:
-        torch.set_num_threads(before)
+if __name__ == "__main__":
+    main()

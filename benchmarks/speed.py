@@ -1,6 +1,6 @@
 """Measure speed beside the textbook: `python -m benchmarks.speed` writes speed.json.
 
-All times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
+Most times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
 machine too. Networks carry random weights, which cost what trained ones cost.
 """
 
@@ -9,33 +9,29 @@ import json
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.curves import draw, measure_curves
 from benchmarks.readme import write_table
+from benchmarks.scenes import detector, observe, request
 from benchmarks.served import served
 from benchmarks.textbook.edge_grasp import edge_grasp_logits
 from benchmarks.textbook.pipeline import detect
 from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
 from benchmarks.timing import interleaved, machine, summary
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
-from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     VN_EDGEGRASP,
     NetworkConfig,
 )
-from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_training.recipes import recipe
 
 RESULTS = Path(__file__).parent / "results"
 TEXTBOOK: dict[str, Callable[..., torch.Tensor]] = {
@@ -43,6 +39,7 @@ TEXTBOOK: dict[str, Callable[..., torch.Tensor]] = {
     "vn-edgegrasp": vn_edge_grasp_logits,
 }
 PAPER = {"EdgeGraspNet": EDGEGRASP, "VN-EdgeGraspNet": VN_EDGEGRASP}
+SHIPPED = ("edgegrasp-plus", "edgegrasp-small")
 LABELLED_GRASPS = 60
 
 
@@ -50,55 +47,28 @@ def main() -> None:
     """Measure everything, write the results and the README's table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed")
     parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument("--without-curves", action="store_true")
     parser.add_argument("--readme", type=Path, help="file whose table to rewrite")
     given = parser.parse_args()
     torch.set_num_threads(1)
+    start = time.perf_counter()
     observation = observe()
     results: dict[str, Any] = {"machine": machine(), "cloud_points": len(observation.cloud)}
-    results["simulator"] = {str(kind): simulator(kind) for kind in SceneKind}
-    print("simulator", results["simulator"], flush=True)
-    results["server"] = server_footprint()
-    print("server", results["server"], flush=True)
-    results["small"] = small_beside_full(observation)
-    print("small", results["small"], flush=True)
-    results["paper"] = {}
-    for name, config in PAPER.items():
-        results["paper"][name] = beside_textbook(config, observation)
-        print(name, results["paper"][name], flush=True)
+    parts: dict[str, Callable[[], dict[str, Any]]] = {
+        "shipped": shipped,
+        "paper": lambda: {
+            name: beside_textbook(config, observation) for name, config in PAPER.items()
+        },
+        "simulator": lambda: {str(kind): simulator(kind) for kind in SceneKind},
+        "server": server_footprint,
+    }
+    for name, part in parts.items():
+        results[name] = part()
+        print(name, results[name], flush=True)
+    results["minutes"] = (time.perf_counter() - start) / 60
     given.output.mkdir(parents=True, exist_ok=True)
-    path = given.output / "speed.json"
-    path.write_text(json.dumps(results, indent=1) + "\n")
+    (given.output / "speed.json").write_text(json.dumps(results, indent=1) + "\n")
     if given.readme is not None:
         write_table(given.readme, results)
-    if not given.without_curves:
-        results["curves"] = measure_curves(detector(EDGEGRASP_SMALL), observation)
-        draw(results["curves"], given.output / "scaling.png")
-        path.write_text(json.dumps(results, indent=1) + "\n")
-
-
-def observe() -> Observation:
-    """A pile seen from two sides: some 15,000 points."""
-    with ClutterSimulation() as simulation:
-        simulation.reset(SceneKind.PILE, np.random.default_rng(1))
-        streams = np.random.default_rng(1), np.random.default_rng(2)
-        return simulation.observe(*streams, num_views=2)
-
-
-def detector(config: NetworkConfig) -> GraspDetector:
-    """A detector with random weights."""
-    metadata = CheckpointMetadata("random", config, 0.0045, "panda")
-    return GraspDetector(build_network(config), metadata, load_gripper())
-
-
-def request(observation: Observation) -> DetectOptions:
-    """32 approach points, 2,000 candidates, the table known."""
-    return DetectOptions(
-        num_approach_points=32,
-        num_candidates=2000,
-        viewpoint=tuple(observation.camera_position.tolist()),
-        support={"normal": (0.0, 0.0, 1.0), "offset": observation.table_height},
-    )
 
 
 def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str, Any]:
@@ -115,7 +85,7 @@ def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str
         {
             "ours": lambda: ours.detect(observation.cloud, options),
             "textbook": lambda: detect(
-                observation.cloud, observation.camera_position, lambda b: textbook(network, b)
+                observation.cloud, observation.table_height, lambda b: textbook(network, b)
             ),
         }
     )
@@ -127,25 +97,28 @@ def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str
     }
 
 
-def small_beside_full(observation: Observation) -> dict[str, Any]:
-    """The small network beside the paper's, in the same pipeline."""
-    small, full, options = detector(EDGEGRASP_SMALL), detector(EDGEGRASP), request(observation)
-    batch = full.prepare(observation.cloud, options).batch
-    assert batch is not None
-    with torch.inference_mode():
-        alone = interleaved(
-            {"small": lambda: small.network(batch), "full": lambda: full.network(batch)}
-        )
-    whole = interleaved(
-        {
-            "small": lambda: small.detect(observation.cloud, options),
-            "full": lambda: full.detect(observation.cloud, options),
-        }
-    )
-    return {
-        "network": summary(alone, "small", "full"),
-        "end_to_end": summary(whole, "small", "full"),
+def shipped() -> dict[str, Any]:
+    """The networks for processors in the whole pipeline, a view of each kind of scene.
+
+    Processor seconds on one thread, and seconds of the clock on two.
+    """
+    scenes = {str(kind): observe(kind, views=1) for kind in SceneKind}
+    detectors = {name: detector(recipe(name).network) for name in SHIPPED}
+    runs = {
+        (name, scene): partial(ours.detect, seen.cloud, request(seen))
+        for name, ours in detectors.items()
+        for scene, seen in scenes.items()
     }
+    results: dict[str, Any] = {name: {} for name in SHIPPED}
+    for threads, clock in ((1, time.process_time), (2, time.perf_counter)):
+        torch.set_num_threads(threads)
+        times = interleaved({"/".join(key): run for key, run in runs.items()}, clock=clock)
+        for name, scene in runs:
+            seen = results[name].setdefault(scene, {"points": len(scenes[scene].cloud)})
+            seen[f"seconds_{threads}"] = statistics.median(times[f"{name}/{scene}"])
+            seen[f"stages_{threads}"] = runs[name, scene]().seconds
+    torch.set_num_threads(1)
+    return results
 
 
 def server_footprint() -> dict[str, float]:
@@ -194,11 +167,8 @@ def simulator(kind: SceneKind) -> dict[str, float]:
 def _tried_poses(simulation: ClutterSimulation, seed: int) -> np.ndarray:
     streams = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
     observation = simulation.observe(*streams)
-    options = request(observation).model_copy(update={"num_candidates": LABELLED_GRASPS})
-    with_any = replace(detector(EDGEGRASP_SMALL).metadata, name="any")
-    prepared = GraspDetector(build_network(EDGEGRASP_SMALL), with_any, load_gripper()).prepare(
-        observation.cloud, options
-    )
+    options = request(observation, num_candidates=LABELLED_GRASPS)
+    prepared = detector(EDGEGRASP_SMALL).prepare(observation.cloud, options)
     assert prepared.sample is not None
     assert prepared.scene is not None
     return prepared.scene.frame.poses_in_cloud(prepared.sample.candidates.T_cloud_hand)

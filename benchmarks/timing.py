@@ -14,16 +14,24 @@ RUNS = 5
 
 
 def interleaved(
-    variants: Mapping[str, Callable[[], object]], runs: int = RUNS
+    variants: Mapping[str, Callable[[], object]],
+    runs: int = RUNS,
+    clock: Callable[[], float] = time.process_time,
 ) -> dict[str, list[float]]:
-    """Processor seconds of each variant in each of `runs` rounds, after one that does not count."""
+    """Seconds of each variant in each of `runs` rounds, after one that does not count.
+
+    Args:
+        variants: What to run, by name.
+        runs: Rounds that count.
+        clock: Of the processor, which other work on the machine changes little; or of the wall.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(runs + 1):
         for name, variant in variants.items():
-            start = time.process_time()
+            start = clock()
             variant()
             if number:
-                seconds[name].append(time.process_time() - start)
+                seconds[name].append(clock() - start)
     return seconds
 
 

@@ -23,6 +23,7 @@ COMMANDS = {
     "compare": ("sim", "Compare two benchmarks scene by scene."),
     "generate-data": ("train", "Make labelled edge grasps in simulation."),
     "train": ("train", "Train weights on generated data."),
+    "quantise": ("train", "Make weights in int8 of edgegrasp weights."),
     "import-checkpoint": ("model", "Convert the authors' checkpoints to safetensors."),
 }
 
@@ -47,6 +48,11 @@ def load_command(name: str) -> Any:
         function = getattr(importlib.import_module(f"edgegrasp_cli.{module}"), module)
     except ModuleNotFoundError as error:
         sys.exit(_missing(name, error))
+    if isinstance(function, typer.Typer):  # a group of commands
+        for command in function.registered_commands:
+            if command.callback is not None:
+                command.callback = _naming_missing_packages(name, command.callback)
+        return typer.main.get_command(function)
     single = typer.Typer(add_completion=False)
     single.command(name)(_naming_missing_packages(name, function))
     return typer.main.get_command(single)

@@ -1,4 +1,4 @@
-"""`edgegrasp replay`."""
+"""`edgegrasp replay attempt`."""
 
 import sys
 from pathlib import Path
@@ -8,11 +8,21 @@ import typer
 
 Option = typer.Option
 
+replay = typer.Typer(
+    help="Make what a benchmark recorded again.", no_args_is_help=True, add_completion=False
+)
 
-def replay(
+
+@replay.callback()
+def _group() -> None:
+    """Keeps `attempt` a command of its own."""
+
+
+@replay.command()
+def attempt(
     results: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
     round: Annotated[int, Option(help="Number of the round, from 0.")] = 0,  # noqa: A002
-    attempt: Annotated[int, Option(help="Number of the attempt in it, from 0.")] = 0,
+    number: Annotated[int, Option("--attempt", help="Number of the attempt in it, from 0.")] = 0,
     seed: Annotated[
         int | None, Option(help="Seed of the round; else the benchmark's first.")
     ] = None,
@@ -36,22 +46,22 @@ def replay(
         folder = ResultFolder(results)
         first = folder.manifest()["seeds"][0]
         with Replay(folder, objects, gui=gui) as repeated:
-            done = repeated.find(first if seed is None else seed, round, attempt)
-            now, seen = repeated.repeat(done.seed, round, attempt)
-            before = done.attempts[attempt]
+            done = repeated.find(first if seed is None else seed, round, number)
+            now, seen = repeated.repeat(done.seed, round, number)
+            before = done.attempts[number]
             if picture is not None:
                 draw_grasps(
                     picture,
                     seen.cloud,
                     [DrawnAttempt.of(before)],
                     camera_position=seen.camera_position,
-                    title=attempt_title(done, attempt),
+                    title=attempt_title(done, number),
                 )
             if film is not None:
                 film_round(repeated, done, film)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"edgegrasp replay: {error}")
-    print(attempt_title(done, attempt))
+    print(attempt_title(done, number))
     same = (now.outcome, now.cause, now.object, now.opening) == (
         before.outcome,
         before.cause,

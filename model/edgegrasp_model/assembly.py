@@ -1,17 +1,31 @@
 """Write candidates and their scores as grasps in the caller's frame."""
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.preparation import Sample
+from edgegrasp_model.preparation import Round
 from edgegrasp_model.results import DebugInfo, Grasp, Outcome
 from edgegrasp_model.scene import Scene
 
 Float32 = NDArray[np.float32]
 
 OUTCOMES = list(Outcome)
+
+
+class Drawn(Protocol):
+    """What of a sample tells how its candidates came about."""
+
+    @property
+    def rounds(self) -> list[Round]:
+        """Every candidate of each round of sampling."""
+
+    @property
+    def row(self) -> NDArray[np.int64]:
+        """Which of the last round's were scored: (E,) rows."""
 
 
 def grasps_in_cloud(
@@ -44,7 +58,7 @@ def grasps_in_cloud(
 
 def debug_info(
     scene: Scene,
-    sample: Sample | None,
+    sample: Drawn | None,
     score: NDArray[np.floating],
     outcome: NDArray[np.int8],
 ) -> DebugInfo:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from edgegrasp_model.compiled import point_kernels
+
 
 class BallCrop(NamedTuple):
     """Balls as rows of their cloud. P ball points in all, ball after ball."""
@@ -66,6 +68,11 @@ def nearest_in_ball(
     """
     centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
     centred = points[crop.ball_rows] - centre
+    kernels = point_kernels()
+    if kernels is not None and centred.dtype == np.float32:
+        bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
+        nearest: NDArray[np.int64] = kernels.nearest_in_groups(centred, bounds, k)
+        return nearest
     # One search for all balls: a fourth coordinate keeps them further apart than any is wide.
     lifted = np.column_stack((centred, crop.ball_of_point * (8.0 * crop.radius)))
     if len(lifted) == 0:

@@ -5,8 +5,10 @@ import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import support_clearance
+from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.compiled import point_kernels
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import CHUNK, HandView, Reach, reach_of, within_box
+from edgegrasp_model.hand_view import CHUNK, HandView, Reach, hand_views, reach_of, within_box
 from edgegrasp_model.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene import Scene
@@ -21,9 +23,7 @@ TOUCH = 1e-6  # metres; hands drawn back onto the support plane end this near to
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 
 
-def collides(
-    scene: Scene, view: HandView, T_cloud_hand: Float32, gripper: Gripper, request: Collision
-) -> Bools:
+def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands meet the cloud, the support plane or an obstacle.
 
     At the grasp, on the straight way to it and on the way out, each box of the hand grown by the
@@ -31,7 +31,6 @@ def collides(
 
     Args:
         scene: Cloud, support plane and obstacles, canonical frame.
-        view: The cloud from the E hands, within `collision_reach`.
         T_cloud_hand: (E, 4, 4), canonical frame.
         gripper: Its boxes, fingers open to the maximum.
         request: Margin and ways.
@@ -39,7 +38,7 @@ def collides(
     Returns:
         (E,)
     """
-    hit = meets_cloud(view, T_cloud_hand, gripper, request)
+    hit = meets_cloud(scene.cloud, T_cloud_hand, gripper, request)
     if scene.support is not None:
         hit |= meets_support(T_cloud_hand, scene.support, gripper, request)
     if len(scene.obstacles):
@@ -48,29 +47,39 @@ def collides(
 
 
 def collision_reach(gripper: Gripper, request: Collision) -> Reach:
-    """What of the cloud has to be seen from a hand to know whether it collides."""
+    """What of the cloud a hand sees that might meet it."""
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0
-    return reach_of(gripper, around=request.margin, back=_way_back(request), lift=lift)
+    return reach_of(gripper, around=request.margin, back=way_back(request), lift=lift)
 
 
-def meets_cloud(
-    view: HandView, T_cloud_hand: Float32, gripper: Gripper, request: Collision
-) -> Bools:
+def meets_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands meet a point of the cloud.  # (E,)."""
-    position = view.position
-    hit = np.zeros(len(position), dtype=bool)
-    boxes = _grown_boxes(gripper, request)
-    columns = np.ascontiguousarray(position.T)  # (3, P): a row at a time is many times faster
-    for low, high in _lengthened(boxes, request):
+    boxes = grown_boxes(gripper, request)
+    swept = lengthened(boxes, request)
+    if (kernels := point_kernels()) is not None:
+        hit: Bools = kernels.meets(cloud.points, T_cloud_hand, swept)
+    else:
+        reach = Reach(tuple(swept[:, 0].min(axis=0)), tuple(swept[:, 1].max(axis=0)))
+        parts = range(0, len(T_cloud_hand), CHUNK)  # what a part sees is let go at once
+        views = (hand_views(cloud, T_cloud_hand[at : at + CHUNK], reach) for at in parts)
+        hit = np.concatenate([np.zeros(0, dtype=bool), *(_in_any(view, swept) for view in views)])
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        free = np.flatnonzero(~hit)
+        view = hand_views(cloud, T_cloud_hand[free], collision_reach(gripper, request))
+        lift = request.retreat_length * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
+        for low, high in boxes:
+            hit[free[view.candidate[_passed_over(view.position, lift, low, high)]]] = True
+    return hit
+
+
+def _in_any(view: HandView, boxes: Float64) -> Bools:
+    """Which hands see a point in one of some boxes (B, 2, 3), hand frame.  # (E,)."""
+    hit = np.zeros(len(view.row), dtype=bool)
+    columns = np.ascontiguousarray(view.position.T)  # (3, P): a row at a time is many times faster
+    for low, high in boxes:
         hit |= within_box(columns, low, high)
     result = np.zeros(view.num_candidates, dtype=bool)
     result[view.candidate[hit]] = True
-    if request.retreat_direction == "up" and request.retreat_length > 0:
-        left = np.flatnonzero(~result[view.candidate])  # points seen from hands still free
-        candidate, position = view.candidate[left], position[left]
-        lift = request.retreat_length * (UP @ T_cloud_hand[candidate, :3, :3])
-        for low, high in boxes:
-            result[candidate[_passed_over(position, lift, low, high)]] = True
     return result
 
 
@@ -81,7 +90,7 @@ def meets_support(
     normal = np.asarray(support.normal)
     height = support_clearance(T_cloud_hand, support, gripper)
     rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
-    lowest = np.minimum(height, height + _way_back(request) * rise)
+    lowest = np.minimum(height, height + way_back(request) * rise)
     if request.retreat_direction == "up":
         lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
     return np.asarray(lowest < request.margin - TOUCH)
@@ -91,8 +100,8 @@ def meets_obstacles(
     T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
 ) -> Bools:
     """Which open hands meet a box.  # (E,)."""
-    grown = _grown_boxes(gripper, request)
-    at_rest = SolidBoxes.of_hands(T_cloud_hand, _lengthened(grown, request))
+    grown = grown_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, lengthened(grown, request))
     hit = _meets_any(at_rest, obstacles, None)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         hands = SolidBoxes.of_hands(T_cloud_hand, grown)
@@ -130,13 +139,18 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
 
 def _cloud_clearance(points: Float32, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     """Signed distance (E,) of points (N, 3) to the boxes of each hand, the least."""
+    if (kernels := point_kernels()) is not None:
+        nearest: Float32 = kernels.clearance(
+            points, T_cloud_hand, gripper.boxes(gripper.max_opening)
+        )
+        return nearest
     boxes = torch.from_numpy(gripper.boxes(gripper.max_opening).astype(np.float32))
     middle, extent = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3)
     pose = torch.from_numpy(T_cloud_hand)
     turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
     shift = -turn @ pose[:, :3, 3:]
     columns = torch.from_numpy(np.ascontiguousarray(points.T))  # (3, N)
-    nearest = torch.full((len(pose),), torch.inf)
+    least = torch.full((len(pose),), torch.inf)
     for start in range(0, len(pose), CHUNK):
         part = slice(start, start + CHUNK)
         position = torch.baddbmm(shift[part], turn[part], columns.expand(len(turn[part]), -1, -1))
@@ -144,17 +158,17 @@ def _cloud_clearance(points: Float32, T_cloud_hand: Float32, gripper: Gripper) -
             beyond = (position - center[:, None]).abs_() - half[:, None]  # (chunk, 3, N)
             inside = beyond.amax(dim=1).clamp_(max=0.0)
             outside = beyond.clamp_(min=0.0).square_().sum(dim=1).sqrt_()
-            nearest[part] = torch.minimum(nearest[part], (inside + outside).amin(dim=1))
-    return nearest.numpy()
+            least[part] = torch.minimum(least[part], (inside + outside).amin(dim=1))
+    return least.numpy()
 
 
-def _way_back(request: Collision) -> float:
+def way_back(request: Collision) -> float:
     """Metres of straight way behind the grasp that the hand passes."""
     out = request.retreat_length if request.retreat_direction == "back" else 0.0
     return max(request.approach_length, out)
 
 
-def _grown_boxes(gripper: Gripper, request: Collision) -> Float64:
+def grown_boxes(gripper: Gripper, request: Collision) -> Float64:
     """Boxes (B, 2, 3) of the open hand with the margin around them."""
     boxes = gripper.boxes(gripper.max_opening)
     boxes[:, 0] -= request.margin
@@ -162,10 +176,10 @@ def _grown_boxes(gripper: Gripper, request: Collision) -> Float64:
     return boxes
 
 
-def _lengthened(boxes: Float64, request: Collision) -> Float64:
+def lengthened(boxes: Float64, request: Collision) -> Float64:
     """Boxes (B, 2, 3) that also cover the ways along the hand's z."""
     swept = boxes.copy()
-    swept[:, 0, 2] -= _way_back(request)
+    swept[:, 0, 2] -= way_back(request)
     return swept
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +32,12 @@ from edgegrasp_model.selection import select
 Float32 = NDArray[np.float32]
 Batch = BallBatch | HandBatch
 
+NO_APPROACH_POINT = (
+    "the approach region holds no point of the processed cloud. Rows hold a voxel by "
+    "half of its points: around a single point, send a sphere."
+)
+NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
+
 
 @dataclass
 class Prepared:
@@ -54,6 +60,12 @@ class Prepared:
         start = time.perf_counter()
         yield
         self.seconds[stage] = time.perf_counter() - start
+
+    def warn_of_few_points(self) -> None:
+        """Say that too few points are left for a scene."""
+        self.warnings.append(
+            f"only {self.counts['kept']} points are left after cropping and cleaning."
+        )
 
     def total_seconds(self) -> dict[str, float]:
         """Seconds of each stage and of all."""
@@ -83,7 +95,7 @@ class GraspDetector:
         self.network = network.to(device).eval()
         self.metadata = metadata
         self.gripper = gripper
-        self.device = device
+        self.device = torch.device(device)
         self.grippers = dict(grippers or {})
 
     @classmethod
@@ -92,15 +104,28 @@ class GraspDetector:
         path: Path,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
-    ) -> Self:
+    ) -> "GraspDetector":
         """Load a checkpoint and the gripper it was trained for.
+
+        Args:
+            path: The file.
+            device: The processor, or a GPU: there the whole pipeline runs, in `on_device`.
+                Weights in int8 stay on the processor.
+            grippers: A user's own that requests may name, beside those that ship.
 
         Raises:
             InvalidCheckpoint: The file cannot be used.
             InvalidGripper: Its gripper is not known here.
         """
-        network, metadata = load_checkpoint(path, device)
-        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
+        network, metadata = load_checkpoint(path)
+        if metadata.network.architecture == "edgegrasp-int8":
+            device = "cpu"  # its layers are there for the processor only
+        kind: type[GraspDetector] = cls
+        if torch.device(device).type != "cpu":
+            from edgegrasp_model.on_device.detector import DeviceDetector  # it imports this file
+
+            kind = DeviceDetector
+        return kind(network, metadata, load_gripper(metadata.gripper), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
@@ -128,17 +153,14 @@ class GraspDetector:
         if scene is None:
             return prepared
         if not scene.approach_allowed.any():
-            prepared.warnings.append(
-                "the approach region holds no point of the processed cloud. Rows hold a voxel by "
-                "half of its points: around a single point, send a sphere."
-            )
+            prepared.warnings.append(NO_APPROACH_POINT)
             return prepared
         with prepared.timed("candidates"):
             radius = prepared.crop_radius
             sample = sample_candidates(scene, options, gripper, radius, prepared.counts)
         prepared.sample = sample
         if len(sample.candidates) == 0:
-            prepared.warnings.append("no candidate satisfies every constraint; see counts.")
+            prepared.warnings.append(NO_CANDIDATE)
             return prepared
         with prepared.timed("description"):
             prepared.width = widths_needed(sample.view, gripper)
@@ -232,6 +254,17 @@ class GraspDetector:
 
     def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
         """Choose the gripper and build the scene, where enough of the cloud is left."""
+        prepared = self._begun(sent, options)
+        with prepared.timed("cloud"):
+            prepared.scene = build_scene(
+                sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
+            )
+        if prepared.scene is None:
+            prepared.warn_of_few_points()
+        return prepared
+
+    def _begun(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
+        """Choose the gripper and the balls, and warn of what is not known."""
         gripper = chosen_gripper(options, self.gripper, self.grippers)
         radius = self.metadata.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
@@ -245,14 +278,6 @@ class GraspDetector:
         if options.viewpoint is None and sent.normals is None:
             prepared.warnings.append(
                 "viewpoint is not given: normals are turned upward; send the camera's position."
-            )
-        with prepared.timed("cloud"):
-            prepared.scene = build_scene(
-                sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
-            )
-        if prepared.scene is None:
-            prepared.warnings.append(
-                f"only {prepared.counts['kept']} points are left after cropping and cleaning."
             )
         return prepared
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from edgegrasp_model.assembly import grasps_in_cloud
 from edgegrasp_model.ball_batch import BallBatch, BallCrop, crop_balls
 from edgegrasp_model.candidates import Candidates
-from edgegrasp_model.collision import UP, clearances, collides, collision_reach, widths_needed
+from edgegrasp_model.collision import UP, clearances, collides, widths_needed
 from edgegrasp_model.given_grasps import Given
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.hand_view import HandView, hand_views
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import Collision
 from edgegrasp_model.results import Evaluation
@@ -46,7 +46,7 @@ def evaluate(
         scorer: The network.
     """
     candidates = given.candidates
-    view = hand_views(scene.cloud, candidates.T_cloud_hand, collision_reach(gripper, request))
+    view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
     if scorer.network.architecture == "hand":
         score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network, view))
     else:
@@ -60,7 +60,7 @@ def evaluate(
         gripper,
         score,
         widths_needed(view, gripper),
-        ~collides(scene, view, given.candidates.T_cloud_hand, gripper, request),
+        ~collides(scene, given.candidates.T_cloud_hand, gripper, request),
         clearances(scene, hands, gripper),
     )
     evaluations = [Evaluation(None, reason) for reason in given.reason]

@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.compiled import point_kernels
 from edgegrasp_model.gripper import Gripper
 
 Float32 = NDArray[np.float32]
@@ -96,6 +97,10 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
         T_cloud_hand: (E, 4, 4).
         reach: What is kept.
     """
+    if (kernels := point_kernels()) is not None:
+        low, high = np.asarray(reach, dtype=np.float32)
+        hand, seen, at = kernels.seen_from(cloud.points, T_cloud_hand, low, high)
+        return HandView(hand, seen, at, len(T_cloud_hand), reach)
     points = torch.from_numpy(np.ascontiguousarray(cloud.points.T))  # (3, N)
     pose = torch.from_numpy(T_cloud_hand)
     turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand

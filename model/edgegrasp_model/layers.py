@@ -10,6 +10,34 @@ from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
 
+# Products of fewer rows add up in an order that depends on how many there are.
+MIN_ROWS = 32
+
+
+def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """F.linear of values (M, ..., C); in inference, no bit of a row depends on the other rows.
+
+    So a request's scores are the same alone and in a batch, on a processor.
+    """
+    if torch.is_grad_enabled() or values.device.type != "cpu":
+        return F.linear(values, weight, bias)
+    if len(weight) == 1:  # a product with a vector, which has an order of its own for each size
+        product = (values * weight[0]).sum(dim=-1, keepdim=True)
+        return product if bias is None else product + bias
+    if 0 < values.shape[:-1].numel() < MIN_ROWS:
+        padded = values.new_zeros((MIN_ROWS, *values.shape[1:]))
+        padded[: len(values)] = values
+        return F.linear(padded, weight, bias)[: len(values)]
+    return F.linear(values, weight, bias)
+
+
+class RowLinear(nn.Linear):
+    """A linear layer as `row_linear` computes it."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Maps (M, ..., inputs) to (M, ..., outputs)."""
+        return row_linear(values, self.weight, self.bias)
+
 
 class SharedLinear(nn.Linear):
     """A linear layer on rows [own, shared[row]] that multiplies each shared part only once.
@@ -21,8 +49,8 @@ class SharedLinear(nn.Linear):
         """Applies the layer to own (M, ..., C1) and shared (B, ..., C2)[shared_of_row (M,)]."""
         widths = [own.shape[-1], shared.shape[-1]]
         own_weight, shared_weight = torch.split(self.weight, widths, dim=1)
-        once_per_ball = F.linear(shared, shared_weight)  # (B, ..., out)
-        rows = F.linear(own, own_weight, self.bias)  # (M, ..., out)
+        once_per_ball = row_linear(shared, shared_weight)  # (B, ..., out)
+        rows = row_linear(own, own_weight, self.bias)  # (M, ..., out)
         rows += once_per_ball.index_select(0, shared_of_row)
         return rows
 
@@ -31,7 +59,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
     """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
+        layers += [RowLinear(inputs, outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 

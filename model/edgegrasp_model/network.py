@@ -20,6 +20,7 @@ from edgegrasp_model.layers import (
     in_pieces,
     maximum,
     mlp,
+    row_linear,
 )
 from edgegrasp_model.network_config import Architecture, NetworkConfig
 from edgegrasp_model.vn_network import VNEdgeGraspNet
@@ -40,12 +41,12 @@ class PointNetConv(nn.Module):
         # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
         widths = [features.shape[1], 3]
         feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = F.linear(batch.points, point_weight)  # (P, width)
-        u = F.linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
+        v = row_linear(batch.points, point_weight)  # (P, width)
+        u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
         pooled = []
         for neighbors, v_here in zip(in_pieces(batch.neighbors), in_pieces(v), strict=True):
             hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
-            pooled.append(maximum(F.linear(hidden, self.output.weight), dim=1))  # (p, width)
+            pooled.append(maximum(row_linear(hidden, self.output.weight), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
         return torch.cat(pooled) + self.output.bias
 
@@ -112,8 +113,15 @@ class EdgeGraspNet(nn.Module):
         return torch.cat(parts, dim=1)
 
 
+def _int8_network(config: NetworkConfig) -> nn.Module:
+    from edgegrasp_model.int8_network import Int8EdgeGraspNet  # it imports this file
+
+    return Int8EdgeGraspNet(config)
+
+
 NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
     "edgegrasp": EdgeGraspNet,
+    "edgegrasp-int8": _int8_network,
     "vn-edgegrasp": VNEdgeGraspNet,
     "hand": HandNet,
 }

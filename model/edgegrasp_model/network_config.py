@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Self, get_args
 
-Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
+Architecture = Literal["edgegrasp", "edgegrasp-int8", "vn-edgegrasp", "hand"]
 
 # Layers of each part of the paper's networks; the classifier may be as deep as it likes.
 _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}

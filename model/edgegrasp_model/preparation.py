@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.ball_batch import BallCrop, crop_balls
 from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
-from edgegrasp_model.collision import UP, collides, collision_reach
+from edgegrasp_model.collision import UP, collides
 from edgegrasp_model.directions import allowed_ways
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import HandView, hand_views
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.sampling import sample_approach_points
@@ -82,31 +82,30 @@ def sample_candidates(
         this = _constrained(scene, approach_index, crop, options, gripper, counts)
         rounds.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
-        row = passed[_subset(len(passed), limit, rng_candidates)]
+        row = passed[random_rows(len(passed), limit, rng_candidates)]
         this.outcome[passed] = CODE[Outcome.NOT_CHECKED]
         candidates = this.candidates.take(row)
-        reach = collision_reach(gripper, options.collision)
-        view = hand_views(scene.cloud, candidates.T_cloud_hand, reach)
-        free = ~collides(scene, view, candidates.T_cloud_hand, gripper, options.collision)
+        free = ~collides(scene, candidates.T_cloud_hand, gripper, options.collision)
         ignored = options.collision.mode == "ignore"
         this.outcome[row] = CODE[Outcome.NOT_SCORED]
         if not ignored:
             this.outcome[row[~free]] = CODE[Outcome.COLLISION]
-        _add(counts, "checked", len(row))
-        _add(counts, "collision_free", int(free.sum()))
+        add_count(counts, "checked", len(row))
+        add_count(counts, "collision_free", int(free.sum()))
         found = len(row) > 0 if ignored else free.any()
         # The same approach points would come up again, and the same candidates around them.
         exhausted = len(approach_rows) <= len(chosen) and len(passed) <= limit
         if found or exhausted or len(rounds) == SAMPLING_ROUNDS:
             break
-    scored = _preferred(free, options, rng_candidates)
+    scored = preferred_rows(free, options, rng_candidates)
     this.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
+    candidates = candidates.take(scored)
     return Sample(
         approach_index,
         crop,
-        candidates.take(scored),
-        view.take(scored),
+        candidates,
+        hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
         free[scored],
         rounds,
         row[scored],
@@ -122,17 +121,17 @@ def _constrained(
     counts: dict[str, int],
 ) -> Round:
     """The edge grasps of some balls, and which satisfy every constraint but collision."""
-    _add(counts, "approach_points", len(approach_index))
-    _add(counts, "pairs", len(crop.ball_rows))
+    add_count(counts, "approach_points", len(approach_index))
+    add_count(counts, "pairs", len(crop.ball_rows))
     pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
-    _add(counts, "in_contact_region", len(pair))
+    add_count(counts, "in_contact_region", len(pair))
     pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
     candidates = edge_grasps(scene.cloud, *pairs, gripper)
     if scene.support is not None:
         level = level_grasps(scene.cloud, *pairs, scene.support, gripper)
         candidates = Candidates.concatenate([candidates, level])
     candidates = replace(candidates, pair=pair[candidates.pair])
-    _add(counts, "candidates", len(candidates))
+    add_count(counts, "candidates", len(candidates))
     outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
     if scene.support is not None:
         margin = options.collision.margin
@@ -141,29 +140,30 @@ def _constrained(
     way = -candidates.approach
     allowed = allowed_ways(way, options.approach_direction, UP, scene.frame.directions)
     outcome[~allowed] = CODE[Outcome.DIRECTION]
-    _add(counts, "in_direction", int(allowed.sum()))
-    _add(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
+    add_count(counts, "in_direction", int(allowed.sum()))
+    add_count(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
     return Round(candidates, outcome)
 
 
-def _preferred(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
+def preferred_rows(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
     """Ascending rows of at most num_candidates candidates, those free of collision first."""
     if options.collision.mode == "ignore":
-        return _subset(len(free), options.num_candidates, rng)
+        return random_rows(len(free), options.num_candidates, rng)
     clear, hit = np.flatnonzero(free), np.flatnonzero(~free)
-    rows = clear[_subset(len(clear), options.num_candidates, rng)]
+    rows = clear[random_rows(len(clear), options.num_candidates, rng)]
     if options.collision.mode == "penalise":
-        rest = _subset(len(hit), options.num_candidates - len(rows), rng)
+        rest = random_rows(len(hit), options.num_candidates - len(rows), rng)
         rows = np.sort(np.concatenate([rows, hit[rest]]))
     return rows
 
 
-def _subset(size: int, limit: int, rng: np.random.Generator) -> Int64:
+def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
     """Ascending rows of at most `limit` out of `size`."""
     if size <= limit:
         return np.arange(size, dtype=np.int64)
     return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
 
 
-def _add(counts: dict[str, int], name: str, number: int) -> None:
+def add_count(counts: dict[str, int], name: str, number: int) -> None:
+    """Add to a count, which is 0 where it is not there yet."""
     counts[name] = counts.get(name, 0) + number

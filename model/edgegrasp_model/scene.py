@@ -70,11 +70,11 @@ def build_scene(
     """
     check_region(options.approach_region, sent, "approach_region")
     check_region(options.contact_region, sent, "contact_region")
-    viewpoints = _check_viewpoints(sent, options)
+    viewpoints = check_viewpoints(sent, options)
     counts["points"] = len(sent.points)
-    sent = _in_workspace(sent, options)
+    sent = cut_to_workspace(sent, options)
     counts["in_workspace"] = len(sent.points)
-    support, sent = _support(sent, options, warnings)
+    support, sent = taken_off_support(sent, options, warnings)
     counts["above_support"] = len(sent.points)
     if len(sent.points) == 0:
         counts |= {"voxels": 0, "kept": 0}
@@ -103,9 +103,9 @@ def build_scene(
         point_of_row=point_of_row,
         approach_allowed=approach,
         contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
-        support=None if support is None else _in_frame(support, frame),
+        support=None if support is None else plane_in_frame(support, frame),
         at_side=at_workspace_side(in_cloud[kept], options.workspace, options.up),
-        viewpoint=_only(viewpoints, frame),
+        viewpoint=only_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
 
@@ -124,7 +124,7 @@ def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLik
     return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
 
 
-def _check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
+def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
     """The camera positions (W, 3), where any are given."""
     if options.viewpoint is None:
         return None
@@ -141,14 +141,15 @@ def _check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.
     return viewpoints
 
 
-def _only(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
+def only_viewpoint(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
     """The camera (3,) in the canonical frame, if there is just one."""
     if viewpoints is None or len(viewpoints) != 1:
         return None
     return frame.points(viewpoints[0]).astype(np.float32)
 
 
-def _in_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
+def cut_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
+    """The part of a cloud within the workspace."""
     if options.workspace is None:
         return sent
     box = options.workspace
@@ -156,7 +157,7 @@ def _in_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
     return sent.take(np.asarray(inside.all(axis=1)))
 
 
-def _support(
+def taken_off_support(
     sent: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> tuple[SupportPlane | None, CheckedCloud]:
     """The support plane, given or found, and the cloud above it."""
@@ -206,7 +207,7 @@ def _unit(vectors: Float32) -> Float32:
     return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
 
-def _in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
+def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
     """A plane of the cloud's frame in the canonical one."""
     normal = np.asarray(plane.normal)
     length = float(np.linalg.norm(normal))

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, cast
 import numba
 import numpy as np
 import torch
-import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.layers import MIN_ROWS, row_linear
 
 if TYPE_CHECKING:
     from edgegrasp_model.vn_network import VNBallMaximum, VNGlobalFeature, VNPointNetConv
@@ -45,8 +45,8 @@ def convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatch) -> 
     """`VNPointNetConv.forward`: maps point features (P, 3, inputs) to (P, 3, width)."""
     feature_weight, point_weight = torch.split(layer.hidden.weight, [features.shape[2], 1], dim=1)
     direction = layer.hidden_relu.direction.weight
-    v = F.linear(batch.points.unsqueeze(2), _beside(point_weight, direction))  # (P, 3, 2 width)
-    u = F.linear(features, _beside(feature_weight, direction)) + v
+    v = row_linear(batch.points.unsqueeze(2), _beside(point_weight, direction))  # (P, 3, 2 width)
+    u = row_linear(features, _beside(feature_weight, direction)) + v
     output = _beside(layer.output.weight, layer.reach.weight).t()  # (width, 2 width)
     count, k = batch.neighbors.shape
     width = len(output)
@@ -58,7 +58,8 @@ def convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatch) -> 
         part = slice(first, min(first + PIECE, count))
         edges = (part.stop - part.start) * k
         _gathered_relu(u.numpy(), v[part].numpy(), neighbors[part], hidden.numpy())
-        torch.mm(hidden[:edges].view(-1, width), output, out=messages[:edges].view(-1, 2 * width))
+        rows = min(max(edges, MIN_ROWS), len(hidden))
+        torch.mm(hidden[:rows].view(-1, width), output, out=messages[:rows].view(-1, 2 * width))
         _furthest(messages.numpy(), np.arange(0, edges + 1, k), pooled[part].numpy())
     return _own_relu(pooled, layer.output_relu.direction)
 
@@ -76,13 +77,15 @@ def ball_feature(layer: "VNGlobalFeature", local: Tensor, batch: BallBatch) -> T
     balls = torch.split(local, batch.ball_sizes)
     first = [
         _pooled(
-            F.linear(_relu(F.linear(_relu(F.linear(b, first_weight)), second_weight)), third_weight)
+            row_linear(
+                _relu(row_linear(_relu(row_linear(b, first_weight)), second_weight)), third_weight
+            )
         )
         for b in balls
     ]
-    shared = F.linear(_activated(layer.maximum_1, first), ball_weight)  # (B, 3, 2 width)
+    shared = row_linear(_activated(layer.maximum_1, first), ball_weight)  # (B, 3, 2 width)
     second = [
-        _pooled(F.linear(_relu(F.linear(ball, own_weight).add_(here)), last_weight))
+        _pooled(row_linear(_relu(row_linear(ball, own_weight).add_(here)), last_weight))
         for ball, here in zip(balls, shared, strict=True)
     ]
     return _activated(layer.maximum_2, second)

@@ -8,7 +8,7 @@ channel last, so that a plain linear layer without a bias is equivariant.
 import torch
 from torch import Tensor, nn
 
-from edgegrasp_model.layers import SharedLinear
+from edgegrasp_model.layers import RowLinear, SharedLinear
 
 _TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
 
@@ -40,7 +40,7 @@ class VNReLU(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.direction = nn.Linear(width, width, bias=False)
+        self.direction = RowLinear(width, width, bias=False)
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, width) to the same shape."""
@@ -52,8 +52,8 @@ class VNLinearReLU(nn.Module):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.feature = nn.Linear(inputs, outputs, bias=False)
-        self.direction = nn.Linear(inputs, outputs, bias=False)
+        self.feature = RowLinear(inputs, outputs, bias=False)
+        self.direction = RowLinear(inputs, outputs, bias=False)
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, inputs) to (M, 3, outputs)."""

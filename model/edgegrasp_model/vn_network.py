@@ -8,11 +8,10 @@ from importlib.util import find_spec
 from types import ModuleType
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.layers import gather_rows, in_pieces, mlp
+from edgegrasp_model.layers import RowLinear, gather_rows, in_pieces, mlp, row_linear
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.vn_layers import (
     VNLinearReLU,
@@ -28,10 +27,10 @@ class VNPointNetConv(nn.Module):
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
-        self.hidden = nn.Linear(inputs + 1, width, bias=False)
+        self.hidden = RowLinear(inputs + 1, width, bias=False)
         self.hidden_relu = VNReLU(width)
-        self.output = nn.Linear(width, width, bias=False)
-        self.reach = nn.Linear(width, width, bias=False)
+        self.output = RowLinear(width, width, bias=False)
+        self.reach = RowLinear(width, width, bias=False)
         self.output_relu = VNReLU(width)
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
@@ -42,8 +41,8 @@ class VNPointNetConv(nn.Module):
         # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
         widths = [features.shape[2], 1]
         feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = F.linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
-        u = F.linear(features, feature_weight) + v  # (P, 3, width)
+        v = row_linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
+        u = row_linear(features, feature_weight) + v  # (P, 3, width)
         u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
         pooled = []
         for neighbors, v_here, v_direction_here in zip(
@@ -62,7 +61,7 @@ class VNBallMaximum(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.reach = nn.Linear(width, width, bias=False)
+        self.reach = RowLinear(width, width, bias=False)
         self.relu = VNReLU(width)
 
     def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
@@ -80,10 +79,10 @@ class VNGlobalFeature(nn.Module):
         super().__init__()
         self.vn_1 = VNLinearReLU(inputs, widths_1[0])
         self.vn_2 = VNLinearReLU(widths_1[0], widths_1[1])
-        self.vn_3 = nn.Linear(widths_1[1], widths_1[2], bias=False)
+        self.vn_3 = RowLinear(widths_1[1], widths_1[2], bias=False)
         self.maximum_1 = VNBallMaximum(widths_1[2])
         self.join = VNSharedLinearReLU(inputs + widths_1[2], widths_2[0])
-        self.vn_5 = nn.Linear(widths_2[0], widths_2[1], bias=False)
+        self.vn_5 = RowLinear(widths_2[0], widths_2[1], bias=False)
         self.maximum_2 = VNBallMaximum(widths_2[1])
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
@@ -114,7 +113,7 @@ class VNEdgeGraspNet(nn.Module):
         channels = 3 + width_3 + config.global_widths_2[-1]  # 3: approach, contact and normal
         self.frame_1 = VNSharedLinearReLU(channels, channels // 2)
         self.frame_2 = VNLinearReLU(channels // 2, channels // 4)
-        self.frame_3 = nn.Linear(channels // 4, 3, bias=False)
+        self.frame_3 = RowLinear(channels // 4, 3, bias=False)
         self.classifier = mlp((3 * channels, *config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:

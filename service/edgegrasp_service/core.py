@@ -3,8 +3,9 @@
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.admission import Admission, Place
-from edgegrasp_service.backend import Catalogue, Detector
+from edgegrasp_service.backend import Catalogue, Detector, Prepared
 from edgegrasp_service.batching import BatchPolicy
 from edgegrasp_service.call import Call, deadline_exceeded
 from edgegrasp_service.errors import (
@@ -28,12 +29,13 @@ from edgegrasp_service.network_worker import LOST, NetworkWorker, out_of_memory
 from edgegrasp_service.observer import Observer
 from edgegrasp_service.sent_cloud import SentCloud, decode_cloud
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.stage_pools import StagePools
+from edgegrasp_service.stage_pools import StagePools, then
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 Answer = TypeVar("Answer", Detection, Scoring)
+Asked = TypeVar("Asked", bound="DetectRequest")
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,16 @@ class ScoreRequest(DetectRequest):
     """One request to score what the caller gives."""
 
     given: GivenGrasps = field(default_factory=GivenGrasps)
+
+
+@dataclass(frozen=True)
+class Decoded(Generic[Asked]):
+    """A request whose cloud is decoded, with what answers it."""
+
+    request: Asked
+    detector: Detector
+    cloud: CloudInput
+    options: DetectOptions
 
 
 @dataclass(frozen=True)
@@ -169,71 +181,80 @@ class GraspService:
         call.check()
         return self._admission.enter(call)
 
-    async def detect(self, request: DetectRequest, place: Place) -> Detection:
+    async def detect(self, read: Callable[[], DetectRequest], place: Place) -> Detection:
         """Find grasps.
 
-        Raises:
-            EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
-        """
-
-        async def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Detection:
-            call = place.call
-            prepared = await self._pools.run(call, "prepare", detector.prepare, cloud, options)
-            logits, seconds = np.empty(0, np.float32), 0.0
-            if prepared.batch is not None:
-                scored = self._worker.score(call, detector, prepared.batch)
-                logits, seconds = await asyncio.wrap_future(scored)
-            prepared.seconds["network"] = seconds
-            return await self._pools.run(call, "finish", detector.finish, prepared, logits)
-
-        return await self._answer(request, place, work)
-
-    async def score(self, request: ScoreRequest, place: Place) -> Scoring:
-        """Score edges or hand poses that the caller gives.
+        Args:
+            read: Makes the request of what was sent; called in the pool that decodes.
+            place: Its place.
 
         Raises:
             EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
         """
-        request.given.check()
-        edges, hand_poses = request.given.edges, request.given.hand_poses
-        for name, given in vars(request.given).items():
-            _limit(name, 0 if given is None else len(given), self.settings.max_candidates)
+        call = place.call
 
-        async def work(detector: Detector, cloud: CloudInput, options: DetectOptions) -> Scoring:
+        def stages(asked: Decoded[DetectRequest]) -> Future[Detection]:
+            detector = asked.detector
+            prepared = self._pools.submit(
+                call, "prepare", detector.prepare, asked.cloud, asked.options
+            )
+            return then(prepared, lambda prepared: self._scored(call, detector, prepared))
+
+        return await self._answer(read, place, stages)
+
+    def _scored(self, call: Call, detector: Detector, prepared: Prepared) -> Future[Detection]:
+        """The network, and what follows."""
+
+        def finish(scored: tuple[Any, float]) -> Future[Detection]:
+            logits, prepared.seconds["network"] = scored
+            return self._pools.submit(call, "finish", detector.finish, prepared, logits)
+
+        if prepared.batch is None:
+            return finish((np.empty(0, np.float32), 0.0))
+        return then(self._worker.score(call, detector, prepared.batch), finish)
+
+    async def score(self, read: Callable[[], ScoreRequest], place: Place) -> Scoring:
+        """Score edges or hand poses that the caller gives; arguments and errors as of `detect`."""
+
+        def checked() -> ScoreRequest:
+            request = read()
+            request.given.check()
+            for name, given in vars(request.given).items():
+                _limit(name, 0 if given is None else len(given), self.settings.max_candidates)
+            return request
+
+        def stages(asked: Decoded[ScoreRequest]) -> Future[Scoring]:
+            given = asked.request.given
+
             def score() -> Scoring:
-                return detector.score(cloud, options, edges=edges, hand_poses=hand_poses)
+                return asked.detector.score(
+                    asked.cloud, asked.options, edges=given.edges, hand_poses=given.hand_poses
+                )
 
-            scoring: Scoring = await asyncio.wrap_future(self._worker.run(place.call, score))
-            return scoring
+            return self._worker.run(place.call, score)
 
-        return await self._answer(request, place, work)
+        return await self._answer(checked, place, stages)
 
     async def _answer(
         self,
-        request: DetectRequest,
+        read: Callable[[], Asked],
         place: Place,
-        work: Callable[[Detector, CloudInput, DetectOptions], Coroutine[Any, Any, Answer]],
+        stages: Callable[[Decoded[Asked]], Future[Answer]],
     ) -> Answer:
-        """Decode a request and do the work, in its turn and before its deadline."""
+        """Decode a request and do what follows, in its turn and before its deadline."""
         call = place.call
-        options = parse_options(dict(request.options))
-        _limit("options.num_approach_points", options.num_approach_points, self.settings.max_balls)
-        _limit("options.num_candidates", options.num_candidates, self.settings.max_candidates)
-        assert self._catalogue is not None  # or there would be no place
-        detector = self._catalogue.get(options.model)
+        options: list[DetectOptions] = []  # known once they are read
 
-        async def decode_and_work() -> Answer:
+        def decode() -> Decoded[Asked]:
+            request = read()
+            options.append(parse_options(dict(request.options)))
+            return self._decoded(request, options[0])
+
+        async def work() -> Answer:
             self.observer.stage(call, "admission", call.seconds)
             try:
-                cloud, chosen = await self._pools.run(
-                    call,
-                    "decode",
-                    decode_cloud,
-                    request.cloud,
-                    options,
-                    self.settings.max_points,
-                )
-                return await work(detector, cloud, chosen)
+                decoded = self._pools.submit(call, "decode", decode)
+                return await asyncio.wrap_future(then(decoded, stages))
             except EdgeGraspError:
                 raise
             except Exception as error:
@@ -242,9 +263,18 @@ class GraspService:
                     raise WorkerLost(LOST) from None
                 raise DetectorFailed("The detector failed; the server's log says why.") from None
 
-        answer = await in_time(call, place.begin(decode_and_work))
+        answer = await in_time(call, place.begin(work))
         self.observer.answered(call, answer)
         return answer
+
+    def _decoded(self, request: Asked, options: DetectOptions) -> Decoded[Asked]:
+        """A request within the bounds, with its cloud decoded."""
+        _limit("options.num_approach_points", options.num_approach_points, self.settings.max_balls)
+        _limit("options.num_candidates", options.num_candidates, self.settings.max_candidates)
+        assert self._catalogue is not None  # or there would be no place
+        detector = self._catalogue.get(options.model)
+        cloud, options = decode_cloud(request.cloud, options, self.settings.max_points)
+        return Decoded(request, detector, cloud, options)
 
     def models(self) -> list[ModelInfo]:
         """The weights a request can name.
@@ -293,6 +323,8 @@ def _limit(field: str, asked: int, most: int) -> None:
         raise PayloadTooLarge(field, str(asked), f"This server takes at most {most}.")
 
 
-def _describe(options: DetectOptions) -> str:
+def _describe(options: list[DetectOptions]) -> str:
     """Options as JSON; lists of rows may be long."""
-    return options.model_dump_json(exclude_defaults=True)[:2000]
+    if not options:
+        return "a request that is not read"
+    return options[0].model_dump_json(exclude_defaults=True)[:2000]

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import AsyncIterator, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 import grpc
@@ -60,8 +61,8 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         try:
             with observed(self._service.observer, call), self._service.admit(call) as place:
                 check_size(request, self._service.settings.max_body_bytes)
-                asked = score_request_from_message(request)
-                return scoring_message(await self._service.score(asked, place))
+                read = partial(score_request_from_message, request)
+                return scoring_message(await self._service.score(read, place))
         except Exception as error:
             await _abort(context, error)
 

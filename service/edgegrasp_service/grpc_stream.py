@@ -36,7 +36,7 @@ async def detect(
     """Answer one message; raises an error of the table in `edgegrasp_service.errors`."""
     with observed(service.observer, call), service.admit(call) as place:
         check_size(message, service.settings.max_body_bytes)
-        return await service.detect(request_from_message(message), place)
+        return await service.detect(lambda: request_from_message(message), place)
 
 
 def check_size(message: Message, max_body_bytes: int) -> None:

@@ -30,7 +30,7 @@ from edgegrasp_service.http_bodies import (
 )
 from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
 from edgegrasp_service.http_problem import problem_response
-from edgegrasp_service.http_request import read_request, read_score_request, read_timeout
+from edgegrasp_service.http_request import read_timeout, receive_request, receive_score_request
 from edgegrasp_service.observer import observed
 from edgegrasp_service.reload import Reloader, reload_models
 from edgegrasp_service.request_id import REQUEST_ID
@@ -87,7 +87,7 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
     )
     async def detect_grasps(request: Request) -> JSONResponse:
         call = Call("http", "DetectGrasps", request_id=REQUEST_ID.get())
-        detection = await _answer(service, request, call, read_request, service.detect)
+        detection = await _answer(service, request, call, receive_request, service.detect)
         return JSONResponse(detection_body(detection))
 
     @app.post(
@@ -99,7 +99,7 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
     )
     async def score_grasps(request: Request) -> JSONResponse:
         call = Call("http", "ScoreGrasps", request_id=REQUEST_ID.get())
-        scoring = await _answer(service, request, call, read_score_request, service.score)
+        scoring = await _answer(service, request, call, receive_score_request, service.score)
         return JSONResponse(scoring_body(scoring))
 
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
@@ -137,19 +137,19 @@ async def _answer(
     service: GraspService,
     request: Request,
     call: Call,
-    read: Callable[[Request], Coroutine[Any, Any, Asked]],
-    work: Callable[[Asked, Place], Coroutine[Any, Any, Answer]],
+    receive: Callable[[Request], Coroutine[Any, Any, Callable[[], Asked]]],
+    work: Callable[[Callable[[], Asked], Place], Coroutine[Any, Any, Answer]],
 ) -> Answer:
-    """Take a place, read the request, and work on it while the client is there."""
+    """Take a place, receive the request, and work on it while the client is there."""
     with observed(service.observer, call):
         if (timeout := read_timeout(request)) is not None:
             call.limit(timeout)
         with service.admit(call) as place:
             try:
-                asked = await in_time(call, read(request))
+                read = await in_time(call, receive(request))
             except ClientDisconnect:
                 raise Cancelled("The client left before its request was whole.") from None
-            return await _unless_gone(request, work(asked, place))
+            return await _unless_gone(request, work(read, place))
 
 
 async def _unless_gone(request: Request, work: Coroutine[Any, Any, Answer]) -> Answer:

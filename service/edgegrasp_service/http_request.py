@@ -1,15 +1,13 @@
 """Read the bodies of the POST routes: JSON, a point cloud file, or a form with parts."""
 
-import gc
-import json
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from fastapi import Request
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 
 from edgegrasp_model.errors import InvalidRequest, brief
@@ -17,6 +15,7 @@ from edgegrasp_service.cloud_decoding import FILE_FORMATS
 from edgegrasp_service.core import DetectRequest, ScoreRequest
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.json_text import read_json
 from edgegrasp_service.npy_file import read_npy
 from edgegrasp_service.options_text import options_from_query
 from edgegrasp_service.sent_arrays import (
@@ -38,7 +37,6 @@ from edgegrasp_service.sent_cloud import (
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
 JSON_OR_FORM = ("application/json", "multipart/form-data")
 MAX_PART_BYTES = 2**31
-MAX_SHORT_LISTS = 20_000  # edges take 6 bytes each
 
 # Clouds of a JSON body; a form has the part `cloud`, a file, in the place of `points`.
 SOURCES: dict[str, Callable[[Any], Source | DepthCloud]] = {
@@ -70,38 +68,49 @@ def read_timeout(request: Request) -> float | None:
     return timeout
 
 
-async def read_request(request: Request) -> DetectRequest:
-    """Read one request for a detection.
+async def receive_request(request: Request) -> Callable[[], DetectRequest]:
+    """Receive what was sent to get a detection.
+
+    Returns:
+        What reads it. A long text takes seconds to read, so not in the event loop. It raises
+        InvalidRequest where the body is not what its content type says, or has unknown fields.
 
     Raises:
-        InvalidRequest: The body is not what its content type says, or has unknown fields.
+        InvalidRequest: A form cannot be taken apart, or there are query parameters beside one.
         UnsupportedMediaType: There is no reader for the content type.
         PayloadTooLarge: The body exceeds the server's limit.
     """
     media_type = _media_type(request)
     if media_type in FILE_TYPES:
         cloud = SentCloud(FileCloud(FILE_TYPES[media_type], await request.body()))
-        return DetectRequest(cloud, options_from_query(request.query_params.multi_items()))
+        query = request.query_params.multi_items()
+        return lambda: DetectRequest(cloud, options_from_query(query))
     accepted = (JSON_OR_FORM[0], *FILE_TYPES, JSON_OR_FORM[1])
-    return _request(await _read_fields(request, media_type, accepted, given=()))
+    read_fields = await _receive_fields(request, media_type, accepted, given=())
+    return lambda: _request(read_fields())
 
 
-async def read_score_request(request: Request) -> ScoreRequest:
-    """Read one request to score edges or hand poses; raises as `read_request`."""
-    fields = await _read_fields(request, _media_type(request), JSON_OR_FORM, GIVEN)
-    arrays = {name: _given(name, fields.pop(name)) for name in GIVEN if name in fields}
-    detect = _request(fields)
-    return ScoreRequest(detect.cloud, detect.options, GivenGrasps(**arrays))
+async def receive_score_request(request: Request) -> Callable[[], ScoreRequest]:
+    """Receive what was sent to score edges or hand poses; as `receive_request`."""
+    read_fields = await _receive_fields(request, _media_type(request), JSON_OR_FORM, GIVEN)
+
+    def read() -> ScoreRequest:
+        fields = read_fields()
+        arrays = {name: _given(name, fields.pop(name)) for name in GIVEN if name in fields}
+        detect = _request(fields)
+        return ScoreRequest(detect.cloud, detect.options, GivenGrasps(**arrays))
+
+    return read
 
 
 def _media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def _read_fields(
+async def _receive_fields(
     request: Request, media_type: str, accepted: tuple[str, ...], given: tuple[str, ...]
-) -> dict[str, Any]:
-    """The fields of a JSON body, or the parts of a form."""
+) -> Callable[[], dict[str, Any]]:
+    """What reads the fields of a JSON body, or the parts of a form."""
     if media_type not in accepted:
         fix = f"Send one of: {', '.join(accepted)}."
         raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
@@ -109,9 +118,8 @@ async def _read_fields(
         name = next(iter(request.query_params))
         raise InvalidRequest(name, "a query parameter", "Send options in the part `options`.")
     if media_type == "application/json":
-        fields = _object("body", await request.body())
-        _refuse_unknown(fields, (*SOURCES, *PER_POINT, *given, "options"), "field")
-        return fields
+        body = await request.body()
+        return lambda: _from_json(body, (*SOURCES, *PER_POINT, *given, "options"))
     known = ("cloud", *list(SOURCES)[1:], *PER_POINT, *given, "options")
     try:
         # The body as a whole is limited already, so its parts need not be.
@@ -119,31 +127,50 @@ async def _read_fields(
         async with request.form(
             max_files=many, max_fields=many, max_part_size=MAX_PART_BYTES
         ) as form:
-            return await _from_parts(form, known)
+            parts = [(name, await _part(part)) for name, part in form.multi_items()]
     except HTTPException as error:
         fix = "Send a file part `cloud` and a JSON part `options`."
         raise InvalidRequest("body", f"a form that cannot be read ({error.detail})", fix) from None
+    return lambda: _from_parts(parts, known)
 
 
-async def _from_parts(form: FormData, known: tuple[str, ...]) -> dict[str, Any]:
+class Part(NamedTuple):
+    """One part of a form."""
+
+    data: bytes
+    file_format: str | None  # None: it is no file
+
+
+async def _part(part: UploadFile | str) -> Part:
+    if isinstance(part, UploadFile):
+        return Part(await part.read(), _format_of(part))
+    return Part(part.encode(), None)
+
+
+def _from_json(body: bytes, known: tuple[str, ...]) -> dict[str, Any]:
+    fields = _object("body", body)
+    _refuse_unknown(fields, known, "field")
+    return fields
+
+
+def _from_parts(parts: Sequence[tuple[str, Part]], known: tuple[str, ...]) -> dict[str, Any]:
     """The parts of a form: files as FileCloud and NpyArray, JSON as what it says."""
-    _refuse_unknown(form, known, "part")
-    for name, count in Counter(name for name, _ in form.multi_items()).items():
+    counts = Counter(name for name, _ in parts)
+    _refuse_unknown(counts, known, "part")
+    for name, count in counts.items():
         if count > 1:
             raise InvalidRequest(name, f"{count} parts", "Send one.")
     fields: dict[str, Any] = {}
-    for name, part in form.items():
+    for name, (data, file_format) in parts:
         if name == "cloud":
-            if not isinstance(part, UploadFile):
+            if file_format is None:
                 raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-            fields["cloud"] = FileCloud(_format_of(part), await part.read())
-            continue
+            fields["cloud"] = FileCloud(file_format, data)
         # curl sends `-F options=@file;type=application/json` as a file too.
-        data = await part.read() if isinstance(part, UploadFile) else part.encode()
-        if isinstance(part, UploadFile) and _format_of(part) == "npy" and name != "options":
+        elif file_format == "npy" and name != "options":
             fields[name] = NpyArray(data)
         else:
-            fields[name] = _json(name, data)
+            fields[name] = read_json(name, data)
     return fields
 
 
@@ -200,24 +227,7 @@ def _format_of(upload: UploadFile) -> str:
 
 
 def _object(field: str, text: bytes) -> dict[str, Any]:
-    value = _json(field, text)
+    value = read_json(field, text)
     if not isinstance(value, dict):
         raise InvalidRequest(field, brief(value), "Send a JSON object.")
     return value
-
-
-def _json(field: str, text: bytes) -> Any:
-    lists = text.count(b"[") + text.count(b"{")
-    # Most lists are points, of 8 bytes or more. An empty one takes 3 bytes, and 64 in memory.
-    if lists > len(text) // 7 + MAX_SHORT_LISTS:
-        value = f"{lists} lists and objects in {len(text)} bytes"
-        raise InvalidRequest(field, value, "Send lists that hold numbers.")
-    collecting = gc.isenabled()
-    gc.disable()  # it would look through millions of lists again and again, and find nothing
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
-    finally:
-        if collecting:
-            gc.enable()

@@ -12,6 +12,7 @@ from edgegrasp_service.npy_file import read_npy
 
 Array = NDArray[Any]
 
+BLOCK = 4096  # rows of lists
 # Name: numbers to a row of the cloud, and their type where they come packed.
 PER_POINT = {
     "normals": (3, "<f4"),
@@ -81,24 +82,41 @@ def numbers_from_lists(field: str, values: list[Any], holes: bool = False) -> Ar
     Raises:
         InvalidRequest: Rows of different lengths, or something other than numbers.
     """
-    ragged = "Send [x, y, z] rows." if holes else "Send rows of one length."
+    # A block at a time, between which other threads run; numpy lets none while it reads lists.
+    blocks = [
+        _objects(field, values[start : start + BLOCK], holes)
+        for start in range(0, len(values), BLOCK)
+    ]
+    if len({block.shape[1:] for block, _ in blocks}) > 1:
+        raise _ragged(field, holes)
+    dtype = np.int64 if all(kinds == {int} for _, kinds in blocks) else np.float64
+    try:
+        return np.concatenate([block.astype(dtype) for block, _ in blocks])
+    except OverflowError:
+        bad = next(row for row in values if _holds(row, _too_large))
+        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
+
+
+def _objects(field: str, values: list[Any], holes: bool) -> tuple[Array, set[type]]:
+    """Numbers as they are, and of which types; raises as `numbers_from_lists`."""
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
     except ValueError:
-        raise InvalidRequest(field, "rows of different lengths", ragged) from None
+        raise _ragged(field, holes) from None
     kinds = set(map(type, array.ravel().tolist()))
     if list in kinds:
-        raise InvalidRequest(field, "rows of different lengths", ragged)
+        raise _ragged(field, holes)
     allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
     if not kinds <= allowed:
         bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
         raise InvalidRequest(field, brief(bad), "Send numbers only.")
-    try:
-        return array.astype(np.int64 if kinds == {int} else np.float64)
-    except OverflowError:
-        bad = next(row for row in values if _holds(row, _too_large))
-        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
+    return array, kinds
+
+
+def _ragged(field: str, holes: bool) -> InvalidRequest:
+    fix = "Send [x, y, z] rows." if holes else "Send rows of one length."
+    return InvalidRequest(field, "rows of different lengths", fix)
 
 
 def _holds(value: object, of_kind: Callable[[object], bool]) -> bool:

@@ -1,10 +1,9 @@
 """Threads that decode and prepare clouds and rank grasps, while another runs the network."""
 
-import asyncio
 import logging
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from edgegrasp_service.call import Call
@@ -15,6 +14,7 @@ from edgegrasp_service.observer import Observer
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+Following = TypeVar("Following")
 
 
 class StagePools:
@@ -34,16 +34,14 @@ class StagePools:
             "finish": ThreadPoolExecutor(1, thread_name_prefix="finish"),
         }
 
-    async def run(
+    def submit(
         self, call: Call, stage: str, work: Callable[..., Result], *args: object
-    ) -> Result:
+    ) -> Future[Result]:
         """Do something in the pool of a stage, if the answer is still wanted then.
 
-        Raises:
-            Cancelled: It is not.
-            DeadlineExceeded: Nor if it came.
-            NotReady: The pools are closed.
-            WorkerLost: Something tried to end the thread.
+        Returns:
+            What it gives, or one of these errors: Cancelled and DeadlineExceeded, if it is not;
+            NotReady, if the pools are closed; WorkerLost, if something tried to end the thread.
         """
 
         def checked() -> Result:
@@ -60,8 +58,8 @@ class StagePools:
                 self._observer.stage(call, stage, time.perf_counter() - start)
 
         try:
-            return await asyncio.wrap_future(self._pools[stage].submit(checked))
-        except (RuntimeError, asyncio.CancelledError):
+            return self._pools[stage].submit(checked)
+        except RuntimeError:
             if not self._closed:
                 raise
             raise NotReady(STOPPING) from None
@@ -71,3 +69,35 @@ class StagePools:
         self._closed = True
         for pool in self._pools.values():
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def then(
+    first: Future[Result], following: Callable[[Result], Future[Following]]
+) -> Future[Following]:
+    """What follows the result of another future; its error, where it has one.
+
+    The thread that ends a stage begins the next one. The event loop, which has others to wake for,
+    hears of the last only.
+    """
+    result: Future[Following] = Future()
+    result.set_running_or_notify_cancel()  # no one else may cancel it: it ends with its stages
+
+    def ended(last: Future[Following]) -> None:
+        if last.cancelled():  # by pools that close
+            result.set_exception(NotReady(STOPPING))
+        elif (error := last.exception()) is not None:
+            result.set_exception(error)
+        else:
+            result.set_result(last.result())
+
+    def begin(done: Future[Result]) -> None:
+        if done.cancelled():
+            result.set_exception(NotReady(STOPPING))
+            return
+        try:
+            following(done.result()).add_done_callback(ended)
+        except BaseException as error:
+            result.set_exception(error)
+
+    first.add_done_callback(begin)
+    return result

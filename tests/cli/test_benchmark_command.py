@@ -108,7 +108,7 @@ def test_a_recorded_attempt_comes_out_the_same(oracle: Path, tmp_path: Path) -> 
     last = attempts(oracle)[-1]
     where = ("--round", last["round"], "--attempt", last["attempt"])
     film, picture = tmp_path / "round.gif", tmp_path / "attempt.png"
-    output = run("replay", oracle, *where, "--film", film, "--picture", picture)
+    output = run("replay", "attempt", oracle, *where, "--film", film, "--picture", picture)
     assert "it came out the same" in output
     assert film.read_bytes()[:4] == b"GIF8"
     assert picture.read_bytes()[1:4] == b"PNG"
@@ -120,9 +120,9 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(oracle: Path, tmp_pat
         assert result.exit_code == 1
         return result.output
 
-    assert "attempt is 99" in refused("replay", oracle, "--attempt", 99)
-    assert "round is 7" in refused("replay", oracle, "--round", 7)
-    assert "holds no benchmark" in refused("replay", tmp_path)
+    assert "attempt is 99" in refused("replay", "attempt", oracle, "--attempt", 99)
+    assert "round is 7" in refused("replay", "attempt", oracle, "--round", 7)
+    assert "holds no benchmark" in refused("replay", "attempt", tmp_path)
     assert "holds no benchmark" in refused("compare", oracle, tmp_path)
     benchmark(tmp_path, "edge-sample", "--protocol", "giga", rounds=1)
     assert "differ in protocol" in refused("compare", oracle, tmp_path)

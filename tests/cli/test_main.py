@@ -42,6 +42,15 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_
     assert "pip install 'edgegrasp[service]'" in result.output
 
 
+def test_a_missing_package_of_a_command_in_a_group_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, tmp_path
+) -> None:
+    monkeypatch.setitem(sys.modules, "edgegrasp_sim.film", None)
+    result = CliRunner().invoke(main.app, ["replay", "attempt", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "pip install 'edgegrasp[sim]'" in result.output
+
+
 def test_a_command_that_is_not_there_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "edgegrasp_cli.serve", None)
     result = CliRunner().invoke(main.app, ["serve"])

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.canonical_frame import CanonicalFrame
 from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import clearances, collides, collision_reach
+from edgegrasp_model.collision import clearances, collides
 from edgegrasp_model.gripper import Gripper, load_gripper
-from edgegrasp_model.hand_view import hand_views
 from edgegrasp_model.obstacles import SolidBoxes
 from edgegrasp_model.options import Collision
 from edgegrasp_model.regions import OrientedBox
@@ -120,8 +119,7 @@ def panda_in_bullet() -> Iterator[tuple[Gripper, BulletHand]]:
 
 def ours(hands: np.ndarray, gripper: Gripper, request: Collision) -> np.ndarray:
     here = scene()
-    view = hand_views(here.cloud, hands, collision_reach(gripper, request))
-    return collides(here, view, hands, gripper, request)
+    return collides(here, hands, gripper, request)
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.004])

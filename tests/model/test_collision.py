@@ -11,9 +11,12 @@ PANDA = load_gripper()
 HAND = np.eye(4, dtype=np.float32)[None]
 
 
+def cloud_of(*points: tuple[float, float, float]) -> Cloud:
+    return Cloud(np.array(points, np.float32), np.zeros((len(points), 3), np.float32))
+
+
 def seen(*points: tuple[float, float, float]):
-    cloud = Cloud(np.array(points, np.float32), np.zeros((len(points), 3), np.float32))
-    return hand_views(cloud, HAND, reach_of(PANDA))
+    return hand_views(cloud_of(*points), HAND, reach_of(PANDA))
 
 
 @pytest.mark.parametrize(
@@ -32,7 +35,7 @@ def seen(*points: tuple[float, float, float]):
     ],
 )
 def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hits: bool) -> None:
-    assert meets_cloud(seen(point), HAND, PANDA, Collision()).tolist() == [hits]
+    assert meets_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
 
 
 def test_the_width_is_what_lies_between_the_fingers_and_clearance() -> None:

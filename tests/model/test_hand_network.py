@@ -15,7 +15,7 @@ from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.hand_network import PIECE
 from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.network_config import HAND, NetworkConfig
 from edgegrasp_model.support import SupportPlane
 
 PANDA = load_gripper()
@@ -133,14 +133,25 @@ def test_a_hand_with_nothing_around_it_has_a_score() -> None:
 
 
 def test_joined_batches_score_as_each_alone() -> None:
+    """To the last bit, whatever their sizes: a request gets the same scores in any company."""
     batches = [look(*scene(seed)) for seed in range(3)] * (PIECE // 60)
+    batches += [first_hands(batches[0], count) for count in (1, 2, 3, 5, 17)]
     joined = HandBatch.concatenate(batches)
     assert len(joined.contact) > PIECE
     assert joined.num_balls == sum(batch.num_balls for batch in batches)
-    apart = torch.cat([scores(batch) for batch in batches])
-    torch.testing.assert_close(scores(joined), apart, atol=1e-5, rtol=1e-4)
+    apart = torch.cat([scores(batch, HAND) for batch in batches])
+    assert torch.equal(scores(joined, HAND), apart)
     with pytest.raises(ValueError, match="batches: got none"):
         HandBatch.concatenate([])
+
+
+def first_hands(batch: HandBatch, count: int) -> HandBatch:
+    return replace(
+        batch,
+        description=batch.description[:count],
+        points=batch.points[:count],
+        point_count=batch.point_count[:count],
+    )
 
 
 def test_the_description_is_standardised_within() -> None:

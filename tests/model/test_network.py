@@ -13,6 +13,13 @@ from edgegrasp_model.network_config import EDGEGRASP, EDGEGRASP_SMALL, VN_EDGEGR
 
 SEEDS = st.integers(0, 2**32 - 1)
 ARCHITECTURES = ["edgegrasp", "vn-edgegrasp"]
+VN_OF_FEW = replace(
+    VN_EDGEGRASP,
+    conv_widths=(32, 48, 64),
+    global_widths_1=(64, 64, 64),
+    global_widths_2=(64, 64),
+    classifier_widths=(64, 32),
+)
 
 
 def scores(network: torch.nn.Module, batch: BallBatch) -> torch.Tensor:
@@ -111,6 +118,18 @@ def test_scores_do_not_depend_on_batch_composition(random_scene, tiny_config, ar
             rtol=0,
             atol=1e-10,
         )
+
+
+@pytest.mark.parametrize("config", [EDGEGRASP_SMALL, VN_OF_FEW], ids=ARCHITECTURES)
+def test_joined_batches_score_as_each_alone_to_the_last_bit(random_scene, config):
+    """So that batching changes no answer; the widths are such as networks have."""
+    network = build_network(config)
+    batches = [random_scene(seed).batch(torch.float32) for seed in range(4)]
+    batches += [random_scene(seed).only_ball(seed).batch(torch.float32) for seed in range(2)]
+    with torch.inference_mode():
+        together = network(BallBatch.concatenate(batches))
+        alone = torch.cat([network(batch) for batch in batches])
+    assert torch.equal(together, alone)
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)

@@ -1,0 +1,233 @@
+"""Loops over the points of a cloud: what hands see and meet, and who is near whom.
+
+They take what NumPy or PyTorch need many passes over large arrays for, a hand or a point at a time,
+in the processor's cache. The callers hold the plain way of each, for where Numba is absent.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.compiled import compiled
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
+BLOCK = 512  # points at a time, so that their positions stay in the first cache
+
+
+def seen_from(
+    points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
+) -> tuple[Int64, Int64, Float32]:
+    """Points between two corners of hand frames.
+
+    Args:
+        points: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        low: (3,) corner, hand frame, metres.
+        high: (3,) corner.
+
+    Returns:
+        Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
+    """
+    columns, turn, shift = _columns(points), *_to_hand(T_cloud_hand)
+    count = np.empty(len(turn), dtype=np.int64)
+    _count_within(columns, turn, shift, low, high, count)
+    hand = np.repeat(np.arange(len(turn)), count)
+    row = np.empty(len(hand), dtype=np.int64)
+    position = np.empty((len(hand), 3), dtype=np.float32)
+    _fill_within(columns, turn, shift, low, high, np.cumsum(count) - count, row, position)
+    return hand, row, position
+
+
+def meets(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
+    """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
+    turn, shift = _to_hand(T_cloud_hand)
+    hit = np.zeros(len(turn), dtype=np.bool_)
+    _meet(_columns(points), turn, shift, boxes.astype(np.float32), hit)
+    return hit
+
+
+def clearance(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
+    """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
+    turn, shift = _to_hand(T_cloud_hand)
+    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
+    nearest = np.full(len(turn), np.inf, dtype=np.float32)
+    extents = np.stack((middle, half), axis=1).astype(np.float32)
+    _nearest_to_boxes(_columns(points), turn, shift, extents, nearest)
+    return nearest
+
+
+def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
+    """The k nearest points of the same group, nearest first; the own row fills up small groups.
+
+    Args:
+        points: (P, 3), group after group.
+        bounds: (G + 1,) where each group begins, and the last ends.
+        k: How many, the point itself included.
+
+    Returns:
+        (P, k) rows of `points`.
+    """
+    nearest = np.empty((len(points), k), dtype=np.int64)
+    if len(points):
+        _nearest(_columns(points), bounds, nearest)
+    return nearest
+
+
+def _columns(points: Float32) -> Float32:
+    return np.ascontiguousarray(points.T, dtype=np.float32)  # (3, N)
+
+
+def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
+    """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
+    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
+    return turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
+
+
+@compiled("contract")
+def _position(columns: Float32, i: int, turn: Float32, shift: Float32) -> tuple[float, ...]:
+    px, py, pz = columns[0, i], columns[1, i], columns[2, i]
+    return (
+        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
+        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
+        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
+    )
+
+
+@compiled("contract")
+def _count_within(
+    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32, count: Int64
+) -> None:
+    for e in range(len(turn)):
+        found = 0
+        for i in range(columns.shape[1]):
+            x, y, z = _position(columns, i, turn[e], shift[e])
+            found += (
+                (x > low[0])
+                & (x < high[0])
+                & (y > low[1])
+                & (y < high[1])
+                & (z > low[2])
+                & (z < high[2])
+            )
+        count[e] = found
+
+
+@compiled("contract")
+def _fill_within(
+    columns: Float32,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    first: Int64,
+    row: Int64,
+    position: Float32,
+) -> None:
+    for e in range(len(turn)):
+        place = first[e]
+        for i in range(columns.shape[1]):
+            x, y, z = _position(columns, i, turn[e], shift[e])
+            if (
+                (x > low[0])
+                & (x < high[0])
+                & (y > low[1])
+                & (y < high[1])
+                & (z > low[2])
+                & (z < high[2])
+            ):
+                row[place] = i
+                position[place, 0], position[place, 1], position[place, 2] = x, y, z
+                place += 1
+
+
+@compiled("contract")
+def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
+    count = columns.shape[1]
+    at = np.empty((3, BLOCK), np.float32)
+    for e in range(len(turn)):
+        for start in range(0, count, BLOCK):
+            size = min(BLOCK, count - start)
+            for i in range(size):
+                x, y, z = _position(columns, start + i, turn[e], shift[e])
+                at[0, i], at[1, i], at[2, i] = x, y, z
+            inside = 0
+            for b in range(len(boxes)):
+                low, high = boxes[b, 0], boxes[b, 1]
+                for i in range(size):
+                    inside += (
+                        (at[0, i] > low[0])
+                        & (at[0, i] < high[0])
+                        & (at[1, i] > low[1])
+                        & (at[1, i] < high[1])
+                        & (at[2, i] > low[2])
+                        & (at[2, i] < high[2])
+                    )
+            if inside:
+                hit[e] = True
+                break
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_boxes(
+    columns: Float32, turn: Float32, shift: Float32, extents: Float32, nearest: Float32
+) -> None:
+    zero = np.float32(0.0)
+    for e in range(len(turn)):
+        for b in range(len(extents)):
+            middle, half = extents[b, 0], extents[b, 1]
+            apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
+            for i in range(columns.shape[1]):
+                x, y, z = _position(columns, i, turn[e], shift[e])
+                x = abs(x - middle[0]) - half[0]
+                y = abs(y - middle[1]) - half[1]
+                z = abs(z - middle[2]) - half[2]
+                deepest = min(deepest, max(x, y, z))
+                x, y, z = max(x, zero), max(y, zero), max(z, zero)
+                apart = min(apart, x * x + y * y + z * z)
+            nearest[e] = min(nearest[e], deepest if deepest < zero else np.sqrt(apart))
+
+
+@compiled("contract")
+def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
+    k = nearest.shape[1]
+    largest = np.max(bounds[1:] - bounds[:-1])
+    squared = np.empty(largest, np.float32)
+    near = np.empty(largest, np.int64)
+    best = np.empty(k, np.float64)
+    for group in range(len(bounds) - 1):
+        start, stop = bounds[group], bounds[group + 1]
+        best[:] = np.inf
+        for i in range(start, stop):
+            px, py, pz = columns[0, i], columns[1, i], columns[2, i]
+            # The k nearest of the row before lie at most this far from here: a safe limit.
+            step = 0.0
+            if i > start:
+                for axis in range(3):
+                    step += (np.float64(columns[axis, i]) - columns[axis, i - 1]) ** 2
+            limit = np.float32((np.sqrt(best[k - 1]) + np.sqrt(step)) ** 2 * (1.0 + ROUNDING))
+            for j in range(start, stop):
+                x, y, z = columns[0, j] - px, columns[1, j] - py, columns[2, j] - pz
+                squared[j - start] = x * x + y * y + z * z
+            found = 0
+            for j in range(stop - start):
+                near[found] = j
+                found += squared[j] <= limit
+            mine = nearest[i]
+            mine[:] = i
+            best[:] = np.inf
+            for c in range(found):
+                j = start + near[c]
+                x = np.float64(columns[0, j]) - np.float64(px)
+                y = np.float64(columns[1, j]) - np.float64(py)
+                z = np.float64(columns[2, j]) - np.float64(pz)
+                here = x * x + y * y + z * z
+                if here < best[k - 1]:
+                    place = k - 1
+                    while place > 0 and best[place - 1] > here:
+                        best[place], mine[place] = best[place - 1], mine[place - 1]
+                        place -= 1
+                    best[place], mine[place] = here, j
