@@ -6,13 +6,13 @@ it was seen, how it stands to gravity and support.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from edgegrasp_model.candidates import Candidates, support_clearance
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Boxes, Gripper
 from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView, hand_views, reach_of
-from edgegrasp_model.hidden_space import DepthMap
+from edgegrasp_model.hidden_space import hidden_shares
 from edgegrasp_model.support import SupportPlane
 
 Float32 = NDArray[np.float32]
@@ -94,7 +94,7 @@ def describe_hands(
         *_between_fingers(view, x, y, z, normal, gripper),
         _cut_off(view, x, y, z, at_side, gripper),
         *_directions(candidates.T_cloud_hand, viewpoint, up, side),
-        *_hidden(cloud, candidates.T_cloud_hand, viewpoint, gripper),
+        *hidden_shares(cloud.points, candidates.T_cloud_hand, viewpoint, up, gripper),
         *_stance(cloud, candidates, gripper, up, support),
     ]
     return np.stack(columns, axis=1).astype(np.float32)
@@ -151,58 +151,6 @@ def _directions(
         toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
-
-
-def _hidden(
-    cloud: Cloud, T_cloud_hand: Float32, viewpoint: Float32 | None, gripper: Gripper
-) -> list[Float32]:
-    """How much of each finger, of the hand and of the space around is where no camera looked."""
-    regions = _probes(gripper)
-    if viewpoint is None or len(cloud.points) == 0:
-        return [np.zeros(len(T_cloud_hand), dtype=np.float32)] * len(regions)
-    depth = DepthMap.of_cloud(cloud.points, viewpoint)
-    probes = np.concatenate(regions).astype(np.float32)  # (S, 3)
-    turn, shift = T_cloud_hand[:, :3, :3], T_cloud_hand[:, None, :3, 3]
-    hidden = depth.hidden(probes @ turn.transpose(0, 2, 1) + shift)  # (E, S)
-    ends = np.cumsum([len(region) for region in regions])[:-1]
-    return [part.mean(axis=1) for part in np.split(hidden, ends, axis=1)]
-
-
-def _probes(gripper: Gripper) -> list[NDArray[np.float64]]:
-    """Points of each part of the open hand, and around it, that are looked up; hand frame."""
-    half, inner = gripper.pad_half_width, gripper.max_opening / 2
-    tip, palm = gripper.tip_z, gripper.palm_z
-    middle, thick = (tip + palm) / 2, 0.5 * (gripper.boxes(2 * inner)[1, 1, 1] - inner)
-    finger = []
-    for low, high in ((middle, tip), (palm, middle)):
-        for side in (1.0, -1.0):
-            y = side * (inner + np.array([0.3, 1.4]) * thick)
-            finger.append(_grid([-0.7 * half, 0.7 * half], y, np.linspace(low, high, 4)[1:]))
-    beyond = [
-        _grid([0.0], [side * (inner + thick)], [tip + 0.006, tip + 0.012]) for side in (1, -1)
-    ]
-    x = [-0.7 * half, 0.7 * half]
-    between = [
-        _grid(x, inner * np.array(part), np.linspace(palm, tip, 5)[1:])
-        for part in ([0.5, 0.85], [-0.25, 0.25], [-0.85, -0.5])
-    ]
-    hand = np.concatenate(
-        [
-            _grid(
-                *(
-                    np.linspace(a, b, n + 2)[1:-1]
-                    for a, b, n in zip(low, high, (2, 5, 2), strict=True)
-                )
-            )
-            for low, high in np.asarray(gripper.hand_boxes)
-        ]
-    )
-    return [*finger, *beyond, *between, hand]
-
-
-def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> NDArray[np.float64]:
-    """All points with these coordinates.  # (X * Y * Z, 3)."""
-    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:

@@ -15,6 +15,7 @@ from edgegrasp_model.layers import maximum, mlp
 from edgegrasp_model.network_config import NetworkConfig
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
+DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
 PIECE = 256  # hands at a time, so that the work stays in cache
 
 
@@ -45,7 +46,8 @@ class HandNet(nn.Module):
             torch.split(batch.points, PIECE), torch.split(batch.point_count, PIECE), strict=True
         )
         around = torch.cat([self._around(points, count) for points, count in pieces])  # (E, 2 C)
-        logits: Tensor = self.classifier(torch.cat((description, around), dim=1)).squeeze(1)
+        seen = F.dropout(torch.cat((description, around), dim=1), DROPOUT, self.training)
+        logits: Tensor = self.classifier(seen).squeeze(1)
         return logits  # (E,)
 
     def _around(self, points: Tensor, count: Tensor) -> Tensor:

@@ -53,7 +53,7 @@ def test_points_in_a_finger_and_between_the_fingers_are_counted() -> None:
     normals = np.array([[0, 0, 1], [0, 1, 0], [0, -1, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=-0.02)
     row = describe(Cloud(points, normals), np.array([0]), np.array([1]), UP, support)[0]
-    in_fingers, between, depth, contact_height = row[0:2], row[7], row[43], row[49]
+    in_fingers, between, depth, contact_height = row[0:2], row[7], row[53], row[59]
     np.testing.assert_allclose(sorted(in_fingers), [0.0, np.log(2)], atol=1e-6)
     np.testing.assert_allclose(between, np.log(4), atol=1e-6)  # p_a and both sides
     np.testing.assert_allclose(depth, 0.02, atol=1e-6)

@@ -17,6 +17,7 @@ from edgegrasp_model.hand_description import AXIS, FACING, HEIGHTS, SLAB, UNKNOW
 from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR
 from edgegrasp_model.on_device.candidates import DeviceCandidates, support_clearance
 from edgegrasp_model.on_device.hand_view import DeviceView, within
+from edgegrasp_model.on_device.hidden_space import hidden_shares
 from edgegrasp_model.on_device.scene import DeviceScene
 
 
@@ -44,6 +45,7 @@ def describe_hands(
         *_between_fingers(view.there, position, normal, gripper),
         _cut_off(scene, view, position, gripper),
         *_directions(scene, candidates.T_cloud_hand, side),
+        *hidden_shares(scene, candidates.T_cloud_hand, gripper),
         *_stance(scene, candidates, gripper),
     ]
     return torch.stack(columns, dim=1).float()
