@@ -15,7 +15,7 @@ Option = typer.Option
 
 
 def serve(config: Path | None, print_config: bool, **flags: Any) -> None:
-    """Answer requests over HTTP and gRPC until SIGTERM; SIGHUP reloads weights and tokens.
+    """Answer requests until SIGTERM; SIGHUP reloads weights, tokens and certificates.
 
     Prints one line with both addresses once weights are loaded. What no flag sets comes from
     EDGEGRASP_* environment variables, such as EDGEGRASP_HTTP_PORT, then from the file of --config,

@@ -6,7 +6,7 @@ A protocol is a data file in `protocols/`, named and versioned; its constants go
 from __future__ import annotations
 
 import tomllib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,6 +82,8 @@ class CameraRules:
         polar_degrees: from world z.
         azimuth_degrees: from world x.
         target: the point looked at, world frame, metres.
+        surface_voxel: metres between the points of a surface, however aslant it is seen; 0: one
+            point for each pixel.
     """
 
     views: int
@@ -89,6 +91,7 @@ class CameraRules:
     polar_degrees: Range
     azimuth_degrees: Range
     target: tuple[float, float, float]
+    surface_voxel: float = 0.0
 
     def view_range(self) -> ViewRange:
         """The same in radians, to sample from."""
@@ -190,7 +193,10 @@ class Protocol:
 
     def to_json(self) -> dict[str, Any]:
         """Every constant, ready for JSON."""
-        return asdict(self)
+        table = asdict(self)
+        if self.camera.surface_voxel == 0:  # results from before it was known go on
+            del table["camera"]["surface_voxel"]
+        return table
 
 
 def protocol_names() -> list[str]:
@@ -242,7 +248,7 @@ def protocol_from(table: dict[str, Any]) -> Protocol:
 
 def _build(kind: type[Any], table: dict[str, Any], where: str) -> Any:
     known = {field.name for field in fields(kind)}
-    if missing := known - table.keys():
+    if missing := {f.name for f in fields(kind) if f.default is MISSING} - table.keys():
         raise ValueError(f"{where} lacks {', '.join(sorted(missing))}; add it")
     if unknown := table.keys() - known:
         raise ValueError(f"{where} has unknown {', '.join(sorted(unknown))}; remove it")

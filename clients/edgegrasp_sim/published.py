@@ -13,7 +13,7 @@ def published(protocol: str, scene: str, samples: str | None = None) -> list[dic
     """The published results of a protocol and scene, in the file's order; rates in per cent.
 
     Args:
-        protocol: its name.
+        protocol: its name; a variant, named `<protocol>-<variant>`, has the figures of both.
         scene: kind of the scenes.
         samples: only those at these approach points and candidates, such as `32-2k`.
     """
@@ -21,6 +21,7 @@ def published(protocol: str, scene: str, samples: str | None = None) -> list[dic
     return [
         row
         for row in rows
-        if (row["protocol"], row["scene"]) == (protocol, scene)
+        if f"{protocol}-".startswith(f"{row['protocol']}-")
+        and row["scene"] == scene
         and samples in (None, row.get("samples"))
     ]

@@ -13,6 +13,7 @@ from edgegrasp_sim.grasping import GraspResult, run_grasp
 from edgegrasp_sim.gripper import Gripper
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import require_pose
+from edgegrasp_sim.resampling import resample_surfaces
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
@@ -237,6 +238,7 @@ class ClutterSimulation:
         noise_std: float = NOISE_STD,
         depth_noise: DepthNoise | None = None,
         with_table: bool = False,
+        surface_voxel: float = 0.0,
     ) -> Observation:
         """Look at the scene from a random viewpoint, or several around it.
 
@@ -248,6 +250,7 @@ class ClutterSimulation:
             noise_std: standard deviation of the noise in each coordinate of each point, metres.
             depth_noise: noise of the images.
             with_table: leave the table in the cloud.
+            surface_voxel: see `observe_from`.
         """
         return self.observe_from(
             views.sample_ring(rng_camera, num_views),
@@ -255,6 +258,7 @@ class ClutterSimulation:
             noise_std=noise_std,
             depth_noise=depth_noise,
             with_table=with_table,
+            surface_voxel=surface_voxel,
         )
 
     def observe_from(
@@ -265,8 +269,19 @@ class ClutterSimulation:
         noise_std: float = NOISE_STD,
         depth_noise: DepthNoise | None = None,
         with_table: bool = False,
+        surface_voxel: float = 0.0,
     ) -> Observation:
-        """Look at the scene from each of the given poses, (4, 4) each; see `observe`."""
+        """Look at the scene from each of the given poses, (4, 4) each.
+
+        Args:
+            T_world_cameras: one for each image.
+            rng_noise: stream of the noise.
+            noise_std: see `observe`, as for what follows.
+            depth_noise: of the images.
+            with_table: leave the table in the cloud.
+            surface_voxel: metres between the points of a surface, however aslant it is seen; 0:
+                one point for each pixel.
+        """
         box = WORKSPACE_WITH_TABLE if with_table else WORKSPACE
         clouds = []
         for T_world_camera in T_world_cameras:
@@ -274,6 +289,11 @@ class ClutterSimulation:
             if depth_noise is not None:
                 depth = depth_noise.apply(depth, rng_noise)
             points = _crop(self.camera.points(depth, T_world_camera), box, _CROP_MARGIN)
+            if surface_voxel > 0 and len(points) > 0:
+                around = np.stack((points.min(axis=0), points.max(axis=0)))
+                points = resample_surfaces(
+                    depth, T_world_camera, self.camera.intrinsics, around, surface_voxel
+                )
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             clouds.append(_crop(points, box, 0.0).astype(np.float32))
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)

@@ -227,6 +227,7 @@ class RoundDriver:
             noise_std=rules.noise.point_std,
             depth_noise=rules.noise.depth_noise(),
             with_table=rules.planning.table == "ransac",
+            surface_voxel=rules.camera.surface_voxel,
         )
         self.view += 1
         above = self._seen.cloud[:, 2] > self._seen.table_height + 0.005

@@ -266,11 +266,10 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
         (E,) metres; negative below the plane.
     """
     boxes = gripper.boxes(gripper.max_opening, gripper.foremost_z - gripper.tip_z)
-    low, high = np.moveaxis(boxes, 1, 0)  # (B, 3) each
-    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(8, 3)
-    corners = np.where(picks[None] == 0, low[:, None], high[:, None]).reshape(-1, 3)  # (8B, 3)
+    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
     normal = np.asarray(support.normal)
     normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)
     origin_height = T_cloud_hand[:, :3, 3] @ normal - support.offset  # (E,)
-    clearance: Float32 = origin_height + (normal_in_hand @ corners.T).min(axis=1)
+    lowest = (normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T).min(axis=1)
+    clearance: Float32 = origin_height + lowest
     return clearance.astype(np.float32)

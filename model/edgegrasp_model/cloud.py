@@ -125,9 +125,10 @@ def estimate_normals(points: Float32) -> Float32:
     """
     k = min(NORMAL_NEIGHBORS, len(points))
     _, rows = cKDTree(points).query(points, k=range(1, k + 1))
-    near = points[rows].astype(np.float64)  # (N, k, 3)
-    near -= near.mean(axis=1, keepdims=True)
-    _, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near)  # (N, 3, 3), ascending variance
+    columns = [column[rows].astype(np.float64) for column in points.T]  # x, y, z, (N, k) each
+    columns = [column - column.mean(axis=1, keepdims=True) for column in columns]
+    products = [[np.einsum("nk,nk->n", one, other) for other in columns] for one in columns]
+    _, vectors = np.linalg.eigh(np.array(products).transpose(2, 0, 1))  # ascending variance
     return vectors[:, :, 0].astype(np.float32)
 
 

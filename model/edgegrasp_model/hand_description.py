@@ -5,6 +5,8 @@ quick to learn from: how many points the hand would hit, what lies between its f
 it was seen, how it stands to gravity and support.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,14 +25,31 @@ FACING = 0.7  # cosine from which a normal faces a finger
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
 
 
-class _Region:
-    """Statistics, per candidate, of the seen points that lie in one region."""
+class _Points(NamedTuple):
+    """Seen points, P of them, ordered by hand."""
 
-    def __init__(self, view: HandView, mask: NDArray[np.bool_]) -> None:
+    hand: NDArray[np.int64]  # (P,) ascending
+    row: NDArray[np.int64]  # (P,) row of the cloud
+    x: Float32  # (P,) metres, in the hand frame
+    y: Float32
+    z: Float32
+    num_hands: int
+
+    def where(self, mask: NDArray[np.bool_]) -> "_Points":
+        """Those for which something holds."""
+        kept = np.flatnonzero(mask)
+        x, y, z = self.x[kept], self.y[kept], self.z[kept]
+        return _Points(self.hand[kept], self.row[kept], x, y, z, self.num_hands)
+
+
+class _Region:
+    """Statistics, per hand, of the seen points that lie in one region."""
+
+    def __init__(self, points: _Points, mask: NDArray[np.bool_]) -> None:
         self._mask = mask
-        candidate = view.candidate[mask]
-        self.count = np.bincount(candidate, minlength=view.num_candidates)
-        self._candidate = candidate
+        hand = points.hand[mask]
+        self.count = np.bincount(hand, minlength=points.num_hands)
+        self._hand = hand
         self._starts = np.cumsum(self.count) - self.count
         self._present = self.count > 0
 
@@ -38,7 +57,7 @@ class _Region:
         return np.log1p(self.count).astype(np.float32)
 
     def mean(self, values: Float32, default: float = 0.0) -> Float32:
-        sums = np.bincount(self._candidate, values[self._mask], minlength=len(self.count))
+        sums = np.bincount(self._hand, values[self._mask], minlength=len(self.count))
         means = sums / np.maximum(self.count, 1)
         return np.where(self._present, means, default).astype(np.float32)
 
@@ -84,15 +103,13 @@ def describe_hands(
     """
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
-    x, y, z = (np.ascontiguousarray(column) for column in view.position.T)
-    turn = candidates.T_cloud_hand[view.candidate, :3, :3]
-    normal = np.einsum("pd,pdk->kp", cloud.normals[view.row], turn)  # (3, P)
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
-    x, normal[0] = x * side[view.candidate], normal[0] * side[view.candidate]
+    x, y, z = np.ascontiguousarray(view.position.T)
+    seen = _Points(view.candidate, view.row, x * side[view.candidate], y, z, view.num_candidates)
     columns = [
-        *_hits(view, x, y, z, gripper),
-        *_between_fingers(view, x, y, z, normal, gripper),
-        _cut_off(view, x, y, z, at_side, gripper),
+        *_hits(seen, gripper),
+        *_between_fingers(seen, cloud.normals, candidates.T_cloud_hand, side, gripper),
+        _cut_off(seen, at_side, gripper),
         *_directions(candidates.T_cloud_hand, viewpoint, up, side),
         *hidden_shares(cloud.points, candidates.T_cloud_hand, viewpoint, up, gripper),
         *_stance(cloud, candidates, gripper, up, support),
@@ -119,24 +136,17 @@ def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
     return unknown
 
 
-def _cut_off(
-    view: HandView,
-    x: Float32,
-    y: Float32,
-    z: Float32,
-    at_side: NDArray[np.bool_] | None,
-    gripper: Gripper,
-) -> Float32:
+def _cut_off(seen: _Points, at_side: NDArray[np.bool_] | None, gripper: Gripper) -> Float32:
     """Points between the fingers where a side of the workspace cuts things off."""
-    if at_side is None:
-        return np.zeros(view.num_candidates, dtype=np.float32)
+    if at_side is None or not at_side.any():
+        return np.zeros(seen.num_hands, dtype=np.float32)
     inside = (
-        (np.abs(x) < gripper.pad_half_width + NEAR)
-        & (np.abs(y) < gripper.max_opening / 2)
-        & (z > gripper.palm_z)
-        & (z < gripper.tip_z + NEAR)
+        (np.abs(seen.x) < gripper.pad_half_width + NEAR)
+        & (np.abs(seen.y) < gripper.max_opening / 2)
+        & (seen.z > gripper.palm_z)
+        & (seen.z < gripper.tip_z + NEAR)
     )
-    return _Region(view, inside & at_side[view.row]).log_count()
+    return _Region(seen, inside & at_side[seen.row]).log_count()
 
 
 def _directions(
@@ -153,24 +163,30 @@ def _directions(
     return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
 
 
-def _hits(view: HandView, x: Float32, y: Float32, z: Float32, gripper: Gripper) -> list[Float32]:
+def _hits(seen: _Points, gripper: Gripper) -> list[Float32]:
     """Points inside the open hand, near its fingers, on its way in and beyond its tips."""
     hand, fingers = gripper.hand_boxes, gripper.finger_boxes
     inner = gripper.max_opening / 2
-    in_line = (np.abs(x) < gripper.pad_half_width) & (np.abs(y) < inner)
+    on_way = _in_any(hand, seen.x, seen.y, seen.z, behind=np.inf)
+    # Few points lie in the fingers' plane: the rest need not be compared with their boxes.
+    low, high = min(box[0][0] for box in fingers), max(box[1][0] for box in fingers)
+    level = (seen.x > low - NEAR) & (seen.x < high + NEAR)
+    near = seen.where(level)
+    x, y, z = near.x, near.y, near.z
     right, left = (x, y - inner, z), (x, -y - inner, z)  # from each finger's inner face
+    in_line = (np.abs(x) < gripper.pad_half_width) & (np.abs(y) < inner)
+    on_way[level] |= _in_any(fingers, *right, behind=APPROACH_LENGTH)
+    on_way[level] |= _in_any(fingers, *left, behind=APPROACH_LENGTH)
     regions = [
-        _in_any(fingers, *right),
-        _in_any(fingers, *left),
-        _in_any(hand, x, y, z),
-        _in_any(fingers, *right, around=NEAR),
-        _in_any(fingers, *left, around=NEAR),
-        _in_any(hand, x, y, z, behind=np.inf)
-        | _in_any(fingers, *right, behind=APPROACH_LENGTH)
-        | _in_any(fingers, *left, behind=APPROACH_LENGTH),
-        in_line & (z >= gripper.tip_z),
+        _Region(near, _in_any(fingers, *right)),
+        _Region(near, _in_any(fingers, *left)),
+        _Region(seen, _in_any(hand, seen.x, seen.y, seen.z)),
+        _Region(near, _in_any(fingers, *right, around=NEAR)),
+        _Region(near, _in_any(fingers, *left, around=NEAR)),
+        _Region(seen, on_way),
+        _Region(near, in_line & (z >= gripper.tip_z)),
     ]
-    return [_Region(view, region).log_count() for region in regions]
+    return [region.log_count() for region in regions]
 
 
 def _in_any(
@@ -191,33 +207,35 @@ def _in_any(
 
 
 def _between_fingers(
-    view: HandView, x: Float32, y: Float32, z: Float32, normal: Float32, gripper: Gripper
+    seen: _Points, normals: Float32, T_cloud_hand: Float32, side: Float32, gripper: Gripper
 ) -> list[Float32]:
     """Extent, middle and normals of what the closing fingers would meet."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
-    tip, palm = gripper.foremost_z, gripper.palm_z
-    z = z - palm
-    middle = (tip - palm) / 2
-    around = (np.abs(y) < inner) & (z > 0) & (z < tip - palm)
-    inside = around & (np.abs(x) < half)
-    wide = _Region(view, around & (np.abs(x) < 3 * half))
-    between = _Region(view, inside)
+    length = gripper.foremost_z - gripper.palm_z
+    above = seen.z - gripper.palm_z
+    around = (np.abs(seen.y) < inner) & (above > 0) & (above < length)
+    points = seen.where(around & (np.abs(seen.x) < 3 * half))
+    x, y, z, middle = points.x, points.y, points.z - gripper.palm_z, length / 2
+    nx, ny, nz = np.einsum("pd,pdk->kp", normals[points.row], T_cloud_hand[points.hand, :3, :3])
+    nx *= side[points.hand]
+    inside = np.abs(x) < half
+    wide = _Region(points, np.ones(len(x), dtype=bool))
+    between = _Region(points, inside)
     y_high, y_low = between.highest(y), between.lowest(y)
-    nx, ny, nz = normal
     columns = [
         between.log_count(),
         *(between.highest(x), between.lowest(x), between.mean(x)),
         *(y_high, y_low, between.mean(y)),
-        *(between.highest(z), between.lowest(z, tip - palm), between.mean(z, middle)),
+        *(between.highest(z), between.lowest(z, length), between.mean(z, middle)),
         *(wide.log_count(), wide.highest(x), wide.lowest(x), wide.mean(x)),
         *(between.mean(np.abs(nx)), between.mean(np.abs(ny)), between.mean(nz)),
-        _Region(view, inside & (ny > FACING)).log_count(),
-        _Region(view, inside & (ny < -FACING)).log_count(),
-        _Region(view, inside & (y > AXIS)).mean(ny),
-        _Region(view, inside & (y < -AXIS)).mean(ny),
+        _Region(points, inside & (ny > FACING)).log_count(),
+        _Region(points, inside & (ny < -FACING)).log_count(),
+        _Region(points, inside & (y > AXIS)).mean(ny),
+        _Region(points, inside & (y < -AXIS)).mean(ny),
     ]
-    for first in (y > y_high[view.candidate] - SLAB, y < y_low[view.candidate] + SLAB):
-        slab = _Region(view, inside & first)  # what a finger meets first
+    for first in (y > y_high[points.hand] - SLAB, y < y_low[points.hand] + SLAB):
+        slab = _Region(points, inside & first)  # what a finger meets first
         columns += [slab.log_count(), slab.mean(ny), slab.mean(z, middle), slab.mean(x)]
     return columns
 

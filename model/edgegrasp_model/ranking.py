@@ -61,8 +61,9 @@ def suppress(
         best, left = int(left[0]), left[1:]
         kept.append(best)
         apart = np.linalg.norm(T_cloud_tcp[left, :3, 3] - T_cloud_tcp[best, :3, 3], axis=1)
-        turned = rotation_distance(T_cloud_tcp[left, :3, :3], T_cloud_tcp[best, :3, :3])
-        near = (apart < suppression.translation) & (turned < suppression.rotation)
+        near = apart < suppression.translation
+        turned = rotation_distance(T_cloud_tcp[left[near], :3, :3], T_cloud_tcp[best, :3, :3])
+        near[near] = turned < suppression.rotation
         dropped.append(left[near])
         left = left[~near]
     return np.asarray(kept, dtype=np.int64), np.concatenate(dropped)

@@ -88,7 +88,7 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
     async def ReloadModels(  # noqa: N802
         self, request: grasp_pb2.ReloadModelsRequest, context: Any
     ) -> grasp_pb2.ReloadModelsResponse:
-        """Load weights and tokens anew."""
+        """Load weights, tokens and certificates anew."""
         try:
             return reloaded_message(await reload_models(self._reloader))
         except Exception as error:

@@ -108,7 +108,7 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
 
     @app.post(
         "/v1/models:reload",
-        summary="Load weights and tokens anew; needs an admin token",
+        summary="Load weights, tokens and certificates anew; needs an admin token",
         response_model=ModelsBody,
         responses=RELOAD_PROBLEMS,
     )

@@ -1,4 +1,4 @@
-"""Reload: new weights and tokens in the place of the old ones, or a reason why not."""
+"""Reload: new weights, tokens and certificates in the place of the old ones, or why not."""
 
 import asyncio
 import logging
@@ -8,6 +8,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.core import GraspService, ModelInfo
 from edgegrasp_service.edge import Edge
 from edgegrasp_service.errors import NotReady, PermissionDenied, ReloadFailed
+from edgegrasp_service.tls import ServerTls
 from edgegrasp_service.tokens import ADMIN_FIX, HEADER, IS_ADMIN, Tokens
 
 logger = logging.getLogger(__name__)
@@ -20,20 +21,26 @@ class Reloader:
         service: Whose weights are loaded beside the old ones, which answer meanwhile.
         edge: Whose tokens are read anew.
         read_tokens: Reads them.
+        tls: Whose certificates are read anew, where there are any.
     """
 
     def __init__(
-        self, service: GraspService, edge: Edge, read_tokens: Callable[[], Tokens]
+        self,
+        service: GraspService,
+        edge: Edge,
+        read_tokens: Callable[[], Tokens],
+        tls: ServerTls | None = None,
     ) -> None:
         self._service = service
         self._edge = edge
         self._read_tokens = read_tokens
+        self._tls = tls
         self._turn = asyncio.Lock()
         self._waiting = False
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def reload(self) -> list[ModelInfo]:
-        """Load weights and tokens anew.
+        """Load weights, tokens and certificates anew.
 
         Returns:
             What is loaded now.
@@ -59,6 +66,7 @@ class Reloader:
     async def _reload(self) -> list[ModelInfo]:
         try:
             tokens = self._read_tokens()
+            certificates = None if self._tls is None else self._tls.read()
             await self._service.reload()
         except EdgeGraspError as error:
             self._edge.metrics.reloaded(succeeded=False)
@@ -69,6 +77,8 @@ class Reloader:
             logger.exception("reload failed, the old weights still serve")
             raise ReloadFailed("The old weights still serve; the log says why.") from None
         self._edge.tokens = tokens
+        if self._tls is not None and certificates is not None:
+            self._tls.use(certificates)
         self._edge.metrics.reloaded(succeeded=True)
         models = self._service.models()
         digests = {model.name: model.digest for model in models}

@@ -46,7 +46,7 @@ class Server:
         metrics: What /metrics shows.
         http_url: e.g. "http://127.0.0.1:8000", once ports are open.
         grpc_address: e.g. "127.0.0.1:50051", once ports are open.
-        reloader: Swaps weights and tokens, once ports are open.
+        reloader: Swaps weights, tokens and certificates, once ports are open.
     """
 
     def __init__(
@@ -74,7 +74,9 @@ class Server:
         )
         self.metrics.describe_models(self._service.models)
         self.metrics.watch("ready", "1: requests are answered", lambda: self._service.ready)
-        self.reloader = Reloader(self._service, self._edge, lambda: load_tokens(settings))
+        self.reloader = Reloader(
+            self._service, self._edge, lambda: load_tokens(settings), self._tls
+        )
         self.http_url = ""
         self.grpc_address = ""
 

@@ -1,8 +1,11 @@
-"""TLS of both transports, from the same files."""
+"""TLS of both transports, from the same files, which may be read anew while connections come in."""
 
 import ssl
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import grpc
 
@@ -11,11 +14,61 @@ from edgegrasp_service.settings import Settings
 
 
 @dataclass(frozen=True)
-class ServerTls:
-    """What each transport needs to speak TLS, with client certificates where a CA is set."""
+class Certificates:
+    """What is in the files: key, certificate, and the CAs of clients where those are set."""
 
     http: ssl.SSLContext
-    grpc: grpc.ServerCredentials
+    grpc: grpc.ServerCertificateConfiguration
+
+
+class ServerTls:
+    """What each transport needs to speak TLS, with client certificates where a CA is set.
+
+    Attributes:
+        http: For the HTTP server.
+        grpc: For the gRPC server.
+    """
+
+    def __init__(self, read: Callable[[], Certificates], require_clients: bool) -> None:
+        """Read the files.
+
+        Args:
+            read: Reads them; raises InvalidSettings.
+            require_clients: Whether a client must show a certificate.
+        """
+        self.read = read
+        first = read()
+        self.http = _RenewableContext(ssl.PROTOCOL_TLS_SERVER)
+        self.http.current = first.http
+        self._lock = threading.Lock()
+        self._next: grpc.ServerCertificateConfiguration | None = None
+        self.grpc = grpc.dynamic_ssl_server_credentials(
+            first.grpc,
+            self._take_next,  # type: ignore[arg-type]  # None is left out of its stubs
+            require_client_authentication=require_clients,
+        )
+
+    def use(self, certificates: Certificates) -> None:
+        """Use others from the next connection on; those that are open stay as they are."""
+        self.http.current = certificates.http
+        with self._lock:
+            self._next = certificates.grpc
+
+    def _take_next(self) -> grpc.ServerCertificateConfiguration | None:
+        """Asked by gRPC for each connection, in a thread of its own; None: as before."""
+        with self._lock:
+            taken, self._next = self._next, None
+        return taken
+
+
+class _RenewableContext(ssl.SSLContext):
+    """A context that leaves each new connection to the one that is current then."""
+
+    current: ssl.SSLContext
+
+    def wrap_bio(self, *arguments: Any, **named: Any) -> ssl.SSLObject:
+        """As asyncio calls it when a connection comes in."""
+        return self.current.wrap_bio(*arguments, **named)
 
 
 def load_tls(settings: Settings) -> ServerTls | None:
@@ -24,30 +77,29 @@ def load_tls(settings: Settings) -> ServerTls | None:
     Raises:
         InvalidSettings: A file cannot be read, or certificate and key are no pair.
     """
-    if settings.tls_certificate is None or settings.tls_key is None:
+    certificate, key, ca = settings.tls_certificate, settings.tls_key, settings.tls_client_ca
+    if certificate is None or key is None:
         return None
-    certificate = _read("tls_certificate", settings.tls_certificate)
-    key = _read("tls_key", settings.tls_key)
+    return ServerTls(lambda: _read_certificates(certificate, key, ca), ca is not None)
+
+
+def _read_certificates(certificate: Path, key: Path, ca: Path | None) -> Certificates:
+    pair = (_read("tls_key", key), _read("tls_certificate", certificate))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.set_alpn_protocols(["http/1.1"])
     try:
-        context.load_cert_chain(
-            settings.tls_certificate, settings.tls_key, password=_refuse_encrypted_key
-        )
+        context.load_cert_chain(certificate, key, password=_refuse_encrypted_key)
     except (ssl.SSLError, ValueError) as error:
         raise InvalidSettings(
-            f"tls_certificate: got {str(settings.tls_certificate)!r} with tls_key "
-            f"{str(settings.tls_key)!r}. They are no certificate with its key, in PEM: {error}."
+            f"tls_certificate: got {str(certificate)!r} with tls_key {str(key)!r}. "
+            f"They are no certificate with its key, in PEM: {error}."
         ) from None
-    ca = None
-    if settings.tls_client_ca is not None:
-        ca = _read("tls_client_ca", settings.tls_client_ca)
-        _require_clients(context, settings.tls_client_ca)
-    credentials = grpc.ssl_server_credentials(
-        [(key, certificate)], root_certificates=ca, require_client_auth=ca is not None
-    )
-    return ServerTls(context, credentials)
+    authorities = None
+    if ca is not None:
+        authorities = _read("tls_client_ca", ca)
+        _require_clients(context, ca)
+    return Certificates(context, grpc.ssl_server_certificate_configuration([pair], authorities))
 
 
 def _require_clients(context: ssl.SSLContext, ca: Path) -> None:

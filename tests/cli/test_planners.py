@@ -169,6 +169,26 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
         pass
 
 
+def test_another_package_may_name_its_planner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "their_package-0.1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 0.1\n")
+    (about / "entry_points.txt").write_text(
+        "[edgegrasp.planners]\ntheirs = their_package:Planner\nbroken = their_package:Missing\n"
+    )
+    (tmp_path / "their_package.py").write_text(
+        "class Planner:\n    def __call__(self, observation, seed): return None\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert type(NamedPlanner("theirs")()).__module__ == "their_package"
+    with pytest.raises(ValueError, match="'broken' cannot be loaded"):
+        NamedPlanner("broken")()
+    with pytest.raises(ValueError, match="oracle, oracle-own, broken, theirs, or module:callable"):
+        NamedPlanner("nobody")()
+
+
 @pytest.mark.parametrize("name", ["guess", "json:", ":loads", "json:no_such", "math:pi"])
 def test_a_wrong_planner_is_told(name: str) -> None:
     with pytest.raises(ValueError, match=f"planner .*{name}"):

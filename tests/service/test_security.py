@@ -26,7 +26,7 @@ from edgegrasp_client import (
 )
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.dummy import DummyCatalogue
-from edgegrasp_service.errors import InvalidSettings
+from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready
 from edgegrasp_service.server import Server, warn_of_strangers
 from edgegrasp_service.settings import Settings
@@ -117,6 +117,39 @@ async def test_mutual_tls(serving, server_tls, pem, transport: str, cloud: np.nd
             assert isinstance(await refused(address, tls=tls), ServerUnavailableError)
 
 
+async def test_certificates_are_read_anew(
+    serving, pem, transport: str, cloud: np.ndarray, tmp_path: Path
+) -> None:
+    """Server's and clients' alike; connections that are open stay, and bad files change nothing."""
+    files = {name: tmp_path / f"{name}.pem" for name in ("server", "server_key", "ca")}
+
+    def put(prefix: str) -> None:
+        for name, path in files.items():
+            path.write_bytes(pem[prefix + name].read_bytes())
+
+    def tls(prefix: str, client: str) -> Tls:
+        return Tls(pem[f"{prefix}ca"], pem[f"{client}client"], pem[f"{client}client_key"])
+
+    put("")
+    given = {"tls_certificate": files["server"], "tls_key": files["server_key"]}
+    async with serving(**given, tls_client_ca=files["ca"]) as server:
+        address = address_of(server, transport)
+        async with AsyncGraspClient(address, tls=tls("", "")) as before:
+            assert await before.models()
+            put("other_")
+            await server.reloader.reload()
+            async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
+                assert len((await after.detect(cloud)).grasps) == 10
+            assert len((await before.detect(cloud)).grasps) == 10
+        for stranger in (tls("", ""), tls("other_", "")):
+            assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
+        files["server_key"].write_text("half a k")
+        with pytest.raises(ReloadFailed, match="They are no certificate with its key"):
+            await server.reloader.reload()
+        async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
+            assert await still.models()
+
+
 async def test_no_tls_older_than_1_2(serving, server_tls, pem) -> None:
     async with serving(**server_tls) as server:
         context = ssl.create_default_context(cafile=pem["ca"])
@@ -125,7 +158,7 @@ async def test_no_tls_older_than_1_2(serving, server_tls, pem) -> None:
             assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
     loaded = load_tls(Settings(**server_tls))
     assert loaded is not None
-    assert loaded.http.minimum_version == ssl.TLSVersion.TLSv1_2
+    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 @pytest.mark.parametrize(

@@ -134,4 +134,5 @@ def test_baselines_name_their_planner_in_the_rows() -> None:
 def test_published_figures_are_found_by_protocol_scene_and_samples() -> None:
     methods = [row["method"] for row in published("edgegrasp", "packed", "64-4k")]
     assert methods == ["EdgeGraspNet", "VN-EdgeGraspNet"]
+    assert published("edgegrasp-fused", "pile") == published("edgegrasp", "pile") != []
     assert published("giga", "packed") == []

@@ -14,8 +14,12 @@ if TYPE_CHECKING:
 
 
 def test_the_named_protocols_differ_where_they_should() -> None:
-    assert protocol_names() == ["edgegrasp", "giga", "robot", "vgn"]
+    assert protocol_names() == ["edgegrasp", "edgegrasp-fused", "giga", "robot", "vgn"]
     paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
+    fused = load_protocol("edgegrasp-fused")
+    assert fused.camera.surface_voxel == pytest.approx(0.30 / 180)
+    camera = replace(fused.camera, surface_voxel=0.0)
+    assert replace(fused, name="edgegrasp", camera=camera) == paper
     assert (paper.rounds, paper.seeds) == (100, (0, 1, 2, 3, 4))
     assert paper.noise.point_std == 0.001
     assert paper.planning.voxel_size == 0.004
@@ -35,6 +39,13 @@ def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)
         assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == protocol
+
+
+def test_a_manifest_from_before_a_constant_was_known_is_read() -> None:
+    table = load_protocol("edgegrasp").to_json()
+    assert "surface_voxel" not in table["camera"]
+    assert protocol_from(table).camera.surface_voxel == 0.0
+    assert "surface_voxel" in load_protocol("edgegrasp-fused").to_json()["camera"]
 
 
 def test_the_side_view_is_where_giga_has_it() -> None:
@@ -61,7 +72,7 @@ def test_a_wrong_file_is_told(tmp_path: Path, old: str, new: str, message: str) 
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(FileNotFoundError, match="edgegrasp, giga, robot, vgn"):
+    with pytest.raises(FileNotFoundError, match="edgegrasp, edgegrasp-fused, giga, robot, vgn"):
         load_protocol("paper")
 
 

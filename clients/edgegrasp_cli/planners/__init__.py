@@ -11,6 +11,7 @@ from typing import Any
 from edgegrasp_sim.trials import Planner
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
+SHIPPED = ("server", "in-process", "edge-sample", "oracle", "oracle-own")
 
 
 @dataclass(frozen=True)
@@ -40,15 +41,16 @@ class NamedPlanner:
 
     def _load(self) -> Any:
         installed = entry_points(group=GROUP)
-        if self.name in installed.names:
-            return installed[self.name].load()
         module, colon, attribute = self.name.partition(":")
-        if not (module and colon and attribute):
-            known = ["server", "in-process", "edge-sample", "oracle", *sorted(installed.names)]
+        named = self.name in installed.names
+        if not named and not (module and colon and attribute):
+            known = [*SHIPPED, *sorted(installed.names)]
             raise ValueError(
                 f"planner is {self.name!r}; choose one of {', '.join(known)}, or module:callable"
             )
         try:
+            if named:
+                return installed[self.name].load()
             return getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"planner {self.name!r} cannot be loaded: {error}") from error

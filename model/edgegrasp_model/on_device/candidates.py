@@ -22,6 +22,7 @@ from edgegrasp_model.candidates import (
 )
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.on_device.cloud import PAIRS, DeviceCloud, squared_distances
+from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.support import SupportPlane
 
 
@@ -87,7 +88,7 @@ def level_grasps(
     gripper: Gripper,
 ) -> DeviceCandidates:
     """Candidates straight down onto low contacts, the closing direction level."""
-    up = torch.tensor(support.normal, dtype=torch.float32, device=cloud.points.device)
+    up = constant(support.normal, cloud.points.device)
     contact = cloud.points[contact_index]
     edge = contact - cloud.points[approach_index]  # (M, 3)
     headings, certain = closing_headings(cloud, support)
@@ -141,7 +142,7 @@ def closing_headings(cloud: DeviceCloud, support: SupportPlane) -> tuple[Tensor,
         (N, 3) unit directions along the plane, and which of them (N,) can be trusted.
     """
     points = cloud.points
-    up = torch.tensor(support.normal, dtype=torch.float32, device=points.device)
+    up = constant(support.normal, points.device)
     low = points @ up - support.offset < LOW
     level = cloud.normals - (cloud.normals @ up).unsqueeze(1) * up
     certain = low & (level.norm(dim=1) > MIN_LEVEL)
@@ -166,7 +167,7 @@ def drawn_back(
     """
     pose = candidates.T_cloud_hand
     clearance = support_clearance(pose, support, gripper) - margin
-    normal = torch.tensor(support.normal, dtype=torch.float32, device=pose.device)
+    normal = constant(support.normal, pose.device)
     rise = candidates.approach @ normal
     back = torch.where(clearance >= 0, 0.0, -clearance / rise)
     clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
@@ -181,8 +182,9 @@ def support_clearance(T_cloud_hand: Tensor, support: SupportPlane, gripper: Grip
     picks = np.indices((2, 2, 2)).reshape(3, 8).T  # (8, 3)
     corners = np.where(picks[None] == 0, boxes[:, None, 0], boxes[:, None, 1]).reshape(-1, 3)
     device = T_cloud_hand.device
-    normal = torch.tensor(support.normal, dtype=torch.float64, device=device)
+    normal = constant(support.normal, device, torch.float64)
     pose = T_cloud_hand.double()
     height = normal @ pose[:, :3, 3:] - support.offset  # (E, 1)
-    corner_heights = (normal @ pose[:, :3, :3]) @ torch.from_numpy(corners).to(device).T
+    offsets = constant(corners.tolist(), device, torch.float64)  # (8B, 3)
+    corner_heights = (normal @ pose[:, :3, :3]) @ offsets.T
     return (height.squeeze(1) + corner_heights.amin(dim=1)).float()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-KEPT = 32  # graphs; the one not used for longest goes
+KEPT = 64  # graphs; the one not used for longest goes
 WARM_UP_RUNS = 2  # libraries choose their kernels and get their workspace before the capture
 
 
@@ -63,7 +63,10 @@ class Captured:
             torch.cuda.current_stream().wait_stream(beside)
             graph = torch.cuda.CUDAGraph()
             self._pool = self._pool or torch.cuda.graph_pool_handle()
-            # Other threads prepare their requests meanwhile.
-            with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+            # Other threads prepare their requests meanwhile: their launches are no part of this.
+            capture = torch.cuda.graph(
+                graph, pool=self._pool, stream=beside, capture_error_mode="thread_local"
+            )
+            with capture:
                 output = self._function(*own)
         return _Graph(graph, own, output)

@@ -17,12 +17,14 @@ from edgegrasp_model.collision import (
 )
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.on_device.candidates import support_clearance
+from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.on_device.hand_view import DeviceView, hands_together, positions, within
 from edgegrasp_model.on_device.scene import DeviceScene
 from edgegrasp_model.options import Collision
 from edgegrasp_model.support import SupportPlane
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 
 def collides(
@@ -48,9 +50,8 @@ def meets_cloud(
     """Which open hands meet a point of the cloud.  # (E,)."""
     device = T_cloud_hand.device
     grown = grown_boxes(gripper, request)
-    swept = torch.from_numpy(lengthened(grown, request).astype(np.float32)).to(device)
-    boxes = torch.from_numpy(grown.astype(np.float32)).to(device)
-    up = torch.from_numpy(UP).to(device)
+    swept = _box_corners(lengthened(grown, request), device)
+    boxes, up = _box_corners(grown, device), constant(UP.tolist(), device)
     upward = request.retreat_direction == "up" and request.retreat_length > 0
     met = [torch.zeros(0, dtype=torch.bool, device=device)]
     for hands in torch.split(T_cloud_hand, hands_together(scene.cloud)):
@@ -70,7 +71,7 @@ def meets_support(
     T_cloud_hand: Tensor, support: SupportPlane, gripper: Gripper, request: Collision
 ) -> Tensor:
     """Which hands come nearer to the support plane than the margin.  # (E,)."""
-    normal = torch.tensor(support.normal, dtype=torch.float64, device=T_cloud_hand.device)
+    normal = constant(support.normal, T_cloud_hand.device, torch.float64)
     height = support_clearance(T_cloud_hand, support, gripper)
     rise = -T_cloud_hand[:, :3, 2].double() @ normal  # per metre of way back
     lowest: Tensor = torch.minimum(height, height + way_back(request) * rise)
@@ -84,8 +85,7 @@ def nearest_things(scene: DeviceScene, T_cloud_hand: Tensor, gripper: Gripper) -
     """As `edgegrasp_model.collision.clearances`: distance (E,) of open hands to what is nearest."""
     if len(scene.obstacles):
         return clearances(scene.on_processor, T_cloud_hand.cpu().numpy(), gripper)
-    boxes = torch.from_numpy(gripper.boxes(gripper.max_opening).astype(np.float32))
-    boxes = boxes.to(T_cloud_hand.device)
+    boxes = _box_corners(gripper.boxes(gripper.max_opening), T_cloud_hand.device)
     middle, extent = boxes.mean(dim=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3)
     nearest = [torch.zeros(0, device=T_cloud_hand.device)]
     for hands in torch.split(T_cloud_hand, hands_together(scene.cloud)):
@@ -114,6 +114,11 @@ def widths_needed(view: DeviceView, gripper: Gripper) -> Tensor:
     reach = (aside * between).amax(dim=1)
     width: Tensor = (2 * (reach + FINGER_CLEARANCE)).clamp(max=gripper.max_opening)
     return width
+
+
+def _box_corners(boxes: Float64, device: torch.device) -> Tensor:
+    """Boxes (B, 2, 3) on a device."""
+    return constant(boxes.reshape(-1, 3).tolist(), device).view(-1, 2, 3)
 
 
 def _passed_over(position: Tensor, lift: Tensor, corners: Tensor) -> Tensor:

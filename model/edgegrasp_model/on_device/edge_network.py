@@ -6,7 +6,7 @@ from torch import Tensor
 
 from edgegrasp_model.layers import gather_rows
 from edgegrasp_model.network import EdgeGraspNet, GlobalFeature, PointNetConv
-from edgegrasp_model.on_device.padded_balls import PaddedBalls
+from edgegrasp_model.on_device.padded_balls import PaddedBalls, in_pieces
 
 
 def edge_grasp_logits(
@@ -34,13 +34,16 @@ def edge_grasp_logits(
 
 
 def _convolution(layer: PointNetConv, features: Tensor, balls: PaddedBalls) -> Tensor:
-    """`PointNetConv.forward`, all neighbours at once."""
+    """`PointNetConv.forward`, in few pieces."""
     widths = [features.shape[1], 3]
     feature_weight, point_weight = torch.split(layer.hidden.weight, widths, dim=1)
     v = F.linear(balls.points, point_weight)
     u = F.linear(features, feature_weight, layer.hidden.bias) + v
-    hidden = gather_rows(u, balls.neighbors).sub_(v.unsqueeze(1)).relu_()  # (P, k, width)
-    return F.linear(hidden, layer.output.weight).amax(dim=1) + layer.output.bias
+    pooled = []
+    for neighbors, here in zip(in_pieces(balls.neighbors), in_pieces(v), strict=True):
+        hidden = gather_rows(u, neighbors).sub_(here.unsqueeze(1)).relu_()  # (p, k, width)
+        pooled.append(F.linear(hidden, layer.output.weight).amax(dim=1))
+    return torch.cat(pooled) + layer.output.bias
 
 
 def _ball_feature(layer: GlobalFeature, local: Tensor, balls: PaddedBalls) -> Tensor:

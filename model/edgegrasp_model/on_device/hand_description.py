@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from edgegrasp_model.collision import UP
@@ -16,6 +17,7 @@ from edgegrasp_model.gripper import Boxes, Gripper
 from edgegrasp_model.hand_description import AXIS, FACING, HEIGHTS, SLAB, UNKNOWN_HEIGHT
 from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR
 from edgegrasp_model.on_device.candidates import DeviceCandidates, support_clearance
+from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.on_device.hand_view import DeviceView, within
 from edgegrasp_model.on_device.hidden_space import hidden_shares
 from edgegrasp_model.on_device.scene import DeviceScene
@@ -69,9 +71,8 @@ def mirrored(vectors: Tensor, side: Tensor) -> Tensor:
     return torch.stack((x * side.unsqueeze(1), y, z))
 
 
-def _toward_camera(viewpoint: np.ndarray, T_cloud_hand: Tensor) -> Tensor:
-    camera = torch.from_numpy(np.asarray(viewpoint, dtype=np.float32)).to(T_cloud_hand.device)
-    return camera - T_cloud_hand[:, :3, 3]
+def _toward_camera(viewpoint: NDArray[np.float32], T_cloud_hand: Tensor) -> Tensor:
+    return constant(viewpoint.tolist(), T_cloud_hand.device) - T_cloud_hand[:, :3, 3]
 
 
 def _log_counts(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -106,7 +107,7 @@ def _in_any(boxes: Boxes, position: Tensor, around: float = 0.0, behind: float =
     for low, high in boxes:
         lower = (low[0] - around, low[1] - around, low[2] - behind)
         upper = tuple(corner + around for corner in high)
-        inside |= within(position, torch.tensor((lower, upper), device=position.device))
+        inside |= within(position, constant((lower, upper), position.device))
     return inside
 
 
@@ -171,14 +172,14 @@ def _directions(scene: DeviceScene, T_cloud_hand: Tensor, side: Tensor) -> list[
     if scene.viewpoint is not None:
         toward = _toward_camera(scene.viewpoint, T_cloud_hand)
         toward = toward / toward.norm(dim=1, keepdim=True).clamp_min(1e-9)
-    ups = torch.from_numpy(UP).to(turn.device)
+    ups = constant(UP.tolist(), turn.device)
     return [*(toward.unsqueeze(1) @ turn).squeeze(1).T, *(ups @ turn).T]
 
 
 def _stance(scene: DeviceScene, candidates: DeviceCandidates, gripper: Gripper) -> list[Tensor]:
     """The edge itself, and how the hand stands to gravity and to the support plane."""
     pose, points = candidates.T_cloud_hand, scene.cloud.points
-    up = torch.from_numpy(UP).to(pose.device)
+    up = constant(UP.tolist(), pose.device)
     contact = points[candidates.contact_index]
     edge = contact - points[candidates.approach_index]
     columns = [
@@ -191,7 +192,7 @@ def _stance(scene: DeviceScene, candidates: DeviceCandidates, gripper: Gripper) 
     support = scene.support
     if support is None:
         return columns + [torch.full_like(candidates.depth, UNKNOWN_HEIGHT)] * HEIGHTS
-    normal = torch.tensor(support.normal, dtype=torch.float64, device=pose.device)
+    normal = constant(support.normal, pose.device, torch.float64)
     tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
     heights = [
         tips.double() @ normal - support.offset,

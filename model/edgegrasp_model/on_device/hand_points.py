@@ -5,6 +5,7 @@ from torch import Tensor
 
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_points import BEHIND, BESIDE, BEYOND, OUTSIDE
+from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.on_device.hand_description import mirrored
 from edgegrasp_model.on_device.hand_view import DeviceView
 
@@ -34,7 +35,7 @@ def points_around_fingers(
     before = _kept(rank - 1, found, limit)
     kept = near & (_kept(rank, found, limit) > before)
     place = torch.where(kept, before, limit)  # the last place is for all others
-    tips = torch.tensor([0.0, 0.0, gripper.tip_z], device=x.device)
+    tips = constant((0.0, 0.0, gripper.tip_z), x.device)
     from_tips = mirrored(view.position - tips[:, None, None], side)
     values = torch.cat((from_tips, normal)).permute(1, 2, 0)  # (E, Q, 6)
     points = torch.zeros((len(x), limit + 1, 6), device=x.device)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from edgegrasp_model.hand_view import Reach
 from edgegrasp_model.on_device.cloud import DeviceCloud
+from edgegrasp_model.on_device.constants import constant
 
 SEEN = 2**24  # points times hands looked at at a time
 
@@ -20,17 +21,14 @@ class DeviceView:
     position: Tensor  # (3, E, Q) in the hand frame
 
 
-def to_hand(T_cloud_hand: Tensor) -> tuple[Tensor, Tensor]:
-    """Turn (E, 3, 3) and shift (E, 3, 1) from the cloud's frame to hand frames."""
-    turn = T_cloud_hand[:, :3, :3].transpose(1, 2)
-    return turn, -turn @ T_cloud_hand[:, :3, 3:]
-
-
 def positions(points: Tensor, T_cloud_hand: Tensor) -> Tensor:
     """Points (N, 3) in the frames of hands (E, 4, 4): (3, E, N)."""
-    turn, shift = to_hand(T_cloud_hand)
-    columns = points.T.expand(len(turn), -1, -1)
-    return torch.baddbmm(shift, turn, columns).transpose(0, 1)
+    turn = T_cloud_hand[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
+    T_hand_cloud = torch.cat((turn, -turn @ T_cloud_hand[:, :3, 3:]), dim=2)  # (E, 3, 4)
+    homogeneous = torch.cat((points, torch.ones_like(points[:, :1])), dim=1)
+    # One large product for all hands, which a GPU likes better than one for each.
+    rows = T_hand_cloud.transpose(0, 1).reshape(-1, 4)  # (3E, 4)
+    return (rows @ homogeneous.T).view(3, len(turn), len(points))
 
 
 def hand_view(cloud: DeviceCloud, T_cloud_hand: Tensor, reach: Reach) -> DeviceView:
@@ -42,7 +40,7 @@ def hand_view(cloud: DeviceCloud, T_cloud_hand: Tensor, reach: Reach) -> DeviceV
         reach: What is kept.
     """
     seen = positions(cloud.points, T_cloud_hand)
-    inside = within(seen, torch.tensor(reach, device=seen.device))
+    inside = within(seen, constant(reach, seen.device))
     count = inside.sum(dim=1)
     most = max(1, int(count.max())) if len(count) else 1
     place = torch.where(inside, inside.cumsum(dim=1) - 1, most)  # the last one is for the others

@@ -7,8 +7,10 @@ from torch import Tensor
 
 from edgegrasp_model.ball_batch import BallBatch
 
-POINT_STEPS = 8  # sizes from one power of two to the next: at most an eighth is filling
-STEPS = 4
+# Sizes from one power of two to the next. Points are nine tenths of the work: at most an eighth of
+# them is filling. Of the rest there are few sizes, so that few graphs serve all requests.
+POINT_STEPS, STEPS = 8, 1
+PIECE = 2**15  # points whose edge features are in memory at once, several gigabytes of them
 
 
 class PaddedBalls(NamedTuple):
@@ -26,7 +28,7 @@ class PaddedBalls(NamedTuple):
 
 
 def bucket(size: int, steps: int = STEPS) -> int:
-    """The next size, at least 8, that is one of `steps` evenly spaced ones up to a power of two."""
+    """The next size, at least 8: a power of two, or one of `steps` even steps to the next."""
     power = max(3, (max(size, 1) - 1).bit_length())  # 2 ** power >= size
     step = max(1, (1 << power - 1) // steps)
     return max(8, -(-size // step) * step)
@@ -60,6 +62,11 @@ def padded_balls(batch: BallBatch) -> PaddedBalls:
         approach=filled(batch.approach, edges),
         depth=filled(batch.depth, edges),
     )
+
+
+def in_pieces(values: Tensor) -> tuple[Tensor, ...]:
+    """Rows (n, ...) in pieces so large that they fill a GPU and so small that they fit one."""
+    return torch.split(values, PIECE)
 
 
 def filled(values: Tensor, size: int) -> Tensor:

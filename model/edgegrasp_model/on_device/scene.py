@@ -20,6 +20,7 @@ from edgegrasp_model.on_device.cloud import (
     orient_normals,
     voxelise,
 )
+from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.regions import Region, check_region, inside_region
 from edgegrasp_model.scene import (
@@ -165,7 +166,7 @@ def _normals(
     device = points.device
     if viewpoints is None:  # one metre above the cloud's middle
         seen_from = (points.amin(dim=0) + points.amax(dim=0)) / 2
-        seen_from = seen_from + torch.tensor([0.0, 0.0, 1.0], device=device)
+        seen_from = seen_from + constant((0.0, 0.0, 1.0), device)
     else:
         seen_from = _uploaded(frame.points(viewpoints).astype(np.float32), device)
         if len(viewpoints) > 1 and sent.view_ids is not None:

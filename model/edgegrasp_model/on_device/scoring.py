@@ -11,7 +11,13 @@ from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.network import EdgeGraspNet
 from edgegrasp_model.on_device.captured import Captured
 from edgegrasp_model.on_device.edge_network import edge_grasp_logits
-from edgegrasp_model.on_device.padded_balls import PaddedBalls, bucket, filled, padded_balls
+from edgegrasp_model.on_device.padded_balls import (
+    POINT_STEPS,
+    PaddedBalls,
+    bucket,
+    filled,
+    padded_balls,
+)
 from edgegrasp_model.on_device.vn_network import vn_edge_grasp_logits
 from edgegrasp_model.vn_network import VNEdgeGraspNet
 
@@ -39,7 +45,7 @@ class ScoringNetwork:
             return torch.empty(0, device=batch.contact.device)
         with torch.inference_mode():
             if isinstance(batch, HandBatch):
-                size = bucket(edges)
+                size = bucket(edges, POINT_STEPS)
                 parts = (batch.description, batch.points, batch.point_count)
                 return self._run(*(filled(part, size) for part in parts))[:edges]
             return self._run(*padded_balls(batch))[:edges]

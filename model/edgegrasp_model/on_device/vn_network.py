@@ -5,7 +5,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from edgegrasp_model.layers import gather_rows
-from edgegrasp_model.on_device.padded_balls import PaddedBalls
+from edgegrasp_model.on_device.padded_balls import PaddedBalls, in_pieces
 from edgegrasp_model.vn_layers import vector_maximum, vector_relu
 from edgegrasp_model.vn_network import (
     VNBallMaximum,
@@ -43,17 +43,20 @@ def vn_edge_grasp_logits(
 
 
 def _convolution(layer: VNPointNetConv, features: Tensor, balls: PaddedBalls) -> Tensor:
-    """`VNPointNetConv.forward`, all neighbours at once."""
+    """`VNPointNetConv.forward`, in few pieces."""
     widths = [features.shape[2], 1]
     feature_weight, point_weight = torch.split(layer.hidden.weight, widths, dim=1)
     v = F.linear(balls.points.unsqueeze(2), point_weight)
     u = F.linear(features, feature_weight) + v
-    direction = layer.hidden_relu.direction
-    hidden = vector_relu(
-        gather_rows(u, balls.neighbors).sub_(v.unsqueeze(1)),
-        gather_rows(direction(u), balls.neighbors).sub_(direction(v).unsqueeze(1)),
-    )  # (P, k, 3, width)
-    vectors: Tensor = layer.output_relu(vector_maximum(layer.output(hidden), layer.reach, dim=1))
+    u_way, v_way = layer.hidden_relu.direction(u), layer.hidden_relu.direction(v)
+    pooled = []
+    for neighbors, here, way in zip(*map(in_pieces, (balls.neighbors, v, v_way)), strict=True):
+        hidden = vector_relu(
+            gather_rows(u, neighbors).sub_(here.unsqueeze(1)),
+            gather_rows(u_way, neighbors).sub_(way.unsqueeze(1)),
+        )  # (p, k, 3, width)
+        pooled.append(vector_maximum(layer.output(hidden), layer.reach, dim=1))
+    vectors: Tensor = layer.output_relu(torch.cat(pooled))
     return vectors
 
 

@@ -79,14 +79,19 @@ def test_padded_balls_have_few_shapes(random_scene) -> None:
         assert set(members.tolist()) == set(range(first, first + sizes[ball]))
 
 
-def test_buckets_are_few_and_little_larger() -> None:
+@pytest.mark.parametrize(("steps", "waste", "most"), [(STEPS, 2.0, 15), (POINT_STEPS, 1.125, 100)])
+def test_buckets_are_few_and_little_larger(steps: int, waste: float, most: int) -> None:
     sizes = range(1, 40_000)
-    buckets = [bucket(size) for size in sizes]
-    assert all(size <= found for size, found in zip(sizes, buckets, strict=True))
-    assert all(found <= max(8, 1.25 * size + 1) for size, found in zip(sizes, buckets, strict=True))
+    buckets = [bucket(size, steps) for size in sizes]
+    for size, found in zip(sizes, buckets, strict=True):
+        assert size <= found <= max(8, waste * size + 1)
     assert buckets == sorted(buckets)
-    assert len(set(buckets)) < 60
-    assert [bucket(size) for size in (1, 8, 9, 1024, 1025, 2000)] == [8, 8, 10, 1024, 1280, 2048]
+    assert len(set(buckets)) < most
+
+
+def test_buckets() -> None:
+    assert [bucket(size, 1) for size in (0, 1, 8, 9, 1024, 1025)] == [8, 8, 8, 16, 1024, 2048]
+    assert [bucket(size, 8) for size in (1, 9, 1025, 2000, 2048)] == [8, 9, 1152, 2048, 2048]
 
 
 def test_half_precision_is_close_and_not_the_same(random_scene, network: torch.nn.Module) -> None:
