@@ -27,7 +27,8 @@ from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import EDGEGRASP, VN_EDGEGRASP, NetworkConfig
 from edgegrasp_model.on_device.choice import choose_device
 from edgegrasp_model.on_device.detector import DeviceDetector
-from edgegrasp_model.on_device.scoring import Precision, ScoringNetwork
+from edgegrasp_model.on_device.precision import Precision
+from edgegrasp_model.on_device.scoring import ScoringNetwork
 from edgegrasp_model.options import DetectOptions
 
 RESULTS = Path(__file__).parent / "results"

@@ -17,13 +17,14 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.in_process import OPTIONS, POINTS, Apart, InProcess
 from benchmarks.load_client import Sample, Task
 from benchmarks.load_picture import draw
 from benchmarks.senders import cloud, sender
@@ -31,9 +32,7 @@ from benchmarks.served import Served, served
 
 ROOT = Path(__file__).parents[1]
 TRANSPORTS = ("grpc", "rest")
-POINTS = 20_000
 SMALL = 3_000
-OPTIONS = {"num_approach_points": 32, "num_candidates": 500}
 SMALL_OPTIONS = {"num_approach_points": 8, "num_candidates": 100}
 DUMMY_SECONDS = 0.02
 # Of requests in the open loop, seconds: too short for a queue that is full.
@@ -50,25 +49,24 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "results")
     parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
     parser.add_argument("--pairs", type=int, default=200, help="requests that overhead compares")
-    parser.add_argument("--without-network", action="store_true", help="the dummy alone")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=PARTS,
+        help="measure these, each at most three minutes, and keep the rest of load.json",
+    )  # fmt: skip
     given = parser.parse_args()
-    results: dict[str, Any] = {"machine": machine(), "overhead": {}}
-    for seconds in (0.0, DUMMY_SECONDS):
-        with served("--backend", "dummy", "--dummy-seconds", str(seconds)) as dummy:
-            name = f"dummy of {1000 * seconds:g} ms"
-            results["overhead"][name] = overhead(dummy, dummy_in_process(seconds), given.pairs)
-    with served("--backend", "dummy", "--dummy-seconds", str(DUMMY_SECONDS)) as dummy:
-        results["closed"] = closed(dummy, given.seconds)
-    results["open"] = open_loops(results["closed"], given.seconds)
-    if not given.without_network:
-        with served(threads=1) as real:
-            results["overhead"]["network"] = overhead(real, network_in_process(), given.pairs // 4)
-            results["network"] = network(real, 2 * given.seconds)
-        results["batching"] = batching(given.seconds)
+    kept = given.output / "load.json"
+    results: dict[str, Any] = {}
+    if tuple(given.only) != PARTS and kept.exists():
+        results = json.loads(kept.read_text())
+    results["machine"] = machine()
+    for part in PARTS:
+        if part in given.only:
+            results[part] = MEASURED[part](results, given)
     results["targets"] = targets(results)
     given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / "load.json").write_text(json.dumps(results, indent=1) + "\n")
-    draw(results, given.output / "load.png")
+    kept.write_text(json.dumps(results, indent=1) + "\n")
+    if not PICTURED - results.keys():
+        draw(results, given.output / "load.png")
     print(json.dumps(results["targets"], indent=1))
 
 
@@ -81,76 +79,62 @@ def machine() -> dict[str, Any]:
     }
 
 
-class InProcess:
-    """A detector without a server around it."""
-
-    def __init__(self, detector: Any) -> None:
-        self._detector = detector
-
-    def seconds(self, points: Any, options: dict[str, int]) -> tuple[float, float]:
-        """What one detection takes, by the clock and of processors."""
-        from edgegrasp_model.cloud_input import CloudInput
-        from edgegrasp_model.options import parse_options
-
-        parsed = parse_options(dict(options))
-        start, cpu = time.perf_counter(), time.process_time()
-        prepared = self._detector.prepare(CloudInput(points), parsed)
-        logits = self._detector.run(prepared.batch)
-        self._detector.finish(prepared, logits)
-        return time.perf_counter() - start, time.process_time() - cpu
+def overhead(results: dict[str, Any], given: argparse.Namespace) -> dict[str, Any]:
+    """What an answer takes beyond the detector, by the detector and the transport."""
+    found = {}
+    for seconds in (0.0, DUMMY_SECONDS):
+        with served("--backend", "dummy", "--dummy-seconds", str(seconds)) as dummy:
+            milliseconds = f"{1000 * seconds:g}"
+            found[f"dummy of {milliseconds} ms"] = beyond(dummy, milliseconds, given.pairs)
+    with served(threads=1) as real:
+        found["network"] = beyond(real, "network", given.pairs // 4)
+    return found
 
 
-def dummy_in_process(seconds: float) -> InProcess:
-    """The dummy network of a service time."""
-    from edgegrasp_service.dummy import DummyDetector
+def beyond(server: Served, kind: str, pairs: int) -> dict[str, Any]:
+    """Milliseconds that an answer over a transport takes beyond the detector.
 
-    return InProcess(DummyDetector(seconds))
-
-
-def network_in_process() -> InProcess:
-    """The default weights, on one thread as in the server that is compared."""
-    import torch
-
-    from edgegrasp_model.catalogue import ModelCatalogue
-
-    torch.set_num_threads(1)
-    return InProcess(ModelCatalogue.load((), default="", grippers=()).get(""))
-
-
-def overhead(server: Served, in_process: InProcess, pairs: int) -> dict[str, Any]:
-    """Milliseconds that an answer over a transport takes beyond the detector in this process.
-
-    The two take turns, so that what else the machine does is in both.
+    That is called here, where it finds its code and data still in the processor's cache, and in a
+    process of its own, which has idled as long as the server. The three take turns, so that what
+    else the machine does is in all of them.
     """
     points = cloud(POINTS, seed=0)
     found: dict[str, Any] = {}
-    for transport in TRANSPORTS:
-        alone, alone_cpu, answers = [], [], []
-        with sender(transport, server.address(transport), points, OPTIONS) as one:
-            for _ in range(5):
-                one.send(None)
-                in_process.seconds(points, OPTIONS)
-            served_cpu = server.cpu_seconds()
-            for _ in range(pairs):
-                for times, value in zip(
-                    (alone, alone_cpu), in_process.seconds(points, OPTIONS), strict=True
-                ):
-                    times.append(value)
-                start = time.perf_counter()
-                told = one.send(None)
-                answers.append(time.perf_counter() - start)
-                if told.code != "OK":
-                    raise RuntimeError(f"{transport}: {told.code}")
-        served_cpu = (server.cpu_seconds() - served_cpu) / pairs
-        found[transport] = {
-            "pairs": pairs,
-            "load_average": os.getloadavg()[0],
-            "in_process_ms": percentiles(alone),
-            "served_ms": percentiles(answers),
-            "overhead_p50_ms": 1000 * float(np.median(answers) - np.median(alone)),
-            "overhead_p50_quietest_blocks_ms": quietest_blocks(alone, answers),
-            "overhead_of_processors_ms": 1000 * (served_cpu - float(np.mean(alone_cpu))),
-        }
+    here = InProcess(kind)
+    with Apart(kind) as apart:
+        for transport in TRANSPORTS:
+            alone: list[float] = []
+            alone_cpu: list[float] = []
+            idled: list[float] = []
+            answers: list[float] = []
+            with sender(transport, server.address(transport), points, OPTIONS) as one:
+                for _ in range(5):
+                    one.send(None)
+                    here.seconds()
+                    apart.seconds()
+                served_cpu = server.cpu_seconds()
+                for _ in range(pairs):
+                    for times, value in zip((alone, alone_cpu), here.seconds(), strict=True):
+                        times.append(value)
+                    start = time.perf_counter()
+                    told = one.send(None)
+                    answers.append(time.perf_counter() - start)
+                    if told.code != "OK":
+                        raise RuntimeError(f"{transport}: {told.code}")
+                    idled.append(apart.seconds()[0])
+            served_cpu = (server.cpu_seconds() - served_cpu) / pairs
+            found[transport] = {
+                "pairs": pairs,
+                "load_average": os.getloadavg()[0],
+                "in_process_ms": percentiles(alone),
+                "in_idle_process_ms": percentiles(idled),
+                "served_ms": percentiles(answers),
+                "overhead_p50_ms": 1000 * float(np.median(answers) - np.median(alone)),
+                "overhead_p50_of_idle_ms": 1000 * float(np.median(answers) - np.median(idled)),
+                "overhead_p50_quietest_blocks_ms": quietest_blocks(alone, answers),
+                "overhead_of_processors_ms": 1000 * (served_cpu - float(np.mean(alone_cpu))),
+            }
+            print(json.dumps({"overhead": kind, "transport": transport} | found[transport]))
     return found
 
 
@@ -170,46 +154,47 @@ def quietest_blocks(alone: Sequence[float], answers: Sequence[float]) -> float |
     return 1000 * (fastest[0] - fastest[1])
 
 
-def closed(server: Served, seconds: float) -> list[dict[str, Any]]:
+def closed(results: dict[str, Any], given: argparse.Namespace) -> list[dict[str, Any]]:
     """Throughput and latency by the number of requests at a time."""
     rows = []
-    for transport in TRANSPORTS:
-        task = Task(transport, server.address(transport), POINTS, OPTIONS, seconds, seed=0)
-        for concurrency in (1, 2, 4, 8):
-            rows.append({"concurrency": concurrency} | measure(server, task, concurrency))
+    with served("--backend", "dummy", "--dummy-seconds", str(DUMMY_SECONDS)) as server:
+        for transport in TRANSPORTS:
+            address = server.address(transport)
+            task = Task(transport, address, POINTS, OPTIONS, given.seconds, seed=0)
+            for concurrency in (1, 2, 4, 8):
+                rows.append({"concurrency": concurrency} | measure(server, task, concurrency))
     return rows
 
 
-def open_loops(closed_rows: Sequence[dict[str, Any]], seconds: float) -> list[dict[str, Any]]:
+def open_loops(results: dict[str, Any], given: argparse.Namespace) -> list[dict[str, Any]]:
     """What becomes of requests that come at fractions and multiples of what is sustained."""
     rows = []
     for transport in TRANSPORTS:
-        of_transport = [row for row in closed_rows if row["transport"] == transport]
+        of_transport = [row for row in results["closed"] if row["transport"] == transport]
         sustainable = max(row["accepted_per_second"] for row in of_transport)
         for share in (0.25, 0.5, 0.75, 0.9, 1.5, OVERLOAD):
             with served("--backend", "dummy", "--dummy-seconds", str(DUMMY_SECONDS)) as server:
                 task = Task(
-                    transport, server.address(transport), POINTS, OPTIONS, seconds, seed=0,
+                    transport, server.address(transport), POINTS, OPTIONS, given.seconds, seed=0,
                     rate=share * sustainable, timeout=DEADLINE,
                 )  # fmt: skip
                 rows.append({"share": share} | measure(server, task, concurrency=96))
     return rows
 
 
-def network(server: Served, seconds: float) -> list[dict[str, Any]]:
+def network(results: dict[str, Any], given: argparse.Namespace) -> list[dict[str, Any]]:
     """The real network over gRPC: one and two at a time, then half and twice what that sustains."""
-    task = Task("grpc", server.address("grpc"), POINTS, OPTIONS, seconds, seed=0)
-    rows = [
-        {"concurrency": concurrency} | measure(server, task, concurrency) for concurrency in (1, 2)
-    ]
-    sustainable = max(row["accepted_per_second"] for row in rows)
-    for share in (0.5, OVERLOAD):
-        timed = replace(task, rate=share * sustainable, timeout=NETWORK_DEADLINE)
-        rows.append({"share": share} | measure(server, timed, concurrency=96))
+    with served(threads=1) as server:
+        task = Task("grpc", server.address("grpc"), POINTS, OPTIONS, 2 * given.seconds, seed=0)
+        rows = [{"concurrency": number} | measure(server, task, number) for number in (1, 2)]
+        sustainable = max(row["accepted_per_second"] for row in rows)
+        for share in (0.5, OVERLOAD):
+            timed = replace(task, rate=share * sustainable, timeout=NETWORK_DEADLINE)
+            rows.append({"share": share} | measure(server, timed, concurrency=96))
     return rows
 
 
-def batching(seconds: float) -> dict[str, Any]:
+def batching(results: dict[str, Any], given: argparse.Namespace) -> dict[str, Any]:
     """Throughput of 8 small clouds at a time with the real network, batches on and off in turns."""
     found: dict[str, list[float]] = {"on": [], "off": []}
     with ExitStack() as stack:
@@ -220,7 +205,8 @@ def batching(seconds: float) -> dict[str, Any]:
         }
         for _ in range(3):
             for name, server in servers.items():
-                task = Task("grpc", server.address("grpc"), SMALL, SMALL_OPTIONS, seconds, seed=0)
+                address = server.address("grpc")
+                task = Task("grpc", address, SMALL, SMALL_OPTIONS, given.seconds, seed=0)
                 row = measure(server, task, concurrency=8)
                 found[name].append(row["accepted_per_second"])
     medians = {name: float(np.median(rates)) for name, rates in found.items()}
@@ -305,12 +291,12 @@ def targets(results: dict[str, Any]) -> dict[str, Any]:
     """The figures that the project asks of itself, beside what was measured."""
     found: dict[str, Any] = {}
     for name, limit in (("grpc", 3.0), ("rest", 6.0)):
-        for kind, both in results["overhead"].items():
-            of = ("overhead_p50_ms", "overhead_p50_quietest_blocks_ms",
+        for kind, both in results.get("overhead", {}).items():
+            of = ("overhead_p50_ms", "overhead_p50_of_idle_ms", "overhead_p50_quietest_blocks_ms",
                   "overhead_of_processors_ms", "load_average")  # fmt: skip
             key = f"{name}: overhead p50 with the {kind}, ms (<= {limit:g})"
             found[key] = {figure: both[name][figure] for figure in of}
-    dummy = [(f"{row['transport']}, dummy", DEADLINE, row) for row in results["open"]]
+    dummy = [(f"{row['transport']}, dummy", DEADLINE, row) for row in results.get("open", [])]
     real = [("grpc, network", NETWORK_DEADLINE, row) for row in results.get("network", [])]
     for kind, deadline, row in dummy + real:
         if row.get("share") != OVERLOAD:
@@ -324,6 +310,18 @@ def targets(results: dict[str, Any]) -> dict[str, Any]:
             results["batching"]["ratio"], 2
         )
     return found
+
+
+# In order: the open loop takes its rates from the closed one.
+MEASURED: dict[str, Callable[[dict[str, Any], argparse.Namespace], Any]] = {
+    "overhead": overhead,
+    "closed": closed,
+    "open": open_loops,
+    "network": network,
+    "batching": batching,
+}
+PARTS = tuple(MEASURED)
+PICTURED = {"overhead", "closed", "open"}
 
 
 if __name__ == "__main__":

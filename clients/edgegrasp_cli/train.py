@@ -4,7 +4,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -25,7 +25,20 @@ def train(
     ] = None,
     views_per_step: Annotated[int, Option(min=1, help="Views in a step.")] = 4,
     balls_per_view: Annotated[int, Option(min=1, help="Balls of each view in a step.")] = 8,
-    learning_rate: Annotated[float, Option(help="At the start; halved on a plateau.")] = 1e-3,
+    learning_rate: Annotated[float, Option(help="At the start.")] = 1e-3,
+    schedule: Annotated[
+        Literal["plateau", "cosine"],
+        Option(help="Halve the rate on a plateau, or let it fall to 0 at the last step."),
+    ] = "plateau",
+    rotations: Annotated[
+        Literal["any", "upright", "none"],
+        Option(help="Turn training balls: any way, about up, or not; edgegrasp and its kin only."),
+    ] = "any",
+    teacher: Annotated[
+        Path | None,
+        Option(help="Weights of a hand network whose scores a network of balls learns from too."),
+    ] = None,
+    evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
     validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
     seed: Annotated[int, Option(min=0, help="Seed of weights, split and batches.")] = 0,
     device: Annotated[str, Option(help="cpu or cuda.")] = "cpu",
@@ -33,9 +46,12 @@ def train(
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again goes on from the last state.
+    done a model card. Running the same command again goes on from the last state. What a teacher
+    says is kept beside the run folder, in `taught`.
     """
+    from edgegrasp_model.errors import InvalidCheckpoint
     from edgegrasp_training.recipes import recipe
+    from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer, TrainingOptions
     from edgegrasp_training.views import find_views, split_by_scene
 
@@ -44,12 +60,18 @@ def train(
         views_per_step=views_per_step,
         balls_per_view=balls_per_view,
         learning_rate=learning_rate,
+        schedule=schedule,
+        rotations=rotations,
+        evaluate_every=evaluate_every,
         seed=seed,
     )
     try:
         training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
-        trainer = Trainer(recipe(model), training_views, validation_views, run, options, device)
-    except (ValueError, FileNotFoundError) as error:
+        metadata = recipe(model)
+        taught = run.parent / "taught"
+        guide = None if teacher is None else Teacher(teacher, metadata.crop_radius, taught)
+        trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
+    except (ValueError, FileNotFoundError, InvalidCheckpoint) as error:
         sys.exit(f"edgegrasp train: {error}")
     print(f"{len(training_views)} training and {len(validation_views)} validation views")
     _run(trainer, until)

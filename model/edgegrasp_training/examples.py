@@ -1,6 +1,9 @@
 """Training examples: the balls or hands of a view with their labels, as the network takes them."""
 
-from dataclasses import dataclass, replace
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -10,6 +13,7 @@ from torch import Tensor
 
 from edgegrasp_model.ball_batch import BallBatch, crop_balls
 from edgegrasp_model.candidates import Candidates, edge_grasps
+from edgegrasp_model.canonical_frame import CanonicalFrame
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_batch import HandBatch
@@ -17,11 +21,15 @@ from edgegrasp_model.hand_description import without_support
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.views import LabelledView
+
+Rotations = Literal["any", "upright", "none"]
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))  # and what they are cut to
 SPARE_POINTS = 2  # times the network's points of a hand are kept, to pick from in each step
+TRIED_WEIGHT = 4.0  # of a simulated label in the loss, beside a teacher's score of weight 1
 SUPPORT = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)  # the table of the simulated scenes
 
 
@@ -42,6 +50,7 @@ class TriedGrasps:
     candidates: Candidates  # E of them
     seen: SeenByHands | None  # for the hand network
     label: NDArray[np.float32]  # (E,) 0 or 1
+    turn: NDArray[np.float32]  # (3, 3) the cloud's axes to those of the frame detectors work in
 
     def without_support(self) -> "TriedGrasps":
         """The same, described as for a request that does not name the support plane."""
@@ -53,6 +62,44 @@ class TriedGrasps:
     def balls(self) -> NDArray[np.int64]:
         """Rows of the cloud that are approach points of labelled candidates, ascending."""
         return np.unique(self.candidates.approach_index)
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """Candidates of a view that a teacher has scored; compact, to keep many views in memory."""
+
+    approach_index: NDArray[np.uint16]  # (E,) rows of the cloud
+    contact_index: NDArray[np.uint16]  # (E,) rows of the cloud
+    approach: NDArray[np.float16]  # (E, 3) unit, outward
+    depth: NDArray[np.float16]  # (E,) metres
+    chance: NDArray[np.float16]  # (E,) that it holds, as the teacher believes
+
+    @staticmethod
+    def none() -> "Lessons":
+        """No candidate."""
+        rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
+        return Lessons(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
+
+    def save(self, path: Path) -> None:
+        """Write them; a reader sees the whole file or none, whoever else writes it too."""
+        partial = path.with_suffix(f".{os.getpid()}.partial")
+        with partial.open("wb") as file:
+            np.savez_compressed(file, **{f.name: getattr(self, f.name) for f in fields(self)})
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as arrays:
+            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+
+
+class Packed(NamedTuple):
+    """What a network is given in one step, and what it should say."""
+
+    batch: BallBatch | HandBatch
+    label: Tensor  # (E,) float32, chance of success
+    weight: Tensor  # (E,) float32, in the loss
 
 
 def tried_grasps(
@@ -86,7 +133,15 @@ def tried_grasps(
         seen = SeenByHands(
             description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
         )
-    return TriedGrasps(cloud, candidates, seen, label)
+    return TriedGrasps(cloud, candidates, seen, label, _turn_of(view))
+
+
+def _turn_of(view: LabelledView) -> NDArray[np.float32]:
+    """What turns a view's axes to those of the detector's frame, (3, 3)."""
+    if len(view.points) == 0:
+        return np.eye(3, dtype=np.float32)
+    frame = CanonicalFrame.of_scene(view.points, UP, view.camera_position)
+    return frame.directions(np.eye(3)).T.astype(np.float32)
 
 
 def _candidates(
@@ -104,25 +159,38 @@ def _candidates(
 
 
 def pack_balls(
-    grasps: TriedGrasps, balls: NDArray[np.int64], config: NetworkConfig
-) -> tuple[BallBatch, Tensor]:
-    """Crop some balls of a view and pack the candidates in them.
+    grasps: TriedGrasps,
+    balls: NDArray[np.int64],
+    config: NetworkConfig,
+    lessons: Lessons | None = None,
+) -> Packed:
+    """Crop some balls of a view and pack the candidates in them, as networks of balls train.
+
+    In the axes of detectors, but lengths are multiples of LENGTH_UNIT.
 
     Args:
         grasps: The labelled candidates of a view.
         balls: (A,) ascending rows of the cloud to crop around.
         config: Crop radius and k.
-
-    Returns:
-        The balls, and the labels (E,) of their candidates.
+        lessons: Further candidates that a teacher has scored.
     """
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
-    candidates = grasps.candidates.take(rows)
+    tried = grasps.candidates.take(rows)
+    approach_index, contact_index = tried.approach_index, tried.contact_index
+    approach, depth, label = tried.approach, tried.depth, grasps.label[rows]
+    weight = np.ones(len(rows), dtype=np.float32)
+    if lessons is not None:
+        taught = np.flatnonzero(np.isin(lessons.approach_index, balls))
+        approach_index = np.append(approach_index, lessons.approach_index[taught])
+        contact_index = np.append(contact_index, lessons.contact_index[taught])
+        approach = np.concatenate([approach, lessons.approach[taught]], dtype=np.float32)
+        depth = np.append(depth, lessons.depth[taught])
+        label = np.append(label, lessons.chance[taught])
+        weight = np.append(TRIED_WEIGHT * weight, np.ones(len(taught), dtype=np.float32))
     crop = crop_balls(grasps.cloud.points, balls, config.crop_radius)
-    ball = np.searchsorted(balls, candidates.approach_index)
     size = len(grasps.cloud.points)
     keys = crop.ball_of_point * size + crop.ball_rows  # ascending
-    wanted = ball * size + candidates.contact_index
+    wanted = np.searchsorted(balls, approach_index) * size + contact_index
     contact = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     inside = keys[contact] == wanted
     batch = BallBatch.from_cloud(
@@ -131,11 +199,13 @@ def pack_balls(
         balls,
         crop,
         contact[inside],
-        candidates.approach[inside],
-        candidates.depth[inside],
+        approach[inside],
+        depth[inside],
         config.k,
     )
-    return batch, torch.from_numpy(grasps.label[rows[inside]])
+    batch = replace(batch, points=batch.points / LENGTH_UNIT, depth=batch.depth / LENGTH_UNIT)
+    label, weight = label[inside].astype(np.float32), weight[inside]
+    return Packed(turned(batch, grasps.turn), torch.from_numpy(label), torch.from_numpy(weight))
 
 
 def pack_hands(
@@ -143,7 +213,7 @@ def pack_hands(
     balls: NDArray[np.int64],
     config: NetworkConfig,
     rng: np.random.Generator | None = None,
-) -> tuple[HandBatch, Tensor]:
+) -> Packed:
     """Pack what the hands of the candidates of some balls see.
 
     Args:
@@ -151,9 +221,6 @@ def pack_hands(
         balls: (A,) rows of the cloud.
         config: Points of each hand.
         rng: Picks points of each hand at random; evenly over the cloud's order without it.
-
-    Returns:
-        The hands, and their labels (E,).
     """
     seen = grasps.seen
     if seen is None:
@@ -173,15 +240,27 @@ def pack_hands(
         torch.from_numpy(np.minimum(count, limit)),
         len(balls),
     )
-    return batch, torch.from_numpy(grasps.label[rows])
+    return Packed(batch, torch.from_numpy(grasps.label[rows]), torch.ones(len(rows)))
 
 
-def rotated(batch: BallBatch, rng: np.random.Generator) -> BallBatch:
-    """Turn all balls of a batch by one uniformly random rotation (paper section IV-D)."""
-    turn = torch.from_numpy(Rotation.random(rng=rng).as_matrix().T.astype(np.float32))
+def turned(batch: BallBatch, turn: NDArray[np.float32]) -> BallBatch:
+    """Turn all balls of a batch by one rotation (3, 3)."""
+    transposed = torch.from_numpy(turn.T.copy())
     return replace(
         batch,
-        points=batch.points @ turn,
-        normals=batch.normals @ turn,
-        approach=batch.approach @ turn,
+        points=batch.points @ transposed,
+        normals=batch.normals @ transposed,
+        approach=batch.approach @ transposed,
     )
+
+
+def random_turn(rotations: Rotations, rng: np.random.Generator) -> NDArray[np.float32]:
+    """A rotation (3, 3) to turn training balls by: any (paper section IV-D), about up, or none."""
+    match rotations:
+        case "any":
+            turn = Rotation.random(rng=rng)
+        case "upright":
+            turn = Rotation.from_rotvec(rng.uniform(0.0, 2 * np.pi) * UP)
+        case "none":
+            turn = Rotation.identity()
+    return turn.as_matrix().astype(np.float32)

@@ -1,13 +1,14 @@
 """The training loop: resumable to the step, stops by itself, keeps the best network."""
 
 import csv
+import math
 import time
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,15 +19,27 @@ from torch import Tensor, nn
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.network import build_network
-from edgegrasp_training.examples import TriedGrasps, pack_balls, pack_hands, rotated, tried_grasps
+from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
+from edgegrasp_training.examples import (
+    Lessons,
+    Packed,
+    Rotations,
+    TriedGrasps,
+    pack_balls,
+    pack_hands,
+    random_turn,
+    tried_grasps,
+    turned,
+)
 from edgegrasp_training.metrics import Evaluation, evaluate_scores
 from edgegrasp_training.model_card import write_model_card
+from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 8000
+Schedule = Literal["plateau", "cosine"]  # halve on a plateau, or fall to 0 at the last step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
 
 
@@ -44,6 +57,8 @@ class TrainingOptions:
     evaluate_every: int = 250  # steps
     averaging: float = 0.998  # share of the old weights in the running mean that is kept and judged
     unknown: float = 0.1  # share of training views without their table, and without their camera
+    rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
+    schedule: Schedule = "plateau"  # of the learning rate
     seed: int = 0
 
 
@@ -58,6 +73,7 @@ class Trainer:
         folder: Path,
         options: TrainingOptions,
         device: torch.device | str = "cpu",
+        teacher: Teacher | None = None,
     ) -> None:
         """Set up, and go on from the folder's last state if there is one.
 
@@ -68,13 +84,22 @@ class Trainer:
             folder: Gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far.
             options: The recipe.
             device: Where the network runs.
+            teacher: Scores further candidates, to learn from beside the labels.
+
+        Raises:
+            ValueError: There is a teacher for a network that sees hands, not balls.
         """
+        if teacher is not None and metadata.network.architecture == "hand":
+            raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
+        self.teacher = teacher
         self.metadata, self.folder, self.options, self.device = metadata, folder, options, device
         self.train_paths, self.validation_paths = train_paths, validation_paths
         self.gripper = load_gripper(metadata.gripper)
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
+        self._lessons = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._learn)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
+        prepare_to_train(self.network)
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
@@ -121,9 +146,9 @@ class Trainer:
                 if balls_per_view is not None and len(balls) > balls_per_view:
                     rng = np.random.default_rng([self.options.seed, number])
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
-                batch, label = self._pack(grasps, balls)
-                logits.append(self.average(batch.to(self.device)).float().cpu())
-                labels.append(label)
+                packed = self._pack(grasps, balls)
+                logits.append(self.average(packed.batch.to(self.device)).float().cpu())
+                labels.append(packed.label)
         logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
         return evaluate_scores(logit, label_array)
 
@@ -136,7 +161,7 @@ class Trainer:
         """
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
-        self.average.load_state_dict(best.state_dict())
+        self.average.load_state_dict(in_units(best).state_dict())
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
@@ -147,67 +172,90 @@ class Trainer:
             "training_seconds": round(self.seconds),
             "seed": self.options.seed,
         }
+        if self.teacher is not None:
+            taught = self.teacher.metadata
+            training |= {"teacher": taught.name, "teacher_digest": taught.digest}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
-        save_checkpoint(path, self.average, metadata)
+        self._save_average(metadata)
         card = self.folder / f"{self.metadata.name}.md"
         write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
 
     def _train_step(self) -> float:
         self.network.train()
-        batch, label = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
-        logit: Tensor = self.network(batch.to(self.device))
-        loss = F.binary_cross_entropy_with_logits(logit, label.to(self.device))
+        packed = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
+        logit: Tensor = self.network(packed.batch.to(self.device))
+        label, weight = packed.label.to(self.device), packed.weight.to(self.device)
+        loss = F.binary_cross_entropy_with_logits(logit, label, weight, reduction="sum")
+        loss = loss / weight.sum()
+        if self.options.schedule == "cosine":
+            left = (1.0 + math.cos(math.pi * self.step / self.options.steps)) / 2
+            for group in self.optimizer.param_groups:
+                group["lr"] = left * self.options.learning_rate
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         # A mean over few steps only at first, so that it does not remember the random weights.
         kept = min(self.options.averaging, (self.step + 1) / (self.step + 10))
-        for mean, weight in zip(self.average.parameters(), self.network.parameters(), strict=True):
-            mean.lerp_(weight.detach(), 1.0 - kept)
+        for mean, value in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(value.detach(), 1.0 - kept)
         return float(loss.detach())
 
-    def _training_batch(self, rng: np.random.Generator) -> tuple[BallBatch | HandBatch, Tensor]:
+    def _training_batch(self, rng: np.random.Generator) -> Packed:
         """Some balls of some views; the step number alone decides which."""
         count = min(self.options.views_per_step, len(self.train_paths))
-        batches, labels = [], []
+        parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
             camera_known, support_known = rng.random(2) >= self.options.unknown
             camera_matters = self.metadata.network.architecture == "hand"
             grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
-            balls = grasps.balls()
+            balls, lessons = grasps.balls(), None
+            if self.teacher is not None:
+                lessons = self._lessons(self.train_paths[index])
+                balls = np.union1d(balls, lessons.approach_index).astype(np.int64)
             if len(balls) == 0:
                 continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
-            batch, label = self._pack(grasps, np.sort(chosen), rng)
-            batches.append(batch)
-            labels.append(label)
+            packed = self._pack(grasps, np.sort(chosen), rng, lessons)
+            if self.metadata.network.architecture == "edgegrasp":
+                packed = self._turned(packed, rng, bool(camera_known))
+            parts.append(packed)
+        batches, labels, weights = zip(*parts, strict=True)
         join: Any = type(batches[0]).concatenate
-        return join(batches), torch.cat(labels)
+        return Packed(join(batches), torch.cat(labels), torch.cat(weights))
 
     def _pack(
         self,
         grasps: TriedGrasps,
         balls: NDArray[np.int64],
         rng: np.random.Generator | None = None,
-    ) -> tuple[BallBatch | HandBatch, Tensor]:
+        lessons: Lessons | None = None,
+    ) -> Packed:
         """Some balls of a view; varied where there is a random stream."""
         network = self.metadata.network
         if network.architecture == "hand":
             return pack_hands(grasps, balls, network, rng)
-        batch, label = pack_balls(grasps, balls, network)
-        # The conventional network must learn invariance; Vector Neurons have it.
-        if rng is not None and network.architecture == "edgegrasp":
-            batch = rotated(batch, rng)
-        return batch, label
+        return pack_balls(grasps, balls, network, lessons)
+
+    def _turned(self, packed: Packed, rng: np.random.Generator, camera_known: bool) -> Packed:
+        """Balls turned at random: what Vector Neurons need not learn, this network must."""
+        # Without a camera the detector's frame is upright, but may be turned any way about up.
+        known = camera_known or self.options.rotations == "any"
+        rotations = self.options.rotations if known else "upright"
+        assert isinstance(packed.batch, BallBatch)
+        return packed._replace(batch=turned(packed.batch, random_turn(rotations, rng)))
 
     def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
         view = load_view(path)
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
+
+    def _learn(self, path: Path) -> Lessons:
+        assert self.teacher is not None
+        return self.teacher.lessons(path)
 
     def _standardise(self) -> None:
         """Fit the description's mean and spread to the training views."""
@@ -223,21 +271,24 @@ class Trainer:
         self.since_best += 1
         if evaluation.loss < self.best_loss:
             self.best_loss, self.since_best = evaluation.loss, 0
-            save_checkpoint(
-                self.folder / f"{self.metadata.name}.safetensors", self.average, self.metadata
-            )
-        elif self.since_best >= self.options.patience:
+            self._save_average(self.metadata)
+        elif self.options.schedule == "plateau" and self.since_best >= self.options.patience:
             self.since_best, self.halved = 0, self.halved + 1
             for group in self.optimizer.param_groups:
                 group["lr"] /= 2
         self._log(evaluation, train_loss)
         self._save_state()
 
+    def _save_average(self, metadata: CheckpointMetadata) -> None:
+        """Write the running mean, for lengths in metres."""
+        path = self.folder / f"{metadata.name}.safetensors"
+        save_checkpoint(path, in_metres(self.average), metadata)
+
     def _log(self, evaluation: Evaluation, train_loss: float) -> None:
         path = self.folder / LOG_FILE
         row = {
             "step": self.step,
-            "learning_rate": self.optimizer.param_groups[0]["lr"],
+            "learning_rate": float(f"{self.optimizer.param_groups[0]['lr']:.4g}"),
             "train_loss": round(train_loss, 5),
             "validation_loss": round(evaluation.loss, 5),
             "accuracy": round(evaluation.accuracy, 5),

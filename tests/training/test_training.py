@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -5,26 +6,27 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates import edge_grasps
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
-from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.examples import (
     SUPPORT,
     UP,
     WORKSPACE,
     pack_balls,
     pack_hands,
-    rotated,
+    random_turn,
     tried_grasps,
+    turned,
 )
 from edgegrasp_training.recipes import RECIPES, recipe
 from edgegrasp_training.training import Trainer, TrainingOptions
-from edgegrasp_training.views import LabelledView, find_views, split_by_scene
+from edgegrasp_training.views import LabelledView, split_by_scene
 
+MakeView = Callable[[int], LabelledView]
 TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04)
 HAND = NetworkConfig(
     "hand", hand_widths=(8, 16), hand_points=16, classifier_widths=(16, 8), crop_radius=0.04
@@ -32,40 +34,6 @@ HAND = NetworkConfig(
 FAST = TrainingOptions(
     steps=40, views_per_step=2, balls_per_view=3, learning_rate=3e-3, evaluate_every=10
 )
-
-
-def made_up_view(seed: int) -> LabelledView:
-    """A box on the table; grasps from above are said to hold, others not."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-0.5, 0.5, (300, 3)) * (0.05, 0.05, 0.06)
-    face = rng.integers(3, size=300)
-    points[np.arange(300), face] = np.sign(points[np.arange(300), face]) * (0.025, 0.025, 0.03)[0]
-    normals = np.zeros((300, 3))
-    normals[np.arange(300), face] = np.sign(points[np.arange(300), face])
-    points += (0.15, 0.15, 0.085)
-    cloud = Cloud(points.astype(np.float32), normals.astype(np.float32))
-    approach = np.repeat(rng.choice(300, 6, replace=False), 30)
-    contact = rng.integers(300, size=len(approach))
-    made = edge_grasps(cloud, approach, contact, load_gripper())
-    label = np.full(len(approach), -1, np.int8)
-    label[made.pair] = made.approach[:, 2] > 0.4
-    return LabelledView(
-        cloud.points,
-        cloud.normals,
-        np.array([0.15, 0.15, 0.8], np.float32),
-        approach,
-        contact,
-        None,
-        label,
-    )
-
-
-@pytest.fixture(scope="module")
-def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("views")
-    for number in range(8):
-        made_up_view(number).save(folder / f"packed_{number}_0.npz")
-    return find_views([folder])
 
 
 def trainer(views: list[Path], folder: Path, config: NetworkConfig = HAND) -> Trainer:
@@ -121,25 +89,41 @@ def test_the_seed_decides_everything(views: list[Path], tmp_path: Path) -> None:
     torch.testing.assert_close(one, other, rtol=0, atol=0)
 
 
-def test_packed_balls_hold_each_tried_grasp_and_its_contact(views: list[Path]) -> None:
+def test_packed_balls_hold_each_tried_grasp_and_its_contact(
+    made_up_view: MakeView, views: list[Path]
+) -> None:
     view = made_up_view(1)
     grasps = tried_grasps(view, TINY, load_gripper())
-    batch, label = pack_balls(grasps, grasps.balls(), TINY)
+    batch, label, weight = pack_balls(grasps, grasps.balls(), TINY)
     assert len(label) == len(grasps.label) == len(batch.contact)
-    order = np.argsort(grasps.candidates.approach_index, kind="stable")
+    assert (weight == 1).all()
     contact = grasps.cloud.points[grasps.candidates.contact_index]
     edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
-    found = batch.points[batch.contact].numpy()
-    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(edge[order], axis=0), atol=1e-6)
-    some, some_label = pack_balls(grasps, grasps.balls()[:2], TINY)
-    assert some.num_balls == 2
-    assert 0 < len(some_label) < len(label)
+    found = batch.points[batch.contact].numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
+    depth = batch.depth.numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
+    some = pack_balls(grasps, grasps.balls()[:2], TINY)
+    assert some.batch.num_balls == 2
+    assert 0 < len(some.label) < len(label)
 
 
-def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream() -> None:
+def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(made_up_view: MakeView) -> None:
+    view = replace(made_up_view(1), camera_position=np.array([0.5, -0.3, 0.6], np.float32))
+    grasps = tried_grasps(view, TINY, load_gripper())
+    np.testing.assert_allclose(grasps.turn @ grasps.turn.T, np.eye(3), atol=1e-6)
+    toward_camera = grasps.turn @ (view.camera_position - view.points.mean(axis=0))
+    assert toward_camera[0] > 0.5
+    assert toward_camera[1] == pytest.approx(0, abs=1e-5)
+    assert (grasps.turn @ UP)[2] == pytest.approx(1)
+
+
+def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
+    made_up_view: MakeView,
+) -> None:
     view = made_up_view(1)
     grasps = tried_grasps(view, HAND, load_gripper())
-    batch, label = pack_hands(grasps, grasps.balls()[:2], HAND)
+    batch, label, _ = pack_hands(grasps, grasps.balls()[:2], HAND)
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
     np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
     assert batch.num_balls == 2
@@ -155,14 +139,14 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream() 
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(batch.point_count, exact.point_count)
-    varied, _ = pack_hands(grasps, grasps.balls()[:2], HAND, np.random.default_rng(0))
+    varied = pack_hands(grasps, grasps.balls()[:2], HAND, np.random.default_rng(0)).batch
     assert not torch.equal(varied.points, batch.points)
     there = torch.arange(HAND.hand_points) < varied.point_count[:, None]
     assert (varied.points[there].abs().sum(dim=1) > 0).all()
     assert (varied.points[~there] == 0).all()
 
 
-def test_a_hand_whose_camera_is_not_known_is_told_of_none() -> None:
+def test_a_hand_whose_camera_is_not_known_is_told_of_none(made_up_view: MakeView) -> None:
     view, gripper = made_up_view(1), load_gripper()
     known = tried_grasps(view, HAND, gripper).seen
     unknown = tried_grasps(view, HAND, gripper, viewpoint_known=False).seen
@@ -174,21 +158,51 @@ def test_a_hand_whose_camera_is_not_known_is_told_of_none() -> None:
     assert (unknown.description[:, camera] == 0).all()
 
 
-def test_augmentation_turns_points_normals_and_approach_alike(views: list[Path]) -> None:
+def test_augmentation_turns_points_normals_and_approach_alike(made_up_view: MakeView) -> None:
     grasps = tried_grasps(made_up_view(2), TINY, load_gripper())
-    batch, _ = pack_balls(grasps, grasps.balls(), TINY)
-    turned = rotated(batch, np.random.default_rng(0))
-    assert not torch.allclose(batch.points, turned.points)
+    batch = pack_balls(grasps, grasps.balls(), TINY).batch
+    other = turned(batch, random_turn("any", np.random.default_rng(0)))
+    assert not torch.allclose(batch.points, other.points)
     lengths, cosines = batch.points.norm(dim=1), (batch.points * batch.normals).sum(dim=1)
-    torch.testing.assert_close(turned.points.norm(dim=1), lengths, atol=1e-6, rtol=1e-4)
-    turned_cosines = (turned.points * turned.normals).sum(dim=1)
-    torch.testing.assert_close(turned_cosines, cosines, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(other.points.norm(dim=1), lengths, atol=1e-5, rtol=1e-4)
+    other_cosines = (other.points * other.normals).sum(dim=1)
+    torch.testing.assert_close(other_cosines, cosines, atol=1e-4, rtol=1e-4)
     along = (batch.points[batch.contact] * batch.approach).sum(dim=1)
-    along_turned = (turned.points[turned.contact] * turned.approach).sum(dim=1)
-    torch.testing.assert_close(along, along_turned, atol=1e-5, rtol=1e-4)
+    along_other = (other.points[other.contact] * other.approach).sum(dim=1)
+    torch.testing.assert_close(along, along_other, atol=1e-4, rtol=1e-4)
 
 
-def test_a_view_without_labels_is_passed_over(views: list[Path], tmp_path: Path) -> None:
+def test_random_turns_are_any_or_upright_or_none() -> None:
+    rng = np.random.default_rng(0)
+    turns = {kind: [random_turn(kind, rng) for _ in range(50)] for kind in ("any", "upright")}
+    for turn in turns["any"] + turns["upright"]:
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+    raised = {kind: [(turn @ UP)[2] for turn in some] for kind, some in turns.items()}
+    assert min(raised["any"]) < -0.5
+    assert max(raised["any"]) > 0.5
+    np.testing.assert_allclose(raised["upright"], 1.0, atol=1e-6)
+    headings = [turn[0, 0] for turn in turns["upright"]]
+    assert min(headings) < -0.5
+    assert max(headings) > 0.5
+    np.testing.assert_array_equal(random_turn("none", rng), np.eye(3))
+
+
+def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(
+    views: list[Path], tmp_path: Path
+) -> None:
+    train, validation = split_by_scene(views, 0.25, seed=0)
+    metadata = CheckpointMetadata("tiny", TINY, voxel_size=0.0045, gripper="panda")
+    options = replace(FAST, steps=8, evaluate_every=4, schedule="cosine")
+    run = Trainer(metadata, train, validation, tmp_path, options)
+    run.run(lambda step, loss: None)
+    rates = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)[:, 1]
+    half, last = options.learning_rate * (1 + np.cos(np.pi * np.array([3 / 8, 7 / 8]))) / 2
+    np.testing.assert_allclose(rates, [half, last], rtol=1e-3)
+
+
+def test_a_view_without_labels_is_passed_over(
+    made_up_view: MakeView, views: list[Path], tmp_path: Path
+) -> None:
     view = made_up_view(3)
     none = replace(view, success=np.full_like(view.success, -1))
     none.save(tmp_path / "packed_99_0.npz")

@@ -131,7 +131,7 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
         dense = dense[keep(dense)]
     if len(dense) < MIN_POINTS:
         return None
-    normals = _normals(dense)
+    normals = estimate_normals(dense)
     cells = np.floor((dense - (dense.min(axis=0) - voxel_size / 2)) / voxel_size).astype(np.int64)
     _, first, voxel, count = np.unique(
         cells, axis=0, return_index=True, return_inverse=True, return_counts=True
@@ -157,8 +157,8 @@ def _in_company(points: Float64) -> NDArray[np.bool_]:
     return near
 
 
-def _normals(points: Float64) -> Float64:
-    """Unit normals (N, 3) of either sign: least variance among the nearest points."""
+def estimate_normals(points: Float64) -> Float64:
+    """Unit normals (N, 3) of either sign: least variance among each point's neighbours."""
     distances, rows = _nearest(points)
     counts = (distances <= NORMAL_RADIUS)[:, :, None]
     near = points[rows]

@@ -17,9 +17,10 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.on_device.balls import ball_batch
 from edgegrasp_model.on_device.hand_batch import hand_batch, hand_widths
+from edgegrasp_model.on_device.precision import Precision
 from edgegrasp_model.on_device.preparation import DeviceSample, sample_candidates
 from edgegrasp_model.on_device.scene import DeviceScene, build_scene
-from edgegrasp_model.on_device.scoring import Precision, ScoringNetwork
+from edgegrasp_model.on_device.scoring import ScoringNetwork
 from edgegrasp_model.on_device.selection import select
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.preparation import Round

@@ -7,6 +7,7 @@ from torch import Tensor
 from edgegrasp_model.layers import gather_rows
 from edgegrasp_model.network import EdgeGraspNet, GlobalFeature, PointNetConv
 from edgegrasp_model.on_device.padded_balls import PaddedBalls, in_pieces
+from edgegrasp_model.on_device.precision import products_in
 
 
 def edge_grasp_logits(
@@ -26,7 +27,7 @@ def edge_grasp_logits(
     f3 = F.relu(_convolution(network.conv3, f2, balls))
     own = (balls.points[contact], balls.normals[contact], balls.depth.unsqueeze(1), balls.approach)
     grasp = torch.cat((*own, f3[contact]), dim=1)
-    with torch.autocast(f3.device.type, half, enabled=half is not None, cache_enabled=False):
+    with products_in(half, f3.device):
         ball = _ball_feature(network.ball_feature, torch.cat((f1, f2, f3), dim=1), balls)
         hidden = F.relu(network.join(grasp, ball, balls.ball_of_edge))
         logits: Tensor = network.classifier(hidden).squeeze(1)

@@ -1,7 +1,6 @@
 """A network as a device runs it: batches filled up to few shapes, one graph for each."""
 
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,10 +17,9 @@ from edgegrasp_model.on_device.padded_balls import (
     filled,
     padded_balls,
 )
+from edgegrasp_model.on_device.precision import Precision, half_type, products_in
 from edgegrasp_model.on_device.vn_network import vn_edge_grasp_logits
 from edgegrasp_model.vn_network import VNEdgeGraspNet
-
-Precision = Literal["float32", "float16", "bfloat16"]
 
 
 class ScoringNetwork:
@@ -35,7 +33,7 @@ class ScoringNetwork:
 
     def __init__(self, network: nn.Module, precision: Precision = "float32") -> None:
         self.network = network
-        self._half = None if precision == "float32" else getattr(torch, precision)
+        self._half = half_type(precision)
         self._run = Captured(self._balls_function() or self._hand_logits)
 
     def __call__(self, batch: BallBatch | HandBatch) -> Tensor:
@@ -59,9 +57,6 @@ class ScoringNetwork:
         return None
 
     def _hand_logits(self, description: Tensor, points: Tensor, point_count: Tensor) -> Tensor:
-        half = self._half
-        with torch.autocast(
-            points.device.type, half, enabled=half is not None, cache_enabled=False
-        ):
+        with products_in(self._half, points.device):
             logits: Tensor = self.network(HandBatch(description, points, point_count, 0))
         return logits.float()

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from edgegrasp_model.layers import gather_rows
 from edgegrasp_model.on_device.padded_balls import PaddedBalls, in_pieces
+from edgegrasp_model.on_device.precision import products_in
 from edgegrasp_model.vn_layers import vector_maximum, vector_relu
 from edgegrasp_model.vn_network import (
     VNBallMaximum,
@@ -32,7 +33,7 @@ def vn_edge_grasp_logits(
     f3 = _convolution(network.conv3, f2, balls)
     named = torch.stack((balls.approach, balls.points[contact], balls.normals[contact]), dim=2)
     grasp = torch.cat((named, f3[contact]), dim=2)
-    with torch.autocast(f3.device.type, half, enabled=half is not None, cache_enabled=False):
+    with products_in(half, f3.device):
         ball = _ball_feature(network.ball_feature, torch.cat((f1, f2, f3), dim=2), balls)
         frame = network.frame_1(grasp, ball, balls.ball_of_edge)
         frame = network.frame_3(network.frame_2(frame))

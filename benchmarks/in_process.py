@@ -1,0 +1,96 @@
+"""A detector without a server around it, in this process or in one of its own.
+
+`python -m benchmarks.in_process KIND` detects once for each line on stdin and writes the seconds
+by the clock and of processors; KIND is "network", or the milliseconds of a dummy.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from types import TracebackType
+from typing import Any, Self
+
+from benchmarks.senders import cloud
+
+POINTS = 20_000
+OPTIONS = {"num_approach_points": 32, "num_candidates": 500}
+
+
+class InProcess:
+    """A detector called in this process."""
+
+    def __init__(self, kind: str) -> None:
+        self._detector = _detector(kind)
+        self._points = cloud(POINTS, seed=0)
+
+    def seconds(self) -> tuple[float, float]:
+        """What one detection takes, by the clock and of processors."""
+        from edgegrasp_model.cloud_input import CloudInput
+        from edgegrasp_model.options import parse_options
+
+        parsed = parse_options(dict(OPTIONS))
+        start, cpu = time.perf_counter(), time.process_time()
+        prepared = self._detector.prepare(CloudInput(self._points), parsed)
+        logits = self._detector.run(prepared.batch)
+        self._detector.finish(prepared, logits)
+        return time.perf_counter() - start, time.process_time() - cpu
+
+
+class Apart:
+    """The same in a process that idles between the calls, as a server's does."""
+
+    def __init__(self, kind: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.in_process", kind],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
+        assert self._process.stdout is not None
+        self._process.stdout.readline()
+
+    def seconds(self) -> tuple[float, float]:
+        """As InProcess tells it, measured there."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        wall, cpu = json.loads(self._process.stdout.readline())
+        return wall, cpu
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """End the process."""
+        self._process.communicate(timeout=30)
+
+
+def _detector(kind: str) -> Any:
+    """The dummy network of a service time, or the default weights on one thread."""
+    if kind != "network":
+        from edgegrasp_service.dummy import DummyDetector
+
+        return DummyDetector(float(kind) / 1000)
+    import torch
+
+    from edgegrasp_model.catalogue import ModelCatalogue
+
+    torch.set_num_threads(1)
+    return ModelCatalogue.load((), default="", grippers=()).get("")
+
+
+if __name__ == "__main__":
+    measured = InProcess(sys.argv[1])
+    print("ready", flush=True)
+    for _ in sys.stdin:
+        print(json.dumps(measured.seconds()), flush=True)

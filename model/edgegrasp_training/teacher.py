@@ -1,0 +1,111 @@
+"""A trained network as teacher: its scores of many candidates that no simulated hand has tried."""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from edgegrasp_model.ball_batch import crop_balls
+from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
+from edgegrasp_model.checkpoint import load_checkpoint
+from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_training.examples import SUPPORT, UP, WORKSPACE, Lessons
+from edgegrasp_training.views import LabelledView, load_view
+
+OWN_BALLS = 16  # balls of a view around approach points of its tried grasps
+FURTHER_BALLS = 8  # around other points
+GRASPS_PER_BALL = 64  # that are scored; about a third of a ball's candidates
+
+
+class Teacher:
+    """A hand network that scores the candidates of views, and the files that keep its scores."""
+
+    def __init__(self, weights: Path, crop_radius: float, folder: Path) -> None:
+        """Load the teacher.
+
+        Args:
+            weights: A checkpoint of architecture `hand`.
+            crop_radius: Radius of the balls that candidates are drawn from, metres.
+            folder: Keeps the scores, in a folder for this teacher and radius; runs may share it.
+
+        Raises:
+            InvalidCheckpoint: The weights cannot be read.
+            ValueError: They are of another architecture.
+        """
+        self.network, self.metadata = load_checkpoint(weights)
+        if self.metadata.network.architecture != "hand":
+            found = self.metadata.network.architecture
+            raise ValueError(f"teacher: got a network of architecture {found!r}. Use a `hand` one.")
+        self.gripper = load_gripper(self.metadata.gripper)
+        self.crop_radius = crop_radius
+        self.folder = folder / f"{self.metadata.digest[:12]}-{crop_radius * 1000:g}mm"
+
+    def lessons(self, path: Path) -> Lessons:
+        """Its scores of a view's candidates; from the file that keeps them if there is one.
+
+        Args:
+            path: The view's file. What it holds decides which candidates are scored.
+        """
+        digest = zlib.crc32(path.read_bytes())
+        kept = self.folder / f"{path.stem}-{digest:08x}.npz"
+        if not kept.is_file():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.teach(load_view(path), np.random.default_rng(digest)).save(kept)
+        return Lessons.load(kept)
+
+    def teach(self, view: LabelledView, rng: np.random.Generator) -> Lessons:
+        """Score candidates around some of a view's points.
+
+        Args:
+            view: The view.
+            rng: Chooses balls and candidates.
+        """
+        own = np.unique(view.approach_index[view.tried()])
+        others = np.setdiff1d(np.arange(len(view.points)), own)
+        own = rng.permutation(own)[:OWN_BALLS]
+        balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
+        if len(balls) == 0:
+            return Lessons.none()
+        cloud = Cloud(view.points, view.normals)
+        candidates = self._candidates(cloud, balls, rng)
+        if len(candidates) == 0:
+            return Lessons.none()
+        hands = HandBatch.from_cloud(
+            cloud,
+            candidates,
+            self.gripper,
+            UP,
+            SUPPORT,
+            view.camera_position,
+            at_workspace_side(view.points, WORKSPACE, UP),
+            self.metadata.network.hand_points,
+        )
+        with torch.inference_mode():
+            chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
+        return Lessons(
+            candidates.approach_index.astype(np.uint16),
+            candidates.contact_index.astype(np.uint16),
+            candidates.approach.astype(np.float16),
+            candidates.depth.astype(np.float16),
+            chance.astype(np.float16),
+        )
+
+    def _candidates(
+        self, cloud: Cloud, balls: NDArray[np.int64], rng: np.random.Generator
+    ) -> Candidates:
+        """Candidates in balls (A,), as the detector makes them; so many of each."""
+        crop = crop_balls(cloud.points, balls, self.crop_radius)
+        pairs = balls[crop.ball_of_point], crop.ball_rows
+        level = level_grasps(cloud, *pairs, SUPPORT, self.gripper)
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), level])
+        both, clear = drawn_back(both, SUPPORT, self.gripper)
+        both = both.take(rng.permutation(np.flatnonzero(clear)))
+        both = both.take(np.argsort(both.approach_index, kind="stable"))
+        _, first = np.unique(both.approach_index, return_index=True)
+        place = np.arange(len(both)) - np.repeat(first, np.diff([*first, len(both)]))
+        return both.take(place < GRASPS_PER_BALL)

@@ -1,0 +1,52 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgegrasp_model.candidates import edge_grasps
+from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_training.views import LabelledView, find_views
+
+MakeView = Callable[[int], LabelledView]
+
+
+def _made_up_view(seed: int) -> LabelledView:
+    """A box on the table; grasps from above are said to hold, others not."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (300, 3)) * (0.05, 0.05, 0.06)
+    face = rng.integers(3, size=300)
+    points[np.arange(300), face] = np.sign(points[np.arange(300), face]) * (0.025, 0.025, 0.03)[0]
+    normals = np.zeros((300, 3))
+    normals[np.arange(300), face] = np.sign(points[np.arange(300), face])
+    points += (0.15, 0.15, 0.085)
+    cloud = Cloud(points.astype(np.float32), normals.astype(np.float32))
+    approach = np.repeat(rng.choice(300, 6, replace=False), 30)
+    contact = rng.integers(300, size=len(approach))
+    made = edge_grasps(cloud, approach, contact, load_gripper())
+    label = np.full(len(approach), -1, np.int8)
+    label[made.pair] = made.approach[:, 2] > 0.4
+    return LabelledView(
+        cloud.points,
+        cloud.normals,
+        np.array([0.15, 0.15, 0.8], np.float32),
+        approach,
+        contact,
+        None,
+        label,
+    )
+
+
+@pytest.fixture(scope="session")
+def made_up_view() -> MakeView:
+    """Makes the view of a seed."""
+    return _made_up_view
+
+
+@pytest.fixture(scope="session")
+def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("views")
+    for number in range(8):
+        _made_up_view(number).save(folder / f"packed_{number}_0.npz")
+    return find_views([folder])
