@@ -39,14 +39,22 @@ class HandNet(nn.Module):
         self.mean.copy_(mean)
         self.std.copy_(std.clamp_min(1e-3))
 
-    def forward(self, batch: HandBatch) -> Tensor:
-        """Scores the edge grasps of a batch: logits (E,) of success."""
+    def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
+        """Scores the edge grasps of a batch: logits (E,) of success.
+
+        Args:
+            batch: What E hands see.
+            left_out: In training, draws what the classifier is not told; None: it is told all.
+        """
         description = (batch.description - self.mean) / self.std  # (E, F)
         pieces = zip(
             torch.split(batch.points, PIECE), torch.split(batch.point_count, PIECE), strict=True
         )
         around = torch.cat([self._around(points, count) for points, count in pieces])  # (E, 2 C)
-        seen = F.dropout(torch.cat((description, around), dim=1), DROPOUT, self.training)
+        seen = torch.cat((description, around), dim=1)
+        if left_out is not None:
+            draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
+            seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
         logits: Tensor = self.classifier(seen).squeeze(1)
         return logits  # (E,)
 

@@ -26,9 +26,14 @@ def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
     lines += [
         f"| {fact} | {' | '.join(column[fact] for column in columns)} |" for fact in columns[0]
     ]
-    objects = Counter(name for view in views.values() for name in set(view.objects))
-    lines += ["", "Made by:", "", "```", command, "```", "", "Views that each object is in:", ""]
-    lines += [f"- {name}: {count}" for name, count in sorted(objects.items())]
+    objects = Counter(
+        known
+        for view in views.values()
+        for known in set(zip(view.objects, view.object_digests, strict=True))
+    )
+    lines += ["", "Made by:", "", "```", command, "```", ""]
+    lines += ["Objects, the SHA-256 of their files, and in how many views they are:", ""]
+    lines += [f"- {name} `{digest}`: {count}" for (name, digest), count in sorted(objects.items())]
     path = folder / CARD_FILE
     path.write_text("\n".join(lines) + "\n")
     return path

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.network import build_network
 from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
@@ -40,6 +41,7 @@ from edgegrasp_training.views import load_view
 
 VIEWS_IN_MEMORY = 8000
 Schedule = Literal["plateau", "cosine"]  # halve on a plateau, or fall to 0 at the last step
+DROPOUT_STREAM = 1  # random stream of a step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
 
 
@@ -181,10 +183,20 @@ class Trainer:
         write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
 
+    def _training_logits(self, batch: BallBatch | HandBatch) -> Tensor:
+        logit: Tensor
+        if isinstance(self.network, HandNet):
+            draws = np.random.SeedSequence([self.options.seed, self.step, DROPOUT_STREAM])
+            left_out = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
+            logit = self.network(batch, left_out)
+        else:
+            logit = self.network(batch)
+        return logit
+
     def _train_step(self) -> float:
         self.network.train()
         packed = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
-        logit: Tensor = self.network(packed.batch.to(self.device))
+        logit = self._training_logits(packed.batch.to(self.device))
         label, weight = packed.label.to(self.device), packed.weight.to(self.device)
         loss = F.binary_cross_entropy_with_logits(logit, label, weight, reduction="sum")
         loss = loss / weight.sum()

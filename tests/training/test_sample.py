@@ -1,5 +1,6 @@
 """The labelled views that come with the project."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -61,3 +62,15 @@ def test_the_card_counts_what_is_there(tmp_path: Path) -> None:
     assert card.split("Made by:")[0] == committed.split("Made by:")[0]
     tried = sum(len(load_view(path).tried()) for path in paths)
     assert f"| {tried} |" in card
+
+
+@pytest.mark.parametrize("kind", SceneKind)
+def test_no_test_object_is_in_the_data_of_the_shipped_weights(
+    shared_dir: Path, kind: SceneKind
+) -> None:
+    card = (SAMPLE.parents[1] / "docs" / "training_data.md").read_text()
+    listed = re.findall(r"^- (\S+) `([0-9a-f]{64})`: \d+$", card, re.MULTILINE)
+    assert len(listed) > 250
+    kept_apart = ObjectSet.from_folder(shared_dir / "objects", kind, "test").models
+    assert not {name for name, _ in listed} & {model.name for model in kept_apart}
+    assert not {digest for _, digest in listed} & {model.digest for model in kept_apart}
