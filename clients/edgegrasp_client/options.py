@@ -116,7 +116,7 @@ class ApproachDirection(TypedDict, total=False):
 class Collision(TypedDict, total=False):
     """What the hand must not meet, and on which way."""
 
-    mode: Literal["avoid", "penalise", "ignore"]  # left out, ranked last, or not looked for
+    mode: Literal["avoid", "penalise", "ignore"]  # left out, worth half, or not looked for
     margin: float  # metres kept free around the hand
     opening: float | None  # metres between the fingers on the way in; None: the maximum
     approach_length: float  # metres of straight way in

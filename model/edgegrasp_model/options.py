@@ -71,7 +71,8 @@ class Collision(Strict):
 
     mode: CollisionMode = Field(
         default="avoid",
-        description="grasps whose hand collides: left out, ranked last, or not looked for",
+        description="grasps whose hand collides: left out, their scores worth half in the "
+        "ranking, or not looked for",
     )
     margin: float = Field(
         default=0.0,

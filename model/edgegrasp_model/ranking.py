@@ -1,6 +1,6 @@
 """Order scored grasps and thin out near duplicates."""
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from edgegrasp_model.options import Suppression
 
 Float32 = NDArray[np.float32]
 
+COLLIDING = 0.5  # a score is worth this share where the hand meets something, as far as one sees
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 
 
@@ -19,23 +20,24 @@ def ranked(
     height: NDArray[np.floating] | None = None,
     clearance: NDArray[np.floating] | None = None,
 ) -> NDArray[np.int64]:
-    """Rows best first: those free of collision before the others, and each of the two in order.
+    """Rows best first.
 
     Args:
         score: (E,) probabilities.
-        collision_free: (E,)
+        collision_free: (E,) the others' scores are worth COLLIDING as much.
         order: By score; by height where the score is SURE_SCORE or more, then the others by
-            score; or by clearance, then by score.
+            score; or those free of collision first, by clearance, then by score.
         height: (E,) of the TCP along up, for `highest`.
         clearance: (E,) for `clearance`.
     """
-    keys: tuple[NDArray[np.floating], ...] = (-score,)
+    worth = np.where(collision_free, score, COLLIDING * score)
+    keys: tuple[NDArray[Any], ...] = (-worth,)
     if order == "highest" and height is not None:
-        sure = score >= SURE_SCORE
-        keys = (-score, np.where(sure, -height, -score), np.where(sure, 0.0, 1.0))
+        sure = worth >= SURE_SCORE
+        keys = (-worth, np.where(sure, -height, -worth), ~sure)
     if order == "clearance" and clearance is not None:
-        keys = (-score, -clearance)
-    return np.lexsort((*keys, ~collision_free)).astype(np.int64)
+        keys = (-score, -clearance, ~collision_free)
+    return np.lexsort(keys).astype(np.int64)
 
 
 def suppress(

@@ -7,10 +7,11 @@ from edgegrasp_model.options import Suppression
 from edgegrasp_model.ranking import ranked, rotation_distance, suppress
 
 
-def test_collision_free_grasps_come_first_then_the_score_decides() -> None:
+def test_the_score_decides_and_counts_half_where_the_hand_collides() -> None:
     score = np.array([0.9, 0.2, 0.95, 0.5])
     free = np.array([False, True, False, True])
-    assert ranked(score, free).tolist() == [3, 1, 2, 0]
+    assert ranked(score, free).tolist() == [3, 2, 0, 1]
+    assert ranked(score, ~free).tolist() == [2, 0, 3, 1]
 
 
 def test_the_highest_of_the_sure_grasps_comes_first_then_the_others_by_score() -> None:

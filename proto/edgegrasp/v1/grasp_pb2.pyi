@@ -1393,7 +1393,7 @@ class Collision(_message.Message):
     RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
     OBSTACLES_FIELD_NUMBER: _builtins.int
     mode: _builtins.str
-    """Grasps whose hand collides: "avoid" (left out), "penalise" (ranked last) or "ignore"."""
+    """Grasps whose hand collides: "avoid" (left out), "penalise" (scores worth half) or "ignore"."""
     margin: _builtins.float
     """Metres kept free around the hand."""
     opening: _builtins.float
