@@ -84,7 +84,7 @@ class Int8Linear(nn.Module):
         source = (values, float(self.input_scale), 0)
         scale = 1.0 if bytes_for is None else float(bytes_for.input_scale)
         target = (scale, 0, torch.float32 if bytes_for is None else torch.uint8)
-        rectified = ("none" if bytes_for is None else "relu", [], "")
+        rectified: tuple[str, list[float], str] = ("none" if bytes_for is None else "relu", [], "")
         multiply = torch.ops.onednn.qlinear_pointwise
         result: Tensor
         if plus is None:

@@ -41,20 +41,26 @@ class Int8EdgeGraspNet(EdgeGraspNet):
             setattr(self, name, layer)
 
 
-def quantise(network: nn.Module, batches: Sequence[BallBatch]) -> Int8EdgeGraspNet:
+def check_quantisable(config: NetworkConfig) -> None:
+    """Raise ValueError unless networks of a config can be quantised."""
+    if config.architecture != "edgegrasp":
+        raise ValueError(
+            f"architecture: got {config.architecture!r}. int8 is for edgegrasp networks in float32."
+        )
+
+
+def quantise(network: EdgeGraspNet, batches: Sequence[BallBatch]) -> Int8EdgeGraspNet:
     """The same network in int8.
 
     Args:
-        network: An EdgeGraspNet in float32.
+        network: In float32.
         batches: Balls as it will meet them: they say how large its features become. A dozen views
             are plenty; nothing is trained.
 
     Raises:
         ValueError: The network is another one, or there are no batches.
     """
-    if type(network) is not EdgeGraspNet:
-        known = getattr(getattr(network, "config", None), "architecture", type(network).__name__)
-        raise ValueError(f"architecture: got {known!r}. int8 is for edgegrasp networks.")
+    check_quantisable(network.config)
     if not batches:
         raise ValueError("batches: got none. Give balls to measure the features on.")
     largest = _largest_inputs(network, batches)

@@ -169,3 +169,15 @@ def test_a_server_with_tls_and_tokens(
             assert code == 1
     code, output = run("models", "--server", "127.0.0.1:1", "--token-file", str(tmp_path / "none"))
     assert (code, "token file" in output) == (1, True)
+
+
+def test_a_device_that_is_not_there_is_named(file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    code, output = run("detect", file, "--device", "cuda")
+    assert code == 1
+    assert "edgegrasp detect: device: got 'cuda'" in output
+    code, output = run("detect", file, "--device", "gpu")
+    assert code == 1
+    assert "Use auto, cpu, cuda" in output

@@ -178,13 +178,18 @@ def drawn_back(
 
 def support_clearance(T_cloud_hand: Tensor, support: SupportPlane, gripper: Gripper) -> Tensor:
     """Height (E,) of the lowest corner of each hand, fingers open, over the support plane."""
+    normal = constant(support.normal, T_cloud_hand.device, torch.float64)
+    return (clearance_over(T_cloud_hand, normal, gripper) - support.offset).float()
+
+
+def clearance_over(T_cloud_hand: Tensor, normal: Tensor, gripper: Gripper) -> Tensor:
+    """Least way (E,) float64 of the corners of hands along a unit normal (3,) float64."""
     boxes = gripper.boxes(gripper.max_opening, gripper.foremost_z - gripper.tip_z)
     picks = np.indices((2, 2, 2)).reshape(3, 8).T  # (8, 3)
     corners = np.where(picks[None] == 0, boxes[:, None, 0], boxes[:, None, 1]).reshape(-1, 3)
-    device = T_cloud_hand.device
-    normal = constant(support.normal, device, torch.float64)
     pose = T_cloud_hand.double()
-    height = normal @ pose[:, :3, 3:] - support.offset  # (E, 1)
-    offsets = constant(corners.tolist(), device, torch.float64)  # (8B, 3)
+    height = normal @ pose[:, :3, 3:]  # (E, 1)
+    offsets = constant(corners.tolist(), pose.device, torch.float64)  # (8B, 3)
     corner_heights = (normal @ pose[:, :3, :3]) @ offsets.T
-    return (height.squeeze(1) + corner_heights.amin(dim=1)).float()
+    least: Tensor = height.squeeze(1) + corner_heights.amin(dim=1)
+    return least

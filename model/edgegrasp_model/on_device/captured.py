@@ -19,10 +19,11 @@ class _Graph(NamedTuple):
 
 
 class Captured:
-    """Calls a function; on a GPU it is captured once for each shape of its inputs, then replayed.
+    """Calls a function; on a GPU it is captured for each shape of its inputs, then replayed.
 
-    A replay is one launch, allocates nothing and compiles nothing. Elsewhere it is a plain call.
-    May be called from several threads, one after the other.
+    A replay is one launch, allocates nothing and compiles nothing. A shape is captured when it
+    comes for the second time: the first may have been the only one. Elsewhere than on a GPU it is
+    a plain call. May be called from several threads, one after the other.
 
     Args:
         function: Of tensors of one device; must not wait for the device, nor look at values.
@@ -30,7 +31,7 @@ class Captured:
 
     def __init__(self, function: Callable[..., Tensor]) -> None:
         self._function = function
-        self._graphs: OrderedDict[tuple[object, ...], _Graph] = OrderedDict()
+        self._graphs: OrderedDict[tuple[object, ...], _Graph | None] = OrderedDict()  # None: once
         self._pool: Any = None  # memory that all graphs share: one runs at a time
         self._turn = threading.Lock()
 
@@ -40,10 +41,13 @@ class Captured:
             return self._function(*inputs)
         shapes = tuple((given.shape, given.dtype, given.device) for given in inputs)
         with self._turn, torch.inference_mode():
-            captured = self._graphs.pop(shapes, None) or self._capture(inputs)
+            known = shapes in self._graphs
+            captured = self._graphs.pop(shapes, None) or (self._capture(inputs) if known else None)
             self._graphs[shapes] = captured
             if len(self._graphs) > KEPT:
                 self._graphs.popitem(last=False)
+            if captured is None:
+                return self._function(*inputs)
             for there, given in zip(captured.inputs, inputs, strict=True):
                 there.copy_(given)
             captured.graph.replay()

@@ -18,7 +18,7 @@ from edgegrasp_model.collision import (
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.on_device.candidates import support_clearance
 from edgegrasp_model.on_device.constants import constant
-from edgegrasp_model.on_device.hand_view import DeviceView, hands_together, positions, within
+from edgegrasp_model.on_device.hand_view import hands_together, positions, within
 from edgegrasp_model.on_device.scene import DeviceScene
 from edgegrasp_model.options import Collision
 from edgegrasp_model.support import SupportPlane
@@ -105,11 +105,17 @@ def nearest_things(scene: DeviceScene, T_cloud_hand: Tensor, gripper: Gripper) -
     return result
 
 
-def widths_needed(view: DeviceView, gripper: Gripper) -> Tensor:
-    """Opening (E,) that lets the fingers pass what lies between them, metres."""
-    x, y, z = view.position
+def widths_needed(there: Tensor, position: Tensor, gripper: Gripper) -> Tensor:
+    """Opening (E,) that lets the fingers pass what lies between them, metres.
+
+    Args:
+        there: (E, Q) which places hold a point.
+        position: (3, E, Q) of what hands see.
+        gripper: Fingers open to its maximum.
+    """
+    x, y, z = position
     aside = y.abs()
-    between = view.there & (x.abs() < gripper.pad_half_width) & (aside < gripper.max_opening / 2)
+    between = there & (x.abs() < gripper.pad_half_width) & (aside < gripper.max_opening / 2)
     between &= (z > gripper.palm_z) & (z < gripper.foremost_z)
     reach = (aside * between).amax(dim=1)
     width: Tensor = (2 * (reach + FINGER_CLEARANCE)).clamp(max=gripper.max_opening)

@@ -6,62 +6,77 @@ places of all hands, counts are one sum, and means one product of masks and valu
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from edgegrasp_model.collision import UP
 from edgegrasp_model.gripper import Boxes, Gripper
 from edgegrasp_model.hand_description import AXIS, FACING, HEIGHTS, SLAB, UNKNOWN_HEIGHT
 from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR
-from edgegrasp_model.on_device.candidates import DeviceCandidates, support_clearance
+from edgegrasp_model.on_device.candidates import clearance_over
 from edgegrasp_model.on_device.constants import constant
-from edgegrasp_model.on_device.hand_view import DeviceView, within
-from edgegrasp_model.on_device.hidden_space import hidden_shares
-from edgegrasp_model.on_device.scene import DeviceScene
+from edgegrasp_model.on_device.hand_view import within
 
 
-def describe_hands(
-    scene: DeviceScene,
-    candidates: DeviceCandidates,
-    gripper: Gripper,
-    view: DeviceView,
-    normal: Tensor,
-    side: Tensor,
-) -> Tensor:
-    """The hand-frame description of each candidate: (E, HAND_DESCRIPTION_SIZE).
+class SeenHands(NamedTuple):
+    """E hands and what they see, at most Q points each. Metres, canonical frame."""
+
+    T_cloud_hand: Tensor  # (E, 4, 4)
+    approach: Tensor  # (E, 3) unit, outward
+    depth: Tensor  # (E,)
+    approach_point: Tensor  # (E, 3) p_a
+    contact_point: Tensor  # (E, 3) p_c
+    there: Tensor  # (E, Q) which places hold a point
+    position: Tensor  # (3, E, Q) in the hand frame
+    normal: Tensor  # (E, Q, 3) in the canonical frame
+    at_side: Tensor  # (E, Q) where a side of the workspace cuts the cloud off
+    camera: Tensor  # (3,) the viewpoint
+    support: Tensor  # (4,) float64, the support plane's normal and offset
+
+
+class Known(NamedTuple):
+    """What is known of a scene; the rest of `SeenHands` holds any numbers in its place."""
+
+    camera: bool
+    support: bool
+
+
+def describe_hands(seen: SeenHands, known: Known, gripper: Gripper, side: Tensor) -> Tensor:
+    """The hand-frame description of each hand: (E, HAND_DESCRIPTION_SIZE).
 
     Args:
-        scene: The scene.
-        candidates: E candidates.
+        seen: The hands.
+        known: What is known of their scene.
         gripper: Fingers open to its maximum.
-        view: What their hands see.
-        normal: (3, E, Q) normals of the seen points in hand frames, mirrored.
         side: (E,) from `mirror_sides`.
     """
-    position = mirrored(view.position, side)
+    position = mirrored(seen.position, side)
     columns = [
-        *_hits(view.there, position, gripper),
-        *_between_fingers(view.there, position, normal, gripper),
-        _cut_off(scene, view, position, gripper),
-        *_directions(scene, candidates.T_cloud_hand, side),
-        *hidden_shares(scene, candidates.T_cloud_hand, gripper),
-        *_stance(scene, candidates, gripper),
+        *_hits(seen.there, position, gripper),
+        *_between_fingers(seen.there, position, hand_normals(seen, side), gripper),
+        _cut_off(seen, gripper),
+        *_directions(seen, known, side),
+        *_stance(seen, known, gripper),
     ]
     return torch.stack(columns, dim=1).float()
 
 
-def mirror_sides(scene: DeviceScene, T_cloud_hand: Tensor) -> Tensor:
+def hand_normals(seen: SeenHands, side: Tensor) -> Tensor:
+    """Normals of the seen points in hand frames, mirrored: (3, E, Q)."""
+    return mirrored((seen.normal @ seen.T_cloud_hand[:, :3, :3]).permute(2, 0, 1), side)
+
+
+def mirror_sides(seen: SeenHands, known: Known) -> Tensor:
     """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
 
     1 for all where the viewpoint is not known.
     """
-    if scene.viewpoint is None:
-        return torch.ones(len(T_cloud_hand), device=T_cloud_hand.device)
-    toward = _toward_camera(scene.viewpoint, T_cloud_hand)
-    along_x = (toward * T_cloud_hand[:, :3, 0]).sum(dim=1)
+    if not known.camera:
+        return torch.ones_like(seen.depth)
+    toward = seen.camera - seen.T_cloud_hand[:, :3, 3]
+    along_x = (toward * seen.T_cloud_hand[:, :3, 0]).sum(dim=1)
     return torch.where(along_x < 0.0, -1.0, 1.0)
 
 
@@ -69,10 +84,6 @@ def mirrored(vectors: Tensor, side: Tensor) -> Tensor:
     """Vectors (3, E, Q) with their x multiplied by `side` (E,)."""
     x, y, z = vectors
     return torch.stack((x * side.unsqueeze(1), y, z))
-
-
-def _toward_camera(viewpoint: NDArray[np.float32], T_cloud_hand: Tensor) -> Tensor:
-    return constant(viewpoint.tolist(), T_cloud_hand.device) - T_cloud_hand[:, :3, 3]
 
 
 def _log_counts(masks: Sequence[Tensor]) -> list[Tensor]:
@@ -153,50 +164,43 @@ def _highest(values: Tensor, mask: Tensor, default: float = 0.0) -> Tensor:
     return torch.where(highest.isinf(), default, highest)
 
 
-def _cut_off(scene: DeviceScene, view: DeviceView, position: Tensor, gripper: Gripper) -> Tensor:
+def _cut_off(seen: SeenHands, gripper: Gripper) -> Tensor:
     """Points between the fingers where a side of the workspace cuts things off."""
-    x, y, z = position
-    if scene.at_side is None:
-        return torch.zeros(len(x), device=x.device)
-    inside = view.there & (x.abs() < gripper.pad_half_width + NEAR)
+    x, y, z = seen.position
+    inside = seen.at_side & seen.there & (x.abs() < gripper.pad_half_width + NEAR)
     inside &= (y.abs() < gripper.max_opening / 2) & (z > gripper.palm_z)
     inside &= z < gripper.tip_z + NEAR
-    return _log_counts([inside & scene.at_side[view.row]])[0]
+    return _log_counts([inside])[0]
 
 
-def _directions(scene: DeviceScene, T_cloud_hand: Tensor, side: Tensor) -> list[Tensor]:
+def _directions(seen: SeenHands, known: Known, side: Tensor) -> list[Tensor]:
     """Where the camera and up are, in hand frames; a camera that is not known is nowhere."""
-    turn = T_cloud_hand[:, :3, :3].clone()
+    turn = seen.T_cloud_hand[:, :3, :3].clone()
     turn[:, :, 0] *= side.unsqueeze(1)
-    toward = torch.zeros_like(turn[:, :, 0])
-    if scene.viewpoint is not None:
-        toward = _toward_camera(scene.viewpoint, T_cloud_hand)
+    toward = torch.zeros_like(seen.approach)
+    if known.camera:
+        toward = seen.camera - seen.T_cloud_hand[:, :3, 3]
         toward = toward / toward.norm(dim=1, keepdim=True).clamp_min(1e-9)
     ups = constant(UP.tolist(), turn.device)
     return [*(toward.unsqueeze(1) @ turn).squeeze(1).T, *(ups @ turn).T]
 
 
-def _stance(scene: DeviceScene, candidates: DeviceCandidates, gripper: Gripper) -> list[Tensor]:
+def _stance(seen: SeenHands, known: Known, gripper: Gripper) -> list[Tensor]:
     """The edge itself, and how the hand stands to gravity and to the support plane."""
-    pose, points = candidates.T_cloud_hand, scene.cloud.points
+    pose, contact = seen.T_cloud_hand, seen.contact_point
     up = constant(UP.tolist(), pose.device)
-    contact = points[candidates.contact_index]
-    edge = contact - points[candidates.approach_index]
+    edge = contact - seen.approach_point
     columns = [
-        candidates.depth,
+        seen.depth,
         edge.norm(dim=1),
         (edge * pose[:, :3, 1]).sum(dim=1),
-        candidates.approach @ up,
+        seen.approach @ up,
         (pose[:, :3, 1] @ up).abs(),
     ]
-    support = scene.support
-    if support is None:
-        return columns + [torch.full_like(candidates.depth, UNKNOWN_HEIGHT)] * HEIGHTS
-    normal = constant(support.normal, pose.device, torch.float64)
+    if not known.support:
+        return columns + [torch.full_like(seen.depth, UNKNOWN_HEIGHT)] * HEIGHTS
+    normal, offset = seen.support[:3], seen.support[3]
     tips = pose[:, :3, 3] + gripper.tip_z * pose[:, :3, 2]
-    heights = [
-        tips.double() @ normal - support.offset,
-        contact.double() @ normal - support.offset,
-        support_clearance(pose, support, gripper),
-    ]
-    return columns + [h.clamp(-UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
+    heights = [tips.double() @ normal, contact.double() @ normal]
+    heights.append(clearance_over(pose, normal, gripper))
+    return columns + [(h - offset).clamp(-UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]

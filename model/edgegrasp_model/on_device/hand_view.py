@@ -8,13 +8,15 @@ from torch import Tensor
 from edgegrasp_model.hand_view import Reach
 from edgegrasp_model.on_device.cloud import DeviceCloud
 from edgegrasp_model.on_device.constants import constant
+from edgegrasp_model.on_device.padded_balls import bucket
 
 SEEN = 2**24  # points times hands looked at at a time
+PLACE_STEPS = 4  # sizes of Q from one power of two to the next
 
 
 @dataclass(frozen=True)
 class DeviceView:
-    """Cloud points in the hand frames of E hands, at most Q each, in the cloud's order."""
+    """Cloud points in the hand frames of E hands, Q places for each, in the cloud's order."""
 
     there: Tensor  # (E, Q) which places hold a point; False behind the last
     row: Tensor  # (E, Q) row of the cloud
@@ -36,13 +38,14 @@ def hand_view(cloud: DeviceCloud, T_cloud_hand: Tensor, reach: Reach) -> DeviceV
 
     Args:
         cloud: N points.
-        T_cloud_hand: So many hands that E times N fits the memory; see `hands_together`.
+        T_cloud_hand: At least one, and so many that E times N fits the memory; see
+            `hands_together`.
         reach: What is kept.
     """
     seen = positions(cloud.points, T_cloud_hand)
     inside = within(seen, constant(reach, seen.device))
     count = inside.sum(dim=1)
-    most = max(1, int(count.max())) if len(count) else 1
+    most = bucket(int(count.max()), PLACE_STEPS)
     place = torch.where(inside, inside.cumsum(dim=1) - 1, most)  # the last one is for the others
     rows = torch.arange(len(cloud.points), device=seen.device).expand_as(place)
     row = torch.zeros((len(seen[0]), most + 1), dtype=torch.int64, device=seen.device)

@@ -175,3 +175,20 @@ def test_given_grasps_score_alike(
     scores = [[e.grasp.score for e in found.evaluations if e.grasp] for found in (one, other)]
     assert len(scores[0]) > 2
     np.testing.assert_allclose(*scores, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_requests_that_share_a_pass_get_their_own_grasps(
+    box_on_table: Callable[..., NDArray[np.float32]], name: str
+) -> None:
+    """As the server does it: prepared one by one, scored in one batch, finished one by one."""
+    there, here = pair(name)
+    clouds = [box_on_table(seed=seed, count=400) for seed in (3, 4)]
+    prepared = [here.prepare(cloud, ask()) for cloud in clouds]
+    batches = [one.batch for one in prepared if one.batch is not None]
+    assert len(batches) == 2
+    logits = here.run(type(batches[0]).concatenate(batches))  # type: ignore[arg-type]
+    parts = np.split(logits, [len(batches[0].contact)])
+    for cloud, one, part in zip(clouds, prepared, parts, strict=True):
+        one.seconds["network"] = 0.0
+        assert_same(there.detect(cloud, ask()), here.finish(one, part))

@@ -19,11 +19,13 @@ from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.network import EdgeGraspNet, build_network
 from edgegrasp_model.network_config import EDGEGRASP, HAND, VN_EDGEGRASP
 from edgegrasp_model.obstacles import SolidBoxes
-from edgegrasp_model.on_device import candidates, cloud, collision, hand_description, hand_points
+from edgegrasp_model.on_device import candidates, cloud, collision
 from edgegrasp_model.on_device.candidates import DeviceCandidates
 from edgegrasp_model.on_device.cloud import DeviceCloud, DeviceVoxels
 from edgegrasp_model.on_device.constants import _constant
 from edgegrasp_model.on_device.edge_network import edge_grasp_logits
+from edgegrasp_model.on_device.hand_batch import _look, _seen
+from edgegrasp_model.on_device.hand_description import Known
 from edgegrasp_model.on_device.hand_view import DeviceView, positions
 from edgegrasp_model.on_device.padded_balls import PaddedBalls
 from edgegrasp_model.on_device.sampling import _spread
@@ -129,18 +131,15 @@ def test_collisions(fields: dict[str, Any]) -> None:
     assert collision.collides(scene(), there(E, 4, 4), hand, request).shape == (E,)
 
 
-def test_what_hands_see() -> None:
-    hand, view = load_gripper(), DeviceView(mask(E, Q), rows(E, Q), there(3, E, Q))
+@pytest.mark.parametrize("known", [Known(True, True), Known(False, False)])
+def test_what_hands_see(known: Known) -> None:
     assert positions(there(N, 3), there(E, 4, 4)).shape == (3, E, N)
-    assert collision.widths_needed(view, hand).shape == (E,)
-    side = hand_description.mirror_sides(scene(), there(E, 4, 4))
-    description = hand_description.describe_hands(
-        scene(), of_candidates(), hand, view, there(3, E, Q), side
-    )
-    assert description.shape == (E, HAND_DESCRIPTION_SIZE)
-    points, count = hand_points.points_around_fingers(view, there(3, E, Q), side, hand, 16)
-    assert points.shape == (E, 16, 6)
-    assert count.shape == (E,)
+    view = DeviceView(mask(E, Q), rows(E, Q), there(3, E, Q))
+    seen = _seen(scene(), of_candidates(), view)
+    assert {part.device.type for part in seen} == {"meta"}
+    told = _look(load_gripper(), known, 16)(*seen)
+    assert told.shape == (E, 2 + HAND_DESCRIPTION_SIZE + 6 * 16)
+    assert told.device.type == "meta"
 
 
 def test_that_a_tensor_of_the_processor_would_be_seen() -> None:
