@@ -22,6 +22,7 @@ from edgegrasp_model.on_device.hand_description import (
 )
 from edgegrasp_model.on_device.hand_points import points_around_fingers
 from edgegrasp_model.on_device.hand_view import DeviceView, hand_view, hands_together
+from edgegrasp_model.on_device.hidden_space import hidden_shares
 from edgegrasp_model.on_device.padded_balls import POINT_STEPS, bucket
 from edgegrasp_model.on_device.scene import DeviceScene
 
@@ -57,7 +58,7 @@ def hand_batch(
     known = Known(scene.viewpoint is not None, scene.support is not None)
     look = _look(gripper, known, num_points)
     parts = [
-        look(*_seen(scene, part, view))[:size]
+        look(*_seen(scene, part, view, gripper))[:size]
         for size, part, view in _views(scene, candidates, gripper)
     ]
     sizes = [1, 1, HAND_DESCRIPTION_SIZE, 6 * num_points]
@@ -103,7 +104,9 @@ def _views(
         yield size, part, hand_view(scene.cloud, part.T_cloud_hand, reach_of(gripper))
 
 
-def _seen(scene: DeviceScene, part: DeviceCandidates, view: DeviceView) -> SeenHands:
+def _seen(
+    scene: DeviceScene, part: DeviceCandidates, view: DeviceView, gripper: Gripper
+) -> SeenHands:
     points, row = scene.cloud.points, view.row
     nowhere = torch.zeros_like(view.there) if scene.at_side is None else scene.at_side[row]
     camera, plane = np.zeros(3, np.float32), np.zeros(4)
@@ -120,6 +123,7 @@ def _seen(scene: DeviceScene, part: DeviceCandidates, view: DeviceView) -> SeenH
         there=view.there,
         position=view.position,
         normal=scene.cloud.normals[row],
+        hidden=torch.stack(hidden_shares(scene, part.T_cloud_hand, gripper), dim=1),
         at_side=nowhere,
         camera=torch.from_numpy(camera).to(points.device),
         support=torch.from_numpy(plane).to(points.device),

@@ -31,6 +31,7 @@ class SeenHands(NamedTuple):
     there: Tensor  # (E, Q) which places hold a point
     position: Tensor  # (3, E, Q) in the hand frame
     normal: Tensor  # (E, Q, 3) in the canonical frame
+    hidden: Tensor  # (E, H) what `hidden_shares` says of the hands
     at_side: Tensor  # (E, Q) where a side of the workspace cuts the cloud off
     camera: Tensor  # (3,) the viewpoint
     support: Tensor  # (4,) float64, the support plane's normal and offset
@@ -58,6 +59,7 @@ def describe_hands(seen: SeenHands, known: Known, gripper: Gripper, side: Tensor
         *_between_fingers(seen.there, position, hand_normals(seen, side), gripper),
         _cut_off(seen, gripper),
         *_directions(seen, known, side),
+        *seen.hidden.unbind(dim=1),
         *_stance(seen, known, gripper),
     ]
     return torch.stack(columns, dim=1).float()

@@ -135,7 +135,7 @@ def test_collisions(fields: dict[str, Any]) -> None:
 def test_what_hands_see(known: Known) -> None:
     assert positions(there(N, 3), there(E, 4, 4)).shape == (3, E, N)
     view = DeviceView(mask(E, Q), rows(E, Q), there(3, E, Q))
-    seen = _seen(scene(), of_candidates(), view)
+    seen = _seen(scene(), of_candidates(), view, load_gripper())
     assert {part.device.type for part in seen} == {"meta"}
     told = _look(load_gripper(), known, 16)(*seen)
     assert told.shape == (E, 2 + HAND_DESCRIPTION_SIZE + 6 * 16)
