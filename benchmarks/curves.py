@@ -20,13 +20,14 @@ from benchmarks.timing import interleaved, machine
 
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.options import Collision
 from edgegrasp_sim.simulation import Observation
 
 RESULTS = Path(__file__).parent / "results"
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 APPROACH_POINTS = (8, 16, 32, 64, 128, 256)
 CANDIDATES = (500, 1_000, 2_000, 4_000, 8_000, 16_000)
-MANY_APPROACH_POINTS = 256  # so that there are so many candidates to choose from
+MANY_APPROACH_POINTS = 256  # so that there are enough candidates, those that collide among them
 BATCHES = (1, 2, 4, 8)
 THREADS = (1, 2)
 RUNS = 5
@@ -71,14 +72,18 @@ def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]
         finally:
             torch.set_num_threads(1)
 
-    def asked(**options: int) -> Callable[[], object]:
-        return partial(small.detect, cloud, request(observation, **options))
+    def around(approach_points: int) -> Callable[[], object]:
+        return partial(small.detect, cloud, request(observation, approach_points))
 
-    many = {"num_approach_points": MANY_APPROACH_POINTS}
+    def scoring(candidates: int) -> Callable[[], object]:
+        asked = request(observation, MANY_APPROACH_POINTS, candidates)
+        every = asked.model_copy(update={"collision": Collision(mode="ignore")})
+        return partial(small.detect, cloud, every)
+
     return {
         "points": {n: partial(small.detect, clouds[n], usual) for n in POINTS},
-        "approach points": {n: asked(num_approach_points=n) for n in APPROACH_POINTS},
-        "candidates": {n: asked(num_candidates=n, **many) for n in CANDIDATES},
+        "approach points": {n: around(n) for n in APPROACH_POINTS},
+        "candidates": {n: scoring(n) for n in CANDIDATES},
         "scenes in a batch": {n: partial(batched, n) for n in BATCHES},
         "threads": {n: partial(threaded, n) for n in THREADS},
     }

@@ -24,11 +24,14 @@ def table(results: dict[str, Any]) -> str:
     """The table and what it was measured on."""
     rows = ["| | ours | textbook | times faster |", "| --- | --- | --- | --- |"]
     for name, paper in results["paper"].items():
-        for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
-            measured = paper[part]
-            ours, textbook = measured["seconds"]["ours"], measured["seconds"]["textbook"]
-            faster = measured["times_faster"]
-            rows.append(f"| {name}, {words} | {ours:.2f} s | {textbook:.2f} s | {faster:.1f} |")
+        for variant, measured in paper["variants"].items():
+            network = f"{name} in int8" if variant == "int8" else name
+            for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
+                seconds, faster = measured[part]["seconds"], measured[part]["times_faster"]
+                rows.append(
+                    f"| {network}, {words} | {seconds[variant]:.2f} s "
+                    f"| {seconds['textbook']:.2f} s | {faster:.1f} |"
+                )
     rows += ["", "| | scene | one thread | two threads |", "| --- | --- | --- | --- |"]
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():
@@ -44,7 +47,7 @@ def table(results: dict[str, Any]) -> str:
             "",
             f"Processor seconds on one thread of an {machine['processor']} with "
             f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), on two "
-            f"threads seconds of the clock; medians of {paper['network']['rounds']} interleaved "
+            f"threads seconds of the clock; medians of {measured['network']['rounds']} interleaved "
             f"runs, 32 approach points, at most 2,000 candidates. The first table: a cloud of two "
             f"views, {results['cloud_points']:,} points; the second: one view of each kind of "
             f"scene. "

@@ -9,6 +9,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,10 @@ from benchmarks.textbook.pipeline import detect
 from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
 from benchmarks.timing import interleaved, machine, summary
 
+from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.int8_network import INT8, quantise
+from edgegrasp_model.network import EdgeGraspNet
 from edgegrasp_model.network_config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
@@ -77,13 +82,22 @@ def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str
     textbook, network = TEXTBOOK[config.architecture], ours.network
     batch = ours.prepare(observation.cloud, options).batch
     assert batch is not None
+    variants = {"ours": ours}
+    if isinstance(network, EdgeGraspNet):
+        assert isinstance(batch, BallBatch)
+        said = replace(ours.metadata, network=replace(config, architecture=INT8))
+        variants["int8"] = GraspDetector(quantise(network, [batch]), said, ours.gripper)
     with torch.inference_mode():
         alone = interleaved(
-            {"ours": lambda: network(batch), "textbook": lambda: textbook(network, batch)}
+            {name: partial(variant.network, batch) for name, variant in variants.items()}
+            | {"textbook": lambda: textbook(network, batch)}
         )
     whole = interleaved(
         {
-            "ours": lambda: ours.detect(observation.cloud, options),
+            name: partial(variant.detect, observation.cloud, options)
+            for name, variant in variants.items()
+        }
+        | {
             "textbook": lambda: detect(
                 observation.cloud, observation.table_height, lambda b: textbook(network, b)
             ),
@@ -92,8 +106,13 @@ def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str
     return {
         "ball_points": len(batch.points),
         "candidates": len(batch.contact),
-        "network": summary(alone, "ours", "textbook"),
-        "end_to_end": summary(whole, "ours", "textbook"),
+        "variants": {
+            name: {
+                "network": summary(alone, name, "textbook"),
+                "end_to_end": summary(whole, name, "textbook"),
+            }
+            for name in variants
+        },
     }
 
 

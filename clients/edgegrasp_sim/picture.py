@@ -78,7 +78,7 @@ def draw_grasps(
     figure = Figure(figsize=(17, 8.4), dpi=110)
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=16)
-    perspective: Any = figure.add_axes((0.01, 0.03, 0.52, 0.86), projection="3d")
+    perspective: Any = figure.add_axes((0.01, 0.07, 0.52, 0.82), projection="3d")
     above: Any = figure.add_axes((0.56, 0.10, 0.35, 0.76))
     _draw_perspective(perspective, points, camera, low, high)
     _draw_above(above, points, low, high)

@@ -68,6 +68,13 @@ class Candidates:
         )
 
 
+class Headings(NamedTuple):
+    """Which way, seen from above, a cloud's surface faces at each of its N points."""
+
+    direction: Float32  # (N, 3) unit, along the support plane
+    certain: NDArray[np.bool_]  # (N,) which can be trusted
+
+
 def edge_grasps(
     cloud: Cloud, approach_index: Int64, contact_index: Int64, gripper: Gripper
 ) -> Candidates:
@@ -153,6 +160,7 @@ def level_grasps(
     contact_index: Int64,
     support: SupportPlane,
     gripper: Gripper,
+    headings: Headings | None = None,
 ) -> Candidates:
     """Candidates straight down onto low contacts, the closing direction level.
 
@@ -167,6 +175,7 @@ def level_grasps(
         contact_index: (M,) rows of the cloud.
         support: The plane that contacts are low over.
         gripper: Gives the opening and contact_z.
+        headings: `closing_headings` of the same cloud, where the caller has them already.
 
     Returns:
         The pairs that allow such a grasp.
@@ -174,7 +183,7 @@ def level_grasps(
     up = np.asarray(support.normal, dtype=np.float32)
     contact = cloud.points[contact_index]
     edge = contact - cloud.points[approach_index]  # (M, 3)
-    heading, certain = closing_headings(cloud, support)
+    heading, certain = headings or closing_headings(cloud, support)
     y = heading[contact_index]
     along, sideways = np.einsum("md,md->m", edge, y), np.einsum("md,md->m", edge, np.cross(y, -up))
     pair = np.flatnonzero(
@@ -196,15 +205,12 @@ def level_grasps(
     return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
 
 
-def closing_headings(cloud: Cloud, support: SupportPlane) -> tuple[Float32, NDArray[np.bool_]]:
+def closing_headings(cloud: Cloud, support: SupportPlane) -> Headings:
     """Which way, seen from above, the cloud's surface faces at each point low over the support.
 
     Args:
         cloud: N points.
         support: The plane; of unit normal.
-
-    Returns:
-        (N, 3) unit directions along the plane, and which of them (N,) can be trusted.
     """
     up = np.asarray(support.normal, dtype=np.float32)
     low = cloud.points @ up - support.offset < LOW
@@ -221,7 +227,7 @@ def closing_headings(cloud: Cloud, support: SupportPlane) -> tuple[Float32, NDAr
         level[flat] = outward
         certain[flat] = np.linalg.norm(outward, axis=1) > MIN_OUTWARD
     length = np.linalg.norm(level, axis=1, keepdims=True)
-    return (level / np.maximum(length, 1e-9)).astype(np.float32), certain
+    return Headings((level / np.maximum(length, 1e-9)).astype(np.float32), certain)
 
 
 def drawn_back(

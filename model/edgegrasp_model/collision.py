@@ -75,9 +75,8 @@ def meets_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: 
 def _in_any(view: HandView, boxes: Float64) -> Bools:
     """Which hands see a point in one of some boxes (B, 2, 3), hand frame.  # (E,)."""
     hit = np.zeros(len(view.row), dtype=bool)
-    columns = np.ascontiguousarray(view.position.T)  # (3, P): a row at a time is many times faster
     for low, high in boxes:
-        hit |= within_box(columns, low, high)
+        hit |= within_box(view.columns, low, high)
     result = np.zeros(view.num_candidates, dtype=bool)
     result[view.candidate[hit]] = True
     return result
@@ -212,7 +211,7 @@ def widths_needed(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
         (E,) metres, at most the gripper's maximum.
     """
     half = gripper.pad_half_width
-    x, y, z = view.position.T
+    x, y, z = view.columns
     inner = gripper.max_opening / 2
     ahead = (z > gripper.palm_z) & (z < gripper.foremost_z)
     between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead

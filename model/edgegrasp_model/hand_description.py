@@ -104,7 +104,7 @@ def describe_hands(
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
-    x, y, z = np.ascontiguousarray(view.position.T)
+    x, y, z = view.columns
     seen = _Points(view.candidate, view.row, x * side[view.candidate], y, z, view.num_candidates)
     columns = [
         *_hits(seen, gripper),

@@ -35,7 +35,7 @@ def points_around_fingers(
         (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
         zeros behind the last; and their number (E,).
     """
-    x, y, z = view.position.T
+    x, y, z = view.columns
     near = (
         (np.abs(x) < gripper.pad_half_width + BESIDE)
         & (np.abs(y) < gripper.max_opening / 2 + OUTSIDE)

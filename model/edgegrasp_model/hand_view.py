@@ -1,6 +1,7 @@
 """The cloud as it is seen from some hands."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,11 @@ class HandView:
     num_candidates: int
     reach: Reach
 
+    @cached_property
+    def columns(self) -> Float32:
+        """The positions with x, y, z in rows (3, P): a row at a time is many times faster."""
+        return np.ascontiguousarray(self.position.T)
+
     def take(self, rows: NDArray[np.int64]) -> "HandView":
         """The views of the given hands, which must ascend."""
         renumbered = np.full(self.num_candidates, -1, dtype=np.int64)
@@ -67,7 +73,7 @@ class HandView:
         if reach == self.reach:
             return self
         low, high = np.asarray(reach, dtype=np.float32)
-        kept = within_box(np.ascontiguousarray(self.position.T), low, high)
+        kept = within_box(self.columns, low, high)
         return HandView(
             self.candidate[kept],
             self.row[kept],

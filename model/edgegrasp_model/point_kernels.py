@@ -88,8 +88,9 @@ def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
 
 
 @compiled("contract")
-def _position(columns: Float32, i: int, turn: Float32, shift: Float32) -> tuple[float, ...]:
-    px, py, pz = columns[0, i], columns[1, i], columns[2, i]
+def _position(
+    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
+) -> tuple[np.float32, np.float32, np.float32]:
     return (
         turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
         turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
@@ -98,21 +99,23 @@ def _position(columns: Float32, i: int, turn: Float32, shift: Float32) -> tuple[
 
 
 @compiled("contract")
+def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
+    inside: bool = (
+        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
 def _count_within(
     columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32, count: Int64
 ) -> None:
+    xs, ys, zs = columns[0], columns[1], columns[2]
     for e in range(len(turn)):
         found = 0
-        for i in range(columns.shape[1]):
-            x, y, z = _position(columns, i, turn[e], shift[e])
-            found += (
-                (x > low[0])
-                & (x < high[0])
-                & (y > low[1])
-                & (y < high[1])
-                & (z > low[2])
-                & (z < high[2])
-            )
+        for i in range(len(xs)):
+            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            found += _between(x, y, z, low, high)
         count[e] = found
 
 
@@ -127,18 +130,12 @@ def _fill_within(
     row: Int64,
     position: Float32,
 ) -> None:
+    xs, ys, zs = columns[0], columns[1], columns[2]
     for e in range(len(turn)):
         place = first[e]
-        for i in range(columns.shape[1]):
-            x, y, z = _position(columns, i, turn[e], shift[e])
-            if (
-                (x > low[0])
-                & (x < high[0])
-                & (y > low[1])
-                & (y < high[1])
-                & (z > low[2])
-                & (z < high[2])
-            ):
+        for i in range(len(xs)):
+            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            if _between(x, y, z, low, high):
                 row[place] = i
                 position[place, 0], position[place, 1], position[place, 2] = x, y, z
                 place += 1
@@ -147,25 +144,22 @@ def _fill_within(
 @compiled("contract")
 def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
     count = columns.shape[1]
-    at = np.empty((3, BLOCK), np.float32)
+    xh, yh, zh = (
+        np.empty(BLOCK, np.float32),
+        np.empty(BLOCK, np.float32),
+        np.empty(BLOCK, np.float32),
+    )
     for e in range(len(turn)):
         for start in range(0, count, BLOCK):
-            size = min(BLOCK, count - start)
-            for i in range(size):
-                x, y, z = _position(columns, start + i, turn[e], shift[e])
-                at[0, i], at[1, i], at[2, i] = x, y, z
+            block = columns[:, start : start + BLOCK]
+            xs, ys, zs = block[0], block[1], block[2]
+            for i in range(len(xs)):
+                xh[i], yh[i], zh[i] = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
             inside = 0
             for b in range(len(boxes)):
                 low, high = boxes[b, 0], boxes[b, 1]
-                for i in range(size):
-                    inside += (
-                        (at[0, i] > low[0])
-                        & (at[0, i] < high[0])
-                        & (at[1, i] > low[1])
-                        & (at[1, i] < high[1])
-                        & (at[2, i] > low[2])
-                        & (at[2, i] < high[2])
-                    )
+                for i in range(len(xs)):
+                    inside += _between(xh[i], yh[i], zh[i], low, high)
             if inside:
                 hit[e] = True
                 break
@@ -175,13 +169,14 @@ def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: 
 def _nearest_to_boxes(
     columns: Float32, turn: Float32, shift: Float32, extents: Float32, nearest: Float32
 ) -> None:
+    xs, ys, zs = columns[0], columns[1], columns[2]
     zero = np.float32(0.0)
     for e in range(len(turn)):
         for b in range(len(extents)):
             middle, half = extents[b, 0], extents[b, 1]
             apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
-            for i in range(columns.shape[1]):
-                x, y, z = _position(columns, i, turn[e], shift[e])
+            for i in range(len(xs)):
+                x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
                 x = abs(x - middle[0]) - half[0]
                 y = abs(y - middle[1]) - half[1]
                 z = abs(z - middle[2]) - half[2]
@@ -200,34 +195,35 @@ def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
     best = np.empty(k, np.float64)
     for group in range(len(bounds) - 1):
         start, stop = bounds[group], bounds[group + 1]
+        xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
         best[:] = np.inf
-        for i in range(start, stop):
-            px, py, pz = columns[0, i], columns[1, i], columns[2, i]
+        for i in range(len(xs)):
+            px, py, pz = xs[i], ys[i], zs[i]
             # The k nearest of the row before lie at most this far from here: a safe limit.
             step = 0.0
-            if i > start:
-                for axis in range(3):
-                    step += (np.float64(columns[axis, i]) - columns[axis, i - 1]) ** 2
+            if i > 0:
+                step = np.float64(px - xs[i - 1]) ** 2
+                step += np.float64(py - ys[i - 1]) ** 2 + np.float64(pz - zs[i - 1]) ** 2
             limit = np.float32((np.sqrt(best[k - 1]) + np.sqrt(step)) ** 2 * (1.0 + ROUNDING))
-            for j in range(start, stop):
-                x, y, z = columns[0, j] - px, columns[1, j] - py, columns[2, j] - pz
-                squared[j - start] = x * x + y * y + z * z
+            for j in range(len(xs)):
+                x, y, z = xs[j] - px, ys[j] - py, zs[j] - pz
+                squared[j] = x * x + y * y + z * z
             found = 0
-            for j in range(stop - start):
+            for j in range(len(xs)):
                 near[found] = j
                 found += squared[j] <= limit
-            mine = nearest[i]
-            mine[:] = i
+            mine = nearest[start + i]
+            mine[:] = start + i
             best[:] = np.inf
             for c in range(found):
-                j = start + near[c]
-                x = np.float64(columns[0, j]) - np.float64(px)
-                y = np.float64(columns[1, j]) - np.float64(py)
-                z = np.float64(columns[2, j]) - np.float64(pz)
+                j = near[c]
+                x = np.float64(xs[j]) - np.float64(px)
+                y = np.float64(ys[j]) - np.float64(py)
+                z = np.float64(zs[j]) - np.float64(pz)
                 here = x * x + y * y + z * z
                 if here < best[k - 1]:
                     place = k - 1
                     while place > 0 and best[place - 1] > here:
                         best[place], mine[place] = best[place - 1], mine[place - 1]
                         place -= 1
-                    best[place], mine[place] = here, j
+                    best[place], mine[place] = here, start + j

@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.ball_batch import BallCrop, crop_balls
-from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
+from edgegrasp_model.candidates import (
+    Candidates,
+    Headings,
+    closing_headings,
+    drawn_back,
+    edge_grasps,
+    level_grasps,
+)
 from edgegrasp_model.collision import UP, collides
 from edgegrasp_model.directions import allowed_ways
 from edgegrasp_model.gripper import Gripper
@@ -69,6 +76,7 @@ def sample_candidates(
     rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
     limit = OVERSAMPLING * options.num_candidates
+    headings = None if scene.support is None else closing_headings(scene.cloud, scene.support)
     rounds: list[Round] = []
     while True:
         chosen = sample_approach_points(
@@ -79,7 +87,7 @@ def sample_candidates(
         )
         approach_index = approach_rows[chosen]
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, approach_index, crop, options, gripper, counts)
+        this = _constrained(scene, headings, approach_index, crop, options, gripper, counts)
         rounds.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
         row = passed[random_rows(len(passed), limit, rng_candidates)]
@@ -114,6 +122,7 @@ def sample_candidates(
 
 def _constrained(
     scene: Scene,
+    headings: Headings | None,
     approach_index: Int64,
     crop: BallCrop,
     options: DetectOptions,
@@ -128,7 +137,7 @@ def _constrained(
     pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
     candidates = edge_grasps(scene.cloud, *pairs, gripper)
     if scene.support is not None:
-        level = level_grasps(scene.cloud, *pairs, scene.support, gripper)
+        level = level_grasps(scene.cloud, *pairs, scene.support, gripper, headings)
         candidates = Candidates.concatenate([candidates, level])
     candidates = replace(candidates, pair=pair[candidates.pair])
     add_count(counts, "candidates", len(candidates))
