@@ -113,7 +113,7 @@ EDGEGRASP_SMALL = NetworkConfig(
     classifier_widths=(256, 128),
 )
 
-# Scores each edge grasp in the frame of its own hand; 0.11 M parameters.
+# Scores each edge grasp in the frame of its own hand; 0.13 M parameters.
 HAND = NetworkConfig(
     architecture="hand",
     hand_widths=(32, 64, 128),
