@@ -5,7 +5,7 @@ import logging
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,7 +35,6 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 Answer = TypeVar("Answer", Detection, Scoring)
-Asked = TypeVar("Asked", bound="DetectRequest")
 
 
 @dataclass(frozen=True)
@@ -54,13 +53,13 @@ class ScoreRequest(DetectRequest):
 
 
 @dataclass(frozen=True)
-class Decoded(Generic[Asked]):
-    """A request whose cloud is decoded, with what answers it."""
+class Decoded:
+    """What is left of a request once its cloud is decoded, and what answers it."""
 
-    request: Asked
     detector: Detector
     cloud: CloudInput
     options: DetectOptions
+    given: GivenGrasps
 
 
 @dataclass(frozen=True)
@@ -193,7 +192,7 @@ class GraspService:
         """
         call = place.call
 
-        def stages(asked: Decoded[DetectRequest]) -> Future[Detection]:
+        def stages(asked: Decoded) -> Future[Detection]:
             detector = asked.detector
             prepared = self._pools.submit(
                 call, "prepare", detector.prepare, asked.cloud, asked.options
@@ -223,8 +222,8 @@ class GraspService:
                 _limit(name, 0 if given is None else len(given), self.settings.max_candidates)
             return request
 
-        def stages(asked: Decoded[ScoreRequest]) -> Future[Scoring]:
-            given = asked.request.given
+        def stages(asked: Decoded) -> Future[Scoring]:
+            given = asked.given
 
             def score() -> Scoring:
                 return asked.detector.score(
@@ -237,15 +236,15 @@ class GraspService:
 
     async def _answer(
         self,
-        read: Callable[[], Asked],
+        read: Callable[[], DetectRequest],
         place: Place,
-        stages: Callable[[Decoded[Asked]], Future[Answer]],
+        stages: Callable[[Decoded], Future[Answer]],
     ) -> Answer:
         """Decode a request and do what follows, in its turn and before its deadline."""
         call = place.call
         options: list[DetectOptions] = []  # known once they are read
 
-        def decode() -> Decoded[Asked]:
+        def decode() -> Decoded:
             request = read()
             options.append(parse_options(dict(request.options)))
             return self._decoded(request, options[0])
@@ -253,8 +252,10 @@ class GraspService:
         async def work() -> Answer:
             self.observer.stage(call, "admission", call.seconds)
             try:
-                decoded = self._pools.submit(call, "decode", decode)
-                return await asyncio.wrap_future(then(decoded, stages))
+                # Nothing here keeps what was read: as JSON it takes many times the cloud's room.
+                return await asyncio.wrap_future(
+                    then(self._pools.submit(call, "decode", decode), stages)
+                )
             except EdgeGraspError:
                 raise
             except Exception as error:
@@ -267,14 +268,15 @@ class GraspService:
         self.observer.answered(call, answer)
         return answer
 
-    def _decoded(self, request: Asked, options: DetectOptions) -> Decoded[Asked]:
+    def _decoded(self, request: DetectRequest, options: DetectOptions) -> Decoded:
         """A request within the bounds, with its cloud decoded."""
         _limit("options.num_approach_points", options.num_approach_points, self.settings.max_balls)
         _limit("options.num_candidates", options.num_candidates, self.settings.max_candidates)
         assert self._catalogue is not None  # or there would be no place
         detector = self._catalogue.get(options.model)
         cloud, options = decode_cloud(request.cloud, options, self.settings.max_points)
-        return Decoded(request, detector, cloud, options)
+        given = request.given if isinstance(request, ScoreRequest) else GivenGrasps()
+        return Decoded(detector, cloud, options, given)
 
     def models(self) -> list[ModelInfo]:
         """The weights a request can name.

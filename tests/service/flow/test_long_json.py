@@ -4,6 +4,7 @@ import asyncio
 import json
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 
 import httpx
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.results import Detection
 from edgegrasp_service import http_request, json_text
+from edgegrasp_service.call import Call
+from edgegrasp_service.core import DetectRequest
 from edgegrasp_service.json_text import LONG, read_json
 from edgegrasp_service.sent_arrays import BLOCK, numbers_from_lists
+from edgegrasp_service.sent_cloud import ListCloud, SentCloud
 
 ROWS = [[0.25, 0.5, 1.0]] * (2 * BLOCK + 7)
 
@@ -59,6 +64,27 @@ async def test_nothing_is_read_of_a_request_that_waits(serve, cloud, monkeypatch
         assert len(read) == 1
         running.stages.open("run")
         assert [response.status_code for response in await asyncio.gather(*asked)] == [200] * 3
+
+
+async def test_what_was_read_is_let_go_once_it_is_decoded(serve, cloud) -> None:
+    running = await serve()
+    running.stages.shut("run")
+    kept: list[weakref.ref[ListCloud]] = []
+
+    def read() -> DetectRequest:
+        source = ListCloud(cloud.tolist())
+        kept.append(weakref.ref(source))
+        return DetectRequest(SentCloud(source))
+
+    async def ask() -> Detection:
+        with running.service.admit(Call("http", "DetectGrasps")) as place:
+            return await running.service.detect(read, place)
+
+    asked = asyncio.create_task(ask())
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    assert [each() for each in kept] == [None]
+    running.stages.open("run")
+    assert (await asked).grasps
 
 
 @pytest.fixture
