@@ -19,6 +19,9 @@ from edgegrasp_model.layers import gather_rows, row_linear
 from edgegrasp_model.network import GlobalFeature, PointNetConv
 
 BYTE, WEIGHT_BYTE = 255, 127  # the largest of a value and of a weight
+# The byte of a large value. Not 255: larger ones have room, and where a processor without VNNI adds
+# two products up in 16 bits they fit.
+LARGE_BYTE = 127
 CONVOLVED = 256  # points at a time in a graph convolution
 ROWS = 512  # points at a time in the global MLPs: 1,024 channels of them stay in cache
 
@@ -50,14 +53,14 @@ class Int8Linear(nn.Module):
         Args:
             weight: (outputs, inputs).
             bias: (outputs,), or none.
-            largest: The largest input that is kept apart from larger ones.
+            largest: A large input; twice as large ones are cut off.
         """
         scale = weight.abs().amax(dim=1).clamp_min(1e-12) / WEIGHT_BYTE
         self.weight.copy_((weight / scale[:, None]).round())
         self.weight_scale.copy_(scale)
         if bias is not None:
             self.bias.copy_(bias)
-        self.input_scale.fill_(max(largest, 1e-12) / BYTE)
+        self.input_scale.fill_(max(largest, 1e-12) / LARGE_BYTE)
         self._packed = None
 
     def bytes_of(self, values: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from edgegrasp_model.network import EdgeGraspNet
 from edgegrasp_model.network_config import NetworkConfig
 
 INT8: Final = "edgegrasp-int8"
-KEPT_APART = 0.9999  # share of a product's inputs that are not cut off at the largest byte
+COVERED = 0.9999  # share of a product's inputs on a view that its range is made for
 SAMPLED = 1 << 20  # inputs of a product looked at in each batch
 
 
@@ -82,7 +82,7 @@ def _largest_inputs(network: EdgeGraspNet, batches: Sequence[BallBatch]) -> dict
 
     def look(name: str, values: Tensor) -> None:
         sample = values.flatten()[:: max(values.numel() // SAMPLED, 1)]
-        kept = max(round((1 - KEPT_APART) * len(sample)), 1)
+        kept = max(round((1 - COVERED) * len(sample)), 1)
         largest[name] = max(largest.get(name, 0.0), float(sample.topk(kept).values[-1]))
 
     def convolution(name: str) -> Any:

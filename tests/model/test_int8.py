@@ -47,11 +47,12 @@ def test_a_layer_is_that_of_its_bytes():
     weight = torch.randn(4, 8, generator=generator)
     bias = torch.randn(4, generator=generator)
     values = torch.rand(6, 8, generator=generator) * 3 - 1
-    layer.fill(weight, bias, largest=1.5)
+    layer.fill(weight, bias, largest=0.75)
     taken = layer.bytes_of(values)
     assert taken.dtype == torch.uint8
     dequantised = taken * layer.input_scale
-    torch.testing.assert_close(dequantised, values.clamp(0, 1.5), rtol=0, atol=1.5 / 255 / 1.99)
+    kept = values.clamp(0, 0.75 * 255 / 127)
+    torch.testing.assert_close(dequantised, kept, rtol=0, atol=0.75 / 127 / 1.99)
     own_weight = layer.weight * layer.weight_scale[:, None]
     torch.testing.assert_close(own_weight, weight, rtol=0, atol=float(weight.abs().max()) / 250)
     expected = dequantised @ own_weight.T + bias
