@@ -35,6 +35,7 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
 
     def __init__(self, edge: Edge) -> None:
         self._edge = edge
+        self._around: dict[str, tuple[Handler, Handler]] = {}  # by path: a handler, and its own
 
     async def intercept_service(
         self,
@@ -44,7 +45,7 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
         """The method's handler, named, counted and logged; or one that refuses."""
         path: str = handler_call_details.method
         entries = list(handler_call_details.invocation_metadata or ())
-        headers = {name: value for name, value in entries if isinstance(value, str)}
+        headers = _headers(entries)
         method = METHODS.get(path, "other")
         try:
             check_headers("metadata", len(entries))
@@ -53,25 +54,31 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
                 self._edge.tokens.check(headers.get(AUTHORIZATION), admin=admin)
         except ServiceError as error:
             # As a stream, it refuses before the request is read.
-            return self._around_writer(method, headers, refusal(error), "stream_stream", None)
+            return self._around_writer(method, refusal(error), "stream_stream", None)
         handler = await continuation(handler_call_details)
         if handler is None:
             self._edge.metrics.request("grpc", method, "UNIMPLEMENTED", None)
             return None
+        known, around = self._around.get(path, (None, None))
+        if known is not handler:
+            around = self._handler_around(method, handler)
+            self._around[path] = handler, around  # of paths that have one, so there are few
+        return around
+
+    def _handler_around(self, method: str, handler: Handler) -> Handler:
         kinds = ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
         kind = next(kind for kind in kinds if getattr(handler, kind) is not None)
         behavior = getattr(handler, kind)
         if inspect.isasyncgenfunction(behavior):
-            return self._around_generator(method, headers, behavior, kind, handler)
-        return self._around_writer(method, headers, behavior, kind, handler)
+            return self._around_generator(method, behavior, kind, handler)
+        return self._around_writer(method, behavior, kind, handler)
 
-    def _around_writer(
-        self, method: str, headers: dict[str, str], behavior: Any, kind: str, handler: Handler
-    ) -> Handler:
+    def _around_writer(self, method: str, behavior: Any, kind: str, handler: Handler) -> Handler:
         """A handler that returns its answer, or writes it to the context."""
 
         async def named(request: Any, context: Any) -> Any:
             answered = Answered("UNKNOWN", long=not kind.endswith("unary"))
+            headers = _headers(context.invocation_metadata())
             with self._edge.request("grpc", method, headers, answered) as request_id:
                 try:
                     await context.send_initial_metadata(((HEADER, request_id),))
@@ -86,13 +93,12 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
 
         return _handler(kind, named, handler)
 
-    def _around_generator(
-        self, method: str, headers: dict[str, str], behavior: Any, kind: str, handler: Handler
-    ) -> Handler:
+    def _around_generator(self, method: str, behavior: Any, kind: str, handler: Handler) -> Handler:
         """A handler that yields its answers."""
 
         async def named(request: Any, context: Any) -> AsyncIterator[Any]:
             answered = Answered("UNKNOWN", long=True)
+            headers = _headers(context.invocation_metadata())
             with self._edge.request("grpc", method, headers, answered) as request_id:
                 try:
                     await context.send_initial_metadata(((HEADER, request_id),))
@@ -117,6 +123,10 @@ def refusal(error: Exception) -> Callable[[Any, Any], Awaitable[None]]:
         await context.abort(problem.code, problem.detail, ((ERROR_METADATA, detail),))
 
     return refuse
+
+
+def _headers(metadata: Any) -> dict[str, str]:
+    return {name: value for name, value in metadata or () if isinstance(value, str)}
 
 
 def _checked(request: Any, kind: str) -> Any:
