@@ -295,7 +295,7 @@ def targets(results: dict[str, Any]) -> dict[str, Any]:
             of = ("overhead_p50_ms", "overhead_p50_of_idle_ms", "overhead_p50_quietest_blocks_ms",
                   "overhead_of_processors_ms", "load_average")  # fmt: skip
             key = f"{name}: overhead p50 with the {kind}, ms (<= {limit:g})"
-            found[key] = {figure: both[name][figure] for figure in of}
+            found[key] = {figure: both[name].get(figure) for figure in of}
     dummy = [(f"{row['transport']}, dummy", DEADLINE, row) for row in results.get("open", [])]
     real = [("grpc, network", NETWORK_DEADLINE, row) for row in results.get("network", [])]
     for kind, deadline, row in dummy + real:
