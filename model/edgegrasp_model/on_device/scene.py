@@ -149,7 +149,7 @@ def voxelise_in_frame(
     sent: CheckedCloud, turn: Tensor, shift: Tensor, voxel_size: float
 ) -> _VoxelCloud:
     """Upload a cloud and sort it into the voxels of the frame that `turn` and `shift` lead to."""
-    points = torch.from_numpy(sent.points).to(turn.device).double() @ turn.T + shift
+    points = _uploaded(sent.points, turn.device).double() @ turn.T + shift
     voxels = voxelise(points, voxel_size)
     return _VoxelCloud(voxels, voxels.mean(points))
 
@@ -184,4 +184,6 @@ def _normals(
 
 
 def _uploaded(values: ArrayLike, device: torch.device) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+    array = np.ascontiguousarray(values)
+    # A message's own bytes are read-only, which PyTorch warns of.
+    return torch.from_numpy(array if array.flags.writeable else array.copy()).to(device)
