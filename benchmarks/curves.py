@@ -132,7 +132,8 @@ def draw(curves: Mapping[str, Any], path: Path) -> None:
             plot.grid(visible=True, alpha=0.3)
         below.set(xlabel=name)
         if name != "points":
-            below.set_xticks(values, [f"{value:,}" for value in values], minor=False)
+            words = [f"{value // 1000}k" if value >= 1000 else f"{value}" for value in values]
+            below.set_xticks(values, words, minor=False)
             below.minorticks_off()
     axes[0, 0].set_ylabel("seconds")
     axes[1, 0].set_ylabel("peak memory, MB")
