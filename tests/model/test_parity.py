@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.ball_batch import BallBatch, crop_balls
 from edgegrasp_model.import_checkpoint import import_checkpoint
+from edgegrasp_model.on_device.scoring import ScoringNetwork
 
 SCENES = ["packed_00", "packed_03", "pile_04", "pile_07", "pile_09"]
 REFERENCE_RADIUS = 0.05
@@ -76,6 +77,18 @@ def test_edgegrasp_logits_are_the_same(shared_dir, random_network, scene):
     batch, _ = golden_batch(reference / "golden" / f"{scene}.npz")
     golden = np.load(reference / "edge_grasp_random" / "logits.npz")[scene]
     np.testing.assert_allclose(logits(random_network, batch), golden, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scene", ["pile_07"])
+def test_the_same_holds_of_the_networks_on_a_device(shared_dir, vn_network, random_network, scene):
+    reference = shared_dir / "reference"
+    batch, golden = golden_batch(reference / "golden" / f"{scene}.npz")
+    scores = ScoringNetwork(vn_network)(batch).numpy()
+    assert np.corrcoef(scores, golden)[0, 1] >= 0.995
+    assert scores.argmax() == golden.argmax()
+    assert np.median(np.abs(scores - golden)) < 1e-4
+    golden = np.load(reference / "edge_grasp_random" / "logits.npz")[scene]
+    np.testing.assert_allclose(ScoringNetwork(random_network)(batch).numpy(), golden, atol=1e-3)
 
 
 def test_vn_logits_keep_when_an_observed_cloud_turns(shared_dir, vn_network):
