@@ -82,7 +82,7 @@ def experiment_figure(results: dict[str, Any]) -> Figure:
             place.set(xlabel=group, ylabel=f"{label} (%)", ylim=(0, 102))
             place.grid(alpha=0.25)
             place.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].legend(fontsize=8, loc="lower left")
+    axes[0, 0].legend(fontsize=8, loc="best")
     return figure
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+from edgegrasp_sim.results import ADDED_SINCE
+
 if TYPE_CHECKING:
     from edgegrasp_sim.results import ResultFolder
 
@@ -13,7 +15,7 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
     """What is worth keeping of a finished benchmark: its conditions and figures, ready for JSON."""
     manifest = folder.manifest()
     summary = json.loads((folder.path / "summary.json").read_text())
-    run = manifest["run"]
+    run = ADDED_SINCE | manifest["run"]
     times = summary["planning_seconds"]
     return {
         "scene": run["scene"],
