@@ -75,7 +75,7 @@ def reference_successes(shared: Path, kind: SceneKind) -> Share:
         raise FileNotFoundError(f"{shared} has no bootstrap_dataset/{kind.value}_*.npz")
     views = []
     for file in files:
-        with np.load(file) as view:
+        with np.load(file, allow_pickle=False) as view:
             success, logit = view["success"], view["teacher_logit"].astype(np.float64)
         best = logit >= np.quantile(logit, 1 - BEST_SHARE)
         tried = success >= 0
@@ -142,7 +142,7 @@ def _own_clouds(
 
 def _golden_clouds(shared: Path) -> Iterable[tuple[NDArray[Any], NDArray[Any]]]:
     for file in sorted((shared / "reference" / "golden").glob("*.npz")):
-        with np.load(file) as scene:
+        with np.load(file, allow_pickle=False) as scene:
             yield scene["dense_cloud"], scene["camera_position"]
 
 
