@@ -151,8 +151,6 @@ def command_of(record: dict[str, Any]) -> str:
     for name in ("num_approach_points", "num_candidates", "collision"):
         if name in planner or name in options:
             words += ["--" + name.replace("_", "-"), str(planner.get(name, options.get(name)))]
-    if record.get("caution"):
-        words += ["--caution", str(record["caution"])]
     return shlex.join(words)
 
 
@@ -165,7 +163,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         seconds = record["planning_seconds_median"]
         lines.append(
             (
-                _title(record),
+                title_of(record["planner"]),
                 record["protocol"]["name"],
                 "-".join(filter(None, numbers)) or "the protocol's",
                 f"{record['rounds']} for each of {', '.join(map(str, record['seeds']))}",
@@ -178,11 +176,6 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         title = f"*{row['method']}* ({row['source']})"
         lines.append((title, "edgegrasp", row.get("samples", ""), "", *_rates(row), ""))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def _title(record: dict[str, Any]) -> str:
-    caution = record.get("caution")
-    return title_of(record["planner"]) + (f", caution {caution:g}" if caution else "")
 
 
 def _training(curves: Curves) -> Iterator[str]:

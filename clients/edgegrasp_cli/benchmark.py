@@ -58,10 +58,6 @@ def benchmark(
         int | None, Option(help="Candidates scored at most; else the protocol's.")
     ] = None,
     collision: Annotated[str, Option(help="avoid, penalise or ignore.")] = "penalise",
-    caution: Annotated[
-        float,
-        Option(help="Score below which another view is taken instead, if the protocol allows one."),
-    ] = 0.0,
     workers: Annotated[
         int | None, Option(help="Processes that simulate; else one for each core. Same results.")
     ] = None,
@@ -115,7 +111,6 @@ def benchmark(
             objects.resolve() if objects is not None else None,
             split,
             patience,
-            caution,
         )
         processes = _processes(
             workers, gui=gui, ray=ray, own_server=planner == "server" and server is None

@@ -49,7 +49,6 @@ class BenchmarkConfig:
         objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
         split: of that folder.
         patience: seconds to go on asking a planner that is unavailable.
-        caution: score below which another view is taken while the protocol allows one.
     """
 
     scene: SceneKind
@@ -59,13 +58,10 @@ class BenchmarkConfig:
     objects: Path | None = None
     split: str = "test"
     patience: float = PATIENCE
-    caution: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
             raise ValueError(f"rounds is {self.rounds}; run at least 1")
-        if not 0.0 <= self.caution <= 1.0:
-            raise ValueError(f"caution is {self.caution}; pass a score, 0 to 1")
         if not self.seeds or min(self.seeds) < 0:
             raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
         if len(set(self.seeds)) < len(self.seeds):
@@ -160,7 +156,6 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
                 "digest": objects_digest(objects),
             },
             "planner": planner,
-            "caution": config.caution,
             "constants": constants(),
         },
         "rounds": config.rounds,
@@ -258,7 +253,6 @@ class RoundRunner:
             seed=seed,
             index=index,
             patience=config.patience,
-            caution=config.caution,
         )
 
     def close(self) -> None:

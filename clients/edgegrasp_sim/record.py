@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from edgegrasp_sim.results import ADDED_SINCE
-
 if TYPE_CHECKING:
     from edgegrasp_sim.results import ResultFolder
 
@@ -15,13 +13,12 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
     """What is worth keeping of a finished benchmark: its conditions and figures, ready for JSON."""
     manifest = folder.manifest()
     summary = json.loads((folder.path / "summary.json").read_text())
-    run = ADDED_SINCE | manifest["run"]
+    run = manifest["run"]
     times = summary["planning_seconds"]
     return {
         "scene": run["scene"],
         "protocol": {name: run["protocol"][name] for name in ("name", "version")},
         "planner": run["planner"],
-        "caution": run["caution"],
         "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
         "rounds": manifest["rounds"],
         "seeds": manifest["seeds"],

@@ -26,8 +26,6 @@ CSV_COLUMNS = (
     *(name for name in Attempt.__dataclass_fields__ if name != "T_world_hand"),
     "T_world_hand",
 )
-# Entries of `run` that older manifests lack, with what was so before there was a choice.
-ADDED_SINCE: dict[str, Any] = {"caution": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +166,7 @@ class ResultFolder:
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
-            before = ADDED_SINCE | json.loads(known.read_text())["run"]
+            before = json.loads(known.read_text())["run"]
             changed = [key for key in manifest["run"] if before.get(key) != manifest["run"][key]]
             if changed:
                 raise ValueError(

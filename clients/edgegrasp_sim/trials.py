@@ -175,8 +175,6 @@ class RoundDriver:
         seed: not negative.
         index: number of the round, not negative.
         patience: seconds to go on asking a planner that is unavailable.
-        caution: score below which a grasp is not executed as long as the protocol allows another
-            view; such a view counts as one without a grasp.
 
     Raises:
         ValueError: unknown scene, or a negative seed or index.
@@ -191,12 +189,10 @@ class RoundDriver:
         seed: int,
         index: int,
         patience: float = PATIENCE,
-        caution: float = 0.0,
     ) -> None:
         if seed < 0 or index < 0:
             raise ValueError(f"seed is {seed} and index {index}; pass numbers of 0 or more")
-        self.simulation, self.protocol = simulation, protocol
-        self.patience, self.caution = patience, caution
+        self.simulation, self.protocol, self.patience = simulation, protocol, patience
         self._camera = random_stream(seed, index, Stream.CAMERA)
         self._noise = random_stream(seed, index, Stream.NOISE)
         self._policy = random_stream(seed, index, Stream.POLICY)
@@ -236,9 +232,7 @@ class RoundDriver:
         return self._seen
 
     def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
-        """Ask the planner, again and again if it is unavailable; None if another view is better.
-
-        That is where it finds no grasp, or none that suits the caution.
+        """Ask the planner, again and again if it is unavailable; None if it finds no grasp.
 
         Raises:
             PlannerUnavailableError: it stayed so for longer than `patience`.
@@ -262,9 +256,6 @@ class RoundDriver:
                 waited_seconds=self._round.waited_seconds + seconds,
             )
         self._planning_seconds = time.perf_counter() - started
-        views_left = self.protocol.round.max_no_grasp - self._round.no_grasp - 1
-        if grasp is not None and grasp.score < self.caution and views_left > 0:
-            grasp = None
         if grasp is None:
             self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
             self._update_end()
@@ -320,14 +311,11 @@ def run_round(
     seed: int,
     index: int,
     patience: float = PATIENCE,
-    caution: float = 0.0,
 ) -> Round:
     """Run one round with a planner; see `RoundDriver` for arguments and errors."""
     if isinstance(planner, TriesGrasps):
         planner.use_trial(simulation.try_in_copy)
-    driver = RoundDriver(
-        simulation, scene, protocol, seed=seed, index=index, patience=patience, caution=caution
-    )
+    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
     while driver.end is None:
         observation = driver.look()
         if driver.end is not None:

@@ -90,15 +90,6 @@ def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
     assert not list(folder.path.rglob("*.tmp"))
 
 
-def test_a_folder_from_before_caution_goes_on_without_it(tmp_path: Path) -> None:
-    folder = ResultFolder(tmp_path)
-    run = {"scene": "pile", "protocol": {"name": "edgegrasp", "version": 1}, "planner": {}}
-    folder.open({"run": run})
-    with pytest.raises(ValueError, match="different caution"):
-        folder.open({"run": run | {"caution": 0.5}})
-    folder.open({"run": run | {"caution": 0.0}})
-
-
 def test_wilson_intervals_are_the_known_ones() -> None:
     assert wilson(8, 10) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
     assert wilson(0, 10) == (0.0, pytest.approx(0.2775, abs=1e-4))

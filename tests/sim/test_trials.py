@@ -180,22 +180,6 @@ def test_a_planner_may_try_grasps_in_the_scene(simulation: ClutterSimulation) ->
     assert done.successes == len(done.attempts)
 
 
-def test_caution_takes_another_view_as_long_as_there_is_one(simulation: ClutterSimulation) -> None:
-    def unsure(seen: Observation, seed: int) -> PlannedGrasp | None:
-        grasp = plan_top_down(seen, seed)
-        return None if grasp is None else replace(grasp, score=0.5)
-
-    def run(caution: float) -> Round:
-        scene, rules = SceneKind.PACKED, protocol(3)
-        return run_round(simulation, unsure, scene, rules, seed=0, index=0, caution=caution)
-
-    bold, cautious = run(0.5), run(0.51)
-    assert bold.no_grasp == 0
-    assert bold.attempts[0].view == 0
-    assert cautious.no_grasp == protocol().round.max_no_grasp - 1
-    assert cautious.attempts[0].view == 2
-
-
 def test_a_round_can_be_driven_by_hand() -> None:
     cubes = ObjectSet("cubes", ObjectSet.builtin(SceneKind.PACKED).models[:1])
     with ClutterSimulation({SceneKind.PACKED: cubes}) as simulation:
