@@ -122,7 +122,9 @@ def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None
     assert "shelf" in refused("benchmark", "--scene", "shelf")
     assert "urdf" in refused("benchmark", "--scene", "pile", "--objects", tmp_path)
     assert "rounds is 0" in refused("benchmark", "--rounds", 0)
-    assert "edgegrasp, giga, robot, vgn" in refused("benchmark", "--protocol", "paper")
+    assert "edgegrasp, edgegrasp-fused, giga, robot, vgn" in refused(
+        "benchmark", "--protocol", "paper"
+    )
     assert "edge-sample" in refused("benchmark", "--planner", "guess")
     assert "cannot be loaded" in refused("benchmark", "--planner", "no_such:planner")
     assert "workers is 2" in refused("benchmark", "--gui", "--workers", 2)

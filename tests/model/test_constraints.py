@@ -357,20 +357,22 @@ def box_distance(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.nd
 def check_order(fields: dict, grasps: list[Grasp]) -> None:
     up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     free = [grasp.collision_free or fields["collision"]["mode"] == "ignore" for grasp in grasps]
-    assert free == sorted(free, reverse=True)
-    for _, group in itertools.groupby(zip(free, grasps, strict=True), key=lambda pair: pair[0]):
-        members = [grasp for _, grasp in group]
-        if fields["order"] == "clearance":
-            values = [grasp.clearance for grasp in members]
-        else:
-            sure = [
-                grasp for grasp in members if grasp.score >= 0.9 and fields["order"] == "highest"
+    if fields["order"] == "clearance":
+        assert free == sorted(free, reverse=True)
+        for half in (True, False):
+            wide = [
+                grasp.clearance
+                for grasp, is_free in zip(grasps, free, strict=True)
+                if is_free is half
             ]
-            assert members[: len(sure)] == sure
-            heights = [float(grasp.T_cloud_tcp[:3, 3] @ up) for grasp in sure]
-            assert all(a >= b - 1e-5 for a, b in itertools.pairwise(heights))
-            values = [grasp.score for grasp in members[len(sure) :]]
-        assert all(a >= b - 1e-6 for a, b in itertools.pairwise(values))
+            assert all(a >= b - 1e-6 for a, b in itertools.pairwise(wide))
+        return
+    worth = [g.score if is_free else g.score / 2 for g, is_free in zip(grasps, free, strict=True)]
+    sure = sum(value >= 0.9 for value in worth) if fields["order"] == "highest" else 0
+    heights = [float(grasp.T_cloud_tcp[:3, 3] @ up) for grasp in grasps[:sure]]
+    assert all(a >= b - 1e-5 for a, b in itertools.pairwise(heights))
+    assert all(value >= 0.9 for value in worth[:sure])
+    assert all(a >= b - 1e-6 for a, b in itertools.pairwise(worth[sure:]))
 
 
 def check_suppression(fields: dict, grasps: list[Grasp]) -> None:

@@ -20,7 +20,7 @@ def test_a_config_survives_json(config):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"architecture": "gpd"}, "architecture: got 'gpd'. Use one of: edgegrasp, vn-edgegrasp"),
+        ({"architecture": "gpd"}, "architecture: got 'gpd'. Use one of: edgegrasp, edgegrasp-int8"),
         ({"conv_widths": (32, 64)}, r"conv_widths: got \(32, 64\). Give 3 positive whole numbers"),
         ({"global_widths_2": (8, 0)}, r"global_widths_2: got \(8, 0\)"),
         ({"classifier_widths": ()}, r"classifier_widths: got \(\)"),

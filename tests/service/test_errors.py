@@ -28,7 +28,13 @@ from edgegrasp_service.settings import Settings
 SMALL = Settings(max_points=100, max_body_bytes=10_000)
 
 # Errors of starting up: no request ever meets them.
-START_UP = {"InvalidCheckpoint", "InvalidGripper", "InvalidSettings", "AddressInUse"}
+START_UP = {
+    "InvalidCheckpoint",
+    "InvalidDevice",
+    "InvalidGripper",
+    "InvalidSettings",
+    "AddressInUse",
+}
 
 
 class Failing:
