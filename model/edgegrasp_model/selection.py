@@ -1,11 +1,13 @@
 """Which scored candidates come back, and in which order."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.collision import UP, clearances
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.options import DetectOptions, Suppression
 from edgegrasp_model.preparation import CODE, Sample
 from edgegrasp_model.ranking import ranked, suppress
 from edgegrasp_model.results import Outcome
@@ -40,13 +42,39 @@ def select(
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
     order = ranked(score, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
+
+    def thinned(order: Int64, suppression: Suppression) -> tuple[Int64, Int64]:
+        return suppress(T_cloud_tcp, order, suppression, options.top_k)
+
+    return kept_of(order, score, options, thinned, counts)
+
+
+def kept_of(
+    order: Int64,
+    score: NDArray[np.floating],
+    options: DetectOptions,
+    thinned: Callable[[Int64, Suppression], tuple[Int64, Int64]],
+    counts: dict[str, int],
+) -> tuple[Int64, NDArray[np.int8]]:
+    """What is left of ordered candidates without low scores, near duplicates and all after top_k.
+
+    Args:
+        order: (E,) rows, best first.
+        score: (E,) probabilities.
+        options: min_score, suppression and top_k.
+        thinned: Tells rows in their order, of which near duplicates are dropped, and the dropped.
+        counts: Gets the number of candidates left after each step.
+
+    Returns:
+        As `select`.
+    """
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
     outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
     if options.suppression is not None:
-        order, dropped = suppress(T_cloud_tcp, order, options.suppression, options.top_k)
+        order, dropped = thinned(order, options.suppression)
     order = order[: options.top_k]
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)

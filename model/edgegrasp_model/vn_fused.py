@@ -9,16 +9,15 @@ choice of the furthest vector.
 Needs the extra `fast` (Numba); nothing imports this module where Numba is absent.
 """
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.compiled import compiled
 from edgegrasp_model.layers import MIN_ROWS, row_linear
 
 if TYPE_CHECKING:
@@ -29,16 +28,8 @@ Float32 = NDArray[np.float32]
 PIECE = 64  # points at a time, so that their neighbours' features fit the cache
 
 
-def _compiled(function: Callable[..., None]) -> Callable[..., None]:
-    """Compile a kernel when it is first called, and keep it on disk where that is possible."""
-    # Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
-    freedom = {"contract", "nsz", "arcp", "reassoc"}
-    try:
-        kept = numba.njit(fastmath=freedom, nogil=True, error_model="numpy", cache=True)
-        return cast(Callable[..., None], kept(function))
-    except RuntimeError:  # no folder to keep it in: neither beside this file nor the user's own
-        fresh = numba.njit(fastmath=freedom, nogil=True, error_model="numpy")
-        return cast(Callable[..., None], fresh(function))
+# Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
+_compiled = compiled("contract", "nsz", "arcp", "reassoc")
 
 
 def convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatch) -> Tensor:

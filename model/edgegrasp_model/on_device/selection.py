@@ -14,9 +14,8 @@ from edgegrasp_model.on_device.collision import nearest_things
 from edgegrasp_model.on_device.preparation import DeviceSample
 from edgegrasp_model.on_device.scene import DeviceScene
 from edgegrasp_model.options import DetectOptions, Suppression
-from edgegrasp_model.preparation import CODE
 from edgegrasp_model.ranking import ranked
-from edgegrasp_model.results import Outcome
+from edgegrasp_model.selection import kept_of
 
 Int64 = NDArray[np.int64]
 
@@ -48,17 +47,12 @@ def select(
     clearance = nearest_things(scene, there, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
     order = ranked(score, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
-    outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
-    good = score[order] >= options.min_score
-    outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
-    order, dropped = order[good], order[:0]
-    counts["above_min_score"] = len(order)
-    if options.suppression is not None:
+
+    def thinned(order: Int64, suppression: Suppression) -> tuple[Int64, Int64]:
         tcps = torch.from_numpy(T_cloud_tcp).to(there.device)
-        order, dropped = suppress(tcps, order, options.suppression, options.top_k)
-    order = order[: options.top_k]
-    outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
-    counts["suppressed"], counts["returned"] = len(dropped), len(order)
+        return suppress(tcps, order, suppression, options.top_k)
+
+    order, outcome = kept_of(order, score, options, thinned, counts)
     if clearance is None:
         chosen = torch.from_numpy(order).to(there.device)
         clearance = nearest_things(scene, there[chosen], gripper)
