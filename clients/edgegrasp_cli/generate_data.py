@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,7 +15,10 @@ def generate_data(
     objects: Annotated[
         Path | None, Option(help="Folder packed/train, pile/train; else the built-in objects.")
     ] = None,
-    scenes: Annotated[int, Option(min=1, help="Scenes, half packed, half piles.")] = 100,
+    scenes: Annotated[int, Option(min=1, help="Scenes.")] = 100,
+    scene: Annotated[
+        Literal["packed", "pile"] | None, Option(help="Of one kind; else half packed, half piles.")
+    ] = None,
     views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
     grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,
     seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 1,
@@ -30,12 +33,14 @@ def generate_data(
     """
     from rich.progress import track
 
+    from edgegrasp_sim.objects import SceneKind
     from edgegrasp_training.data_card import write_data_card
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
     from edgegrasp_training.views import find_views
 
+    kind = None if scene is None else SceneKind(scene)
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights
+        scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights, kind=kind
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0

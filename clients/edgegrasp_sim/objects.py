@@ -31,11 +31,13 @@ class ObjectModel:
         name: unique within its set.
         urdf: its description.
         scale: factor that brings it to the size of the hand, before a scene's own scale.
+        origin: the object that it is another shape of, if it is one.
     """
 
     name: str
     urdf: Path
     scale: float = 1.0
+    origin: ObjectModel | None = None
 
     @property
     def files(self) -> list[Path]:

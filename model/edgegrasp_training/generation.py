@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -21,14 +22,17 @@ from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_training.hollow_shapes import write_hollow_shapes
+from edgegrasp_training.varied_objects import varied_objects
 from edgegrasp_training.views import LabelledView
 
-SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM = 0, 1, 2, 3
+SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 VOXEL_SIZE = 0.0045  # metres
 SAMPLED_RADIUS = 0.04  # metres; balls that candidates are drawn from
 APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects: shapes of every sort
+VARIED_SHARE = 0.7  # of the scenes of an object folder, made of stretched and hollow objects
 WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
 BEST_SHARE = 0.1  # of the candidates, by score: what a network would have executed
 UNSURE = 0.1, 0.8  # scores that leave the outcome open
@@ -49,17 +53,17 @@ class GenerationOptions:
     noise_std: float = 0.001  # metres
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
+    kind: SceneKind | None = None  # of all scenes; None: packed where the index is even, else piles
+
+    def kind_of(self, index: int) -> SceneKind:
+        """How a scene is made."""
+        return self.kind or (SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE)
 
 
-def scene_name(index: int, seed: int) -> str:
-    """Name of a generated scene; even indices are packed, odd ones piles."""
-    kind = SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE
-    return f"{kind.value}_{seed}-{index:06d}"
-
-
-def view_path(folder: Path, index: int, view: int, seed: int) -> Path:
+def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -> Path:
     """File of a view."""
-    return folder / f"{scene_name(index, seed)}_{view}.npz"
+    kind = options.kind_of(index).value
+    return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
 
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
@@ -68,7 +72,7 @@ def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
         index
         for index in range(options.scenes)
         if not all(
-            view_path(folder, index, view, options.seed).is_file()
+            view_path(folder, index, view, options).is_file()
             for view in range(options.views_per_scene)
         )
     ]
@@ -108,34 +112,53 @@ def generate_scene(
     folder: Path, objects: Path | None, options: GenerationOptions, index: int
 ) -> tuple[int, int]:
     """Generate all views of one scene; how many grasps were tried and how many held."""
-    kind = SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE
-    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(4)]
+    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
+    kind = options.kind_of(index)
     source, scales = _variety(kind, streams[SCENE_STREAM])
-    sets = None if objects is None else {kind: ObjectSet.from_folder(objects, source, "train")}
     tried = held = 0
-    with ClutterSimulation(sets) as simulation:
-        count = 1 + int(streams[SCENE_STREAM].poisson(MEAN_FURTHER_OBJECTS))
-        simulation.reset(kind, streams[SCENE_STREAM], count, scales)
-        if options.weights is not None and streams[SCENE_STREAM].random() < CLEARED_SHARE:
-            _clear_easy(simulation, _detector(options.weights), options.noise_std, streams)
-        for view_number in range(options.views_per_scene):
-            observation = simulation.observe(
-                streams[CAMERA_STREAM],
-                streams[NOISE_STREAM],
-                views=TRAINING_VIEWS,
-                noise_std=options.noise_std,
-            )
-            view = _label(simulation, observation, options, streams[CHOICE_STREAM])
-            models = simulation.object_models
-            view = replace(
-                view,
-                objects=tuple(model.name for model in models),
-                object_digests=tuple(model.digest for model in models),
-            )
-            view.save(view_path(folder, index, view_number, options.seed))
-            tried += len(view.tried())
-            held += int((view.success == 1).sum())
+    with TemporaryDirectory() as shapes:
+        drawn = None
+        if objects is not None:
+            drawn = _drawn_objects(objects, source, Path(shapes), streams[SHAPE_STREAM])
+        with ClutterSimulation(None if drawn is None else {kind: drawn}) as simulation:
+            count = 1 + int(streams[SCENE_STREAM].poisson(MEAN_FURTHER_OBJECTS))
+            simulation.reset(kind, streams[SCENE_STREAM], count, scales)
+            for number, view in enumerate(_views(simulation, options, streams)):
+                view.save(view_path(folder, index, number, options))
+                tried += len(view.tried())
+                held += int((view.success == 1).sum())
     return tried, held
+
+
+def _drawn_objects(
+    objects: Path, source: SceneKind, folder: Path, rng: np.random.Generator
+) -> ObjectSet:
+    """The objects of a scene as they are, or varied ones, whose files the folder gets."""
+    plain = ObjectSet.from_folder(objects, source, "train")
+    if rng.random() >= VARIED_SHARE:
+        return plain
+    return varied_objects(plain, write_hollow_shapes(folder / "hollow"), folder, rng)
+
+
+def _views(
+    simulation: ClutterSimulation, options: GenerationOptions, streams: list[np.random.Generator]
+) -> Iterator[LabelledView]:
+    """Labelled views of the scene that stands in the simulation."""
+    if options.weights is not None and streams[SCENE_STREAM].random() < CLEARED_SHARE:
+        _clear_easy(simulation, _detector(options.weights), options.noise_std, streams)
+    models = [model.origin or model for model in simulation.object_models]
+    for _ in range(options.views_per_scene):
+        observation = simulation.observe(
+            streams[CAMERA_STREAM],
+            streams[NOISE_STREAM],
+            views=TRAINING_VIEWS,
+            noise_std=options.noise_std,
+        )
+        yield replace(
+            _label(simulation, observation, options, streams[CHOICE_STREAM]),
+            objects=tuple(model.name for model in models),
+            object_digests=tuple(model.digest for model in models),
+        )
 
 
 def _clear_easy(
