@@ -47,20 +47,20 @@ def _cup(bottom: float, top: float, height: float, wall: float) -> Profile:
 
 # Metres; a scene's own scale, and a stretch along each axis, come on top.
 SHAPES: dict[str, Profile] = {
-    "torus-slim": _torus(0.030, 0.006),
-    "torus": _torus(0.026, 0.010),
-    "torus-thick": _torus(0.024, 0.014),
-    "torus-large": _torus(0.034, 0.011),
-    "ring-flat": _tube(0.035, 0.020, 0.010),
-    "ring": _tube(0.033, 0.022, 0.020),
-    "ring-narrow": _tube(0.024, 0.010, 0.016),
-    "tube": _tube(0.020, 0.015, 0.060),
-    "tube-wide": _tube(0.030, 0.025, 0.045),
-    "bowl": _bowl(0.038, 0.030, 0.004),
-    "bowl-flat": _bowl(0.042, 0.018, 0.004),
-    "bowl-deep": _bowl(0.030, 0.038, 0.005),
-    "cup": _cup(0.020, 0.028, 0.060, 0.003),
-    "cup-low": _cup(0.028, 0.034, 0.035, 0.004),
+    "made-torus-slim": _torus(0.030, 0.006),
+    "made-torus": _torus(0.026, 0.010),
+    "made-torus-thick": _torus(0.024, 0.014),
+    "made-torus-large": _torus(0.034, 0.011),
+    "made-ring-flat": _tube(0.035, 0.020, 0.010),
+    "made-ring": _tube(0.033, 0.022, 0.020),
+    "made-ring-narrow": _tube(0.024, 0.010, 0.016),
+    "made-tube": _tube(0.020, 0.015, 0.060),
+    "made-tube-wide": _tube(0.030, 0.025, 0.045),
+    "made-bowl": _bowl(0.038, 0.030, 0.004),
+    "made-bowl-flat": _bowl(0.042, 0.018, 0.004),
+    "made-bowl-deep": _bowl(0.030, 0.038, 0.005),
+    "made-cup": _cup(0.020, 0.028, 0.060, 0.003),
+    "made-cup-low": _cup(0.028, 0.034, 0.035, 0.004),
 }
 
 

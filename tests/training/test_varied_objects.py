@@ -46,15 +46,15 @@ def test_a_torus_has_the_volume_of_a_torus() -> None:
     radius, tube = 0.030, 0.006
     volume = 2 * np.pi**2 * radius * tube**2
     # Twelve corners and 24 segments cut off some of it.
-    assert _volume(revolved(SHAPES["torus-slim"])) == pytest.approx(volume, rel=0.06)
+    assert _volume(revolved(SHAPES["made-torus-slim"])) == pytest.approx(volume, rel=0.06)
 
 
 def test_a_stretched_object_is_longer_by_each_factor(
     shapes: tuple[ObjectModel, ...], tmp_path: Path
 ) -> None:
-    bowl = next(model for model in shapes if model.name == "bowl")
+    bowl = next(model for model in shapes if model.name == "made-bowl")
     longer = stretched(bowl, (1.3, 0.8, 2.0), tmp_path / "stretched")
-    assert longer.name == "bowl"
+    assert longer.name == "made-bowl"
     assert longer.origin is bowl
     margin = 0.004  # the engine's own, around every shape
     np.testing.assert_allclose(
