@@ -14,13 +14,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from edgegrasp_model.network import build_network
 from edgegrasp_sim.experiment_report import experiment_table, percent, title_of
 from edgegrasp_sim.published import published
 from edgegrasp_sim.record import record_of
 from edgegrasp_sim.results import ResultFolder
+from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
 
@@ -76,6 +79,8 @@ BENCHMARK = (
     "edgegrasp benchmark --scene packed --rounds 100 --seed 0 --seed 1 --objects OBJECTS "
     "--num-approach-points 32 --num-candidates 2000 --output DIR"
 )
+# Counted in the authors' checkpoint files.
+AUTHORS_PARAMETERS = {"edgegrasp": 3_048_993, "vn-edgegrasp": 1_702_268}
 NOT_YET = "Not measured yet."
 
 
@@ -133,6 +138,8 @@ def _sections(kept: Path) -> Iterator[str]:
         yield f"{rounds} rounds for each of the seeds {', '.join(map(str, seeds))}.\n"
         yield experiment_table(found)
         yield f"![{heading}](results/{name}.png)\n"
+    yield "## Parameters\n"
+    yield _parameters_table()
     yield "## Training\n"
     yield from _training(_read(kept / "curves.json"))
 
@@ -176,6 +183,17 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         title = f"*{row['method']}* ({row['source']})"
         lines.append((title, "edgegrasp", row.get("samples", ""), "", *_rates(row), ""))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _parameters_table() -> str:
+    """How many numbers each network learns, beside the checkpoints of the paper's authors."""
+    lines = ["| weights | parameters | in the authors' checkpoint |", "| --- | --- | --- |"]
+    for name, config in RECIPES.items():
+        network = build_network(config, torch.Generator().manual_seed(0))
+        count = sum(parameter.numel() for parameter in network.parameters())
+        theirs = AUTHORS_PARAMETERS.get(name)
+        lines.append(f"| {name} | {count:,} | {'' if theirs is None else f'{theirs:,}'} |")
+    return "\n".join(lines) + "\n"
 
 
 def _training(curves: Curves) -> Iterator[str]:
