@@ -22,7 +22,7 @@ from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene import at_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT
-from edgegrasp_training.views import LabelledView
+from edgegrasp_training.views import UNTRIED, LabelledView
 
 Rotations = Literal["any", "upright", "none"]
 
@@ -30,6 +30,8 @@ UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))  # and what they are cut to
 SPARE_POINTS = 2  # times the network's points of a hand are kept, to pick from in each step
 TRIED_WEIGHT = 4.0  # of a simulated label in the loss, beside a teacher's score of weight 1
+SHAKEN_SHARE = 0.2  # of a held grasp's label that it only gets if it stays when shaken
+FIRM_SHARE = 0.78  # of the held grasps that stay, where nobody shook
 SUPPORT = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)  # the table of the simulated scenes
 
 
@@ -49,7 +51,7 @@ class TriedGrasps:
     cloud: Cloud
     candidates: Candidates  # E of them
     seen: SeenByHands | None  # for the hand network
-    label: NDArray[np.float32]  # (E,) 0 or 1
+    label: NDArray[np.float32]  # (E,) 0; held: 1, a little less where it did not stay when shaken
     turn: NDArray[np.float32]  # (3, 3) the cloud's axes to those of the frame detectors work in
 
     def without_support(self) -> "TriedGrasps":
@@ -98,7 +100,7 @@ class Packed(NamedTuple):
     """What a network is given in one step, and what it should say."""
 
     batch: BallBatch | HandBatch
-    label: Tensor  # (E,) float32, chance of success
+    label: Tensor  # (E,) float32, what to say: above 1/2 where it held, or a teacher believes so
     weight: Tensor  # (E,) float32, in the loss
 
 
@@ -116,7 +118,7 @@ def tried_grasps(
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
     candidates = _candidates(view, cloud, rows, gripper)
-    label = view.success[rows[candidates.pair]].astype(np.float32)
+    label = _labels(view)[rows[candidates.pair]]
     seen = None
     if config.architecture == "hand":
         batch = HandBatch.from_cloud(
@@ -134,6 +136,19 @@ def tried_grasps(
             description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
         )
     return TriedGrasps(cloud, candidates, seen, label, _turn_of(view))
+
+
+def _labels(view: LabelledView) -> NDArray[np.float32]:
+    """What to say of each grasp: whether it holds, and of those that do, firm ones a little more.
+
+    Most of the best candidates hold; the one that also stays when shaken is the one to execute.
+    """
+    held = view.success == 1
+    firm = np.full(len(held), FIRM_SHARE)
+    if view.firm is not None:
+        firm = np.where(view.firm == UNTRIED, FIRM_SHARE, view.firm == 1)
+    label: NDArray[np.float32] = (held * (1.0 - SHAKEN_SHARE * (1.0 - firm))).astype(np.float32)
+    return label
 
 
 def _turn_of(view: LabelledView) -> NDArray[np.float32]:

@@ -137,7 +137,7 @@ class Trainer:
         self._save_state()
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
-        """Score the validation views; of each at most so many balls, or all of them."""
+        """Score the validation views against what held; of each so many balls, or all of them."""
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
@@ -150,7 +150,7 @@ class Trainer:
                     balls = np.sort(rng.choice(balls, balls_per_view, replace=False))
                 packed = self._pack(grasps, balls)
                 logits.append(self.average(packed.batch.to(self.device)).float().cpu())
-                labels.append(packed.label)
+                labels.append((packed.label > 0.5).float())
         logit, label_array = torch.cat(logits).numpy(), torch.cat(labels).numpy()
         return evaluate_scores(logit, label_array)
 

@@ -219,3 +219,14 @@ def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
         assert recipe(name).name == name
     with pytest.raises(ValueError, match="edgegrasp-plus"):
         recipe("edgegrasp-huge")
+
+
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view: MakeView) -> None:
+    view = made_up_view(1)
+    firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
+    shaken = tried_grasps(replace(view, firm=firm.astype(np.int8)), TINY, load_gripper()).label
+    unknown = tried_grasps(view, TINY, load_gripper()).label
+    assert set(shaken.tolist()) == {0.0, 1.0, np.float32(0.8)}
+    assert len(set(unknown.tolist())) == 2
+    np.testing.assert_array_equal(unknown > 0.5, shaken > 0.5)
+    assert 0.8 < unknown.max() < 1
