@@ -14,6 +14,8 @@ from typing import Any, Self
 
 from benchmarks.senders import cloud
 
+from edgegrasp_service.allocator import keep_freed_memory
+
 POINTS = 20_000
 OPTIONS = {"num_approach_points": 32, "num_candidates": 500}
 
@@ -90,6 +92,7 @@ def _detector(kind: str) -> Any:
 
 
 if __name__ == "__main__":
+    keep_freed_memory()  # as the server does
     measured = InProcess(sys.argv[1])
     print("ready", flush=True)
     for _ in sys.stdin:

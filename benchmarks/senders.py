@@ -53,14 +53,14 @@ class GrpcSender:
     def __init__(self, address: str, points: NDArray[np.float32], options: dict[str, int]) -> None:
         self._channel = grpc.insecure_channel(address, CHANNEL_OPTIONS)
         self._detect = grasp_pb2_grpc.GraspServiceStub(self._channel).DetectGrasps
-        self._points = points.astype("<f4").tobytes()
-        self._options = grasp_pb2.DetectOptions(**options)
+        self._request = grasp_pb2.DetectGraspsRequest(
+            points=points.astype("<f4").tobytes(), options=grasp_pb2.DetectOptions(**options)
+        )
 
     def send(self, timeout: float | None) -> Told:
         """Send the cloud."""
-        request = grasp_pb2.DetectGraspsRequest(points=self._points, options=self._options)
         try:
-            answer = self._detect(request, timeout=timeout)
+            answer = self._detect(self._request, timeout=timeout)
         except grpc.RpcError as error:
             return Told(error.code().name)
         return Told("OK", answer.counts.get("crc32", 0))

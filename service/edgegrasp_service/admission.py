@@ -4,7 +4,9 @@ import asyncio
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -132,17 +134,20 @@ class Place:
         self.call = call
         self._admission = admission
         self._had_turn = False
-        self._work: asyncio.Task[Any] | None = None
+        self._work: Future[Any] | None = None
 
-    async def begin(self, work: Callable[[], Coroutine[Any, Any, Result]]) -> Result:
-        """Wait for the turn, then do the work.
+    async def begin(self, work: Callable[[], Future[Result]]) -> Result:
+        """Wait for the turn, then for the work that is begun.
 
         Where this is cancelled, the work goes on to the end of its stage, and keeps the place.
+
+        Args:
+            work: Begins it; what it gives back runs, so that nobody can cancel it.
         """
         await self._admission.turn()
         self._had_turn = True
-        task = self._work = asyncio.create_task(work())
-        return await asyncio.shield(task)
+        self._work = work()
+        return await asyncio.wrap_future(self._work)
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -158,12 +163,9 @@ class Place:
         if self._work is None or self._work.done():
             self._admission.leave(self._had_turn)
         else:
-            self._work.add_done_callback(self._work_ended)
-
-    def _work_ended(self, task: asyncio.Task[Any]) -> None:
-        if not task.cancelled():
-            task.exception()  # nobody waits for it
-        self._admission.leave(self._had_turn)
+            loop = asyncio.get_running_loop()
+            leave = partial(self._admission.leave, self._had_turn)
+            self._work.add_done_callback(lambda work: loop.call_soon_threadsafe(leave))
 
 
 def _whole_seconds(wait: float) -> int:

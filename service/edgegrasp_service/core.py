@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -249,22 +250,22 @@ class GraspService:
             options.append(parse_options(dict(request.options)))
             return self._decoded(request, options[0])
 
-        async def work() -> Answer:
+        def work() -> Future[Answer]:
             self.observer.stage(call, "admission", call.seconds)
-            try:
-                # Nothing here keeps what was read: as JSON it takes many times the cloud's room.
-                return await asyncio.wrap_future(
-                    then(self._pools.submit(call, "decode", decode), stages)
-                )
-            except EdgeGraspError:
-                raise
-            except Exception as error:
-                logger.exception("%s failed on %s", call.request_id, _describe(options))
-                if out_of_memory(error):
-                    raise WorkerLost(LOST) from None
-                raise DetectorFailed("The detector failed; the server's log says why.") from None
+            # Nothing here keeps what was read: as JSON it takes many times the cloud's room.
+            last = then(self._pools.submit(call, "decode", decode), stages)
+            named = copy_context()  # with the request's id
+            last.add_done_callback(lambda ended: named.run(_log_fault, ended, call, options))
+            return last
 
-        answer = await in_time(call, place.begin(work))
+        try:
+            answer = await in_time(call, place.begin(work))
+        except EdgeGraspError:
+            raise
+        except Exception as error:
+            if out_of_memory(error):
+                raise WorkerLost(LOST) from None
+            raise DetectorFailed("The detector failed; the server's log says why.") from None
         self.observer.answered(call, answer)
         return answer
 
@@ -318,6 +319,13 @@ async def in_time(call: Call, work: Coroutine[Any, Any, Result]) -> Result:
     except asyncio.CancelledError:
         call.cancel()
         raise
+
+
+def _log_fault(ended: Future[Any], call: Call, options: list[DetectOptions]) -> None:
+    """Log what is no error of the caller's, also where nobody waits for the answer any more."""
+    error = ended.exception()
+    if error is not None and not isinstance(error, EdgeGraspError):
+        logger.error("%s failed on %s", call.request_id, _describe(options), exc_info=error)
 
 
 def _limit(field: str, asked: int, most: int) -> None:

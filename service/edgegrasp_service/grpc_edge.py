@@ -3,17 +3,17 @@
 import asyncio
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import grpc
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.edge import Answered, Edge, check_headers
-from edgegrasp_service.errors import ServiceError, report
+from edgegrasp_service.errors import ErrorReport, ServiceError, report
 from edgegrasp_service.grpc_decoding import Decoded, Undecodable, tolerant
 from edgegrasp_service.grpc_messages import ERROR_METADATA, error_message
-from edgegrasp_service.request_id import HEADER
+from edgegrasp_service.request_id import HEADER, REQUEST_ID
 from edgegrasp_service.tokens import HEADER as AUTHORIZATION
 
 HEALTH = "grpc.health.v1.Health"
@@ -81,7 +81,10 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
             headers = _headers(context.invocation_metadata())
             with self._edge.request("grpc", method, headers, answered) as request_id:
                 try:
-                    await context.send_initial_metadata(((HEADER, request_id),))
+                    # Of a single answer, with it: by itself it takes a quarter of a millisecond.
+                    context.set_trailing_metadata(((HEADER, request_id),))
+                    if answered.long:
+                        await context.send_initial_metadata(((HEADER, request_id),))
                     if isinstance(request, Undecodable):
                         await refusal(request.error)(request, context)
                     answer = await behavior(_checked(request, kind), context)
@@ -118,11 +121,17 @@ def refusal(error: Exception) -> Callable[[Any, Any], Awaitable[None]]:
     """A behaviour that aborts with an error."""
 
     async def refuse(request: Any, context: Any) -> None:
-        problem = report(error)
-        detail = error_message(problem).SerializeToString()
-        await context.abort(problem.code, problem.detail, ((ERROR_METADATA, detail),))
+        await abort(context, report(error))
 
     return refuse
+
+
+async def abort(context: Any, problem: ErrorReport) -> NoReturn:
+    """End a call with an error, and the request's id beside it."""
+    detail = error_message(problem).SerializeToString()
+    trailing = ((ERROR_METADATA, detail), (HEADER, REQUEST_ID.get()))
+    await context.abort(problem.code, problem.detail, trailing)
+    raise AssertionError("abort raises")
 
 
 def _headers(metadata: Any) -> dict[str, str]:

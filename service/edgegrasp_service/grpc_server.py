@@ -16,11 +16,9 @@ from edgegrasp_service.call import Call
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.errors import AddressInUse, report
 from edgegrasp_service.grpc_door import GrpcDoor
-from edgegrasp_service.grpc_edge import GrpcEdge
+from edgegrasp_service.grpc_edge import GrpcEdge, abort
 from edgegrasp_service.grpc_messages import (
-    ERROR_METADATA,
     detection_message,
-    error_message,
     models_message,
     reloaded_message,
     score_request_from_message,
@@ -185,6 +183,4 @@ async def _abort(context: Any, error: Exception) -> NoReturn:
     problem = report(error)
     if problem.status >= 500:
         logger.warning("gRPC: %s", problem.detail)
-    detail = error_message(problem).SerializeToString()
-    await context.abort(problem.code, problem.detail, ((ERROR_METADATA, detail),))
-    raise AssertionError("abort raises")
+    await abort(context, problem)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 import uvicorn
 
 from edgegrasp_service import grpc_edge, http_edge
+from edgegrasp_service.allocator import keep_freed_memory
 from edgegrasp_service.backend import load_backend
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.edge import Edge
@@ -187,6 +188,7 @@ def run(settings: Settings) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
+    keep_freed_memory()
     with contextlib.ExitStack() as ends:
         log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
         observers: list[Observer] = []

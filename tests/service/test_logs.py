@@ -41,7 +41,7 @@ async def told(server: Any, transport: str, request_id: str, cloud: np.ndarray) 
             grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()), metadata=metadata
         )
         await call
-        return dict(await call.initial_metadata())["x-request-id"]
+        return dict(await call.trailing_metadata())["x-request-id"]
 
 
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
@@ -71,7 +71,15 @@ async def test_errors_carry_the_request_id(serving, path: str) -> None:
                 grasp_pb2.DetectGraspsRequest(points=b"1"), metadata=(("x-request-id", "mine"),)
             )
             assert await call.code() == grpc.StatusCode.INVALID_ARGUMENT
-            assert dict(await call.initial_metadata())["x-request-id"] == "mine"
+            assert dict(await call.trailing_metadata())["x-request-id"] == "mine"
+
+
+async def test_a_stream_is_named_before_its_first_answer(serving) -> None:
+    async with serving() as server, aio.insecure_channel(server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        call = stub.DetectGraspsStream(metadata=(("x-request-id", "mine"),))
+        assert dict(await call.initial_metadata())["x-request-id"] == "mine"
+        call.cancel()
 
 
 class Serving:

@@ -2,6 +2,8 @@
 
 import asyncio
 import io
+from collections.abc import Callable
+from concurrent.futures import Future
 
 import grpc
 import httpx
@@ -129,12 +131,25 @@ class Clock:
         return self.now
 
 
+def running() -> Future[None]:
+    """Work that nobody can cancel."""
+    work: Future[None] = Future()
+    work.set_running_or_notify_cancel()
+    return work
+
+
+def finished() -> Future[None]:
+    work = running()
+    work.set_result(None)
+    return work
+
+
 async def one_at_a_time(clock: Clock, seconds: float, count: int = 1) -> Admission:
     """An admission that has seen requests of so many seconds."""
     admission = Admission(max_active=2, max_waiting=10, clock=clock)
     for _ in range(count):
         with admission.enter(Call("grpc", "DetectGrasps", clock=clock)) as place:
-            await place.begin(lambda: asyncio.sleep(0))
+            await place.begin(finished)
             clock.now += seconds
     return admission
 
@@ -161,7 +176,7 @@ async def test_idle_time_is_not_taken_for_work() -> None:
     admission = await one_at_a_time(clock, seconds=1.0)
     clock.now += 3600.0
     with admission.enter(Call("grpc", "DetectGrasps", clock=clock)) as place:
-        await place.begin(lambda: asyncio.sleep(0))
+        await place.begin(finished)
         clock.now += 1.0
     admission.enter(Call("grpc", "DetectGrasps", clock=clock))
     admission.enter(Call("grpc", "DetectGrasps", timeout=1.6, clock=clock))
@@ -169,12 +184,12 @@ async def test_idle_time_is_not_taken_for_work() -> None:
 
 async def test_a_place_given_up_while_it_waits_goes_to_the_next() -> None:
     admission = Admission(max_active=1, max_waiting=10)
-    release = asyncio.Event()
+    work = running()
     done: list[int] = []
 
     async def ask(number: int) -> None:
         with admission.enter(Call("grpc", "DetectGrasps")) as place:
-            await place.begin(release.wait)
+            await place.begin(lambda: work)
             done.append(number)
 
     asked = [asyncio.create_task(ask(number)) for number in range(4)]
@@ -182,7 +197,7 @@ async def test_a_place_given_up_while_it_waits_goes_to_the_next() -> None:
     asked[1].cancel()
     asked[2].cancel()
     await asyncio.wait(asked[1:3])
-    release.set()
+    work.set_result(None)
     await asyncio.gather(asked[0], asked[3])
     assert done == [0, 3]
     await admission.empty()
@@ -190,22 +205,20 @@ async def test_a_place_given_up_while_it_waits_goes_to_the_next() -> None:
 
 async def test_a_turn_that_comes_as_its_owner_leaves_is_passed_on() -> None:
     admission = Admission(max_active=1, max_waiting=10)
-    release, done = asyncio.Event(), []
+    work, done = running(), []
 
-    async def ask(number: int, wait: asyncio.Event) -> None:
+    async def ask(number: int, begin: Callable[[], Future[None]]) -> None:
         with admission.enter(Call("grpc", "DetectGrasps")) as place:
-            await place.begin(wait.wait)
+            await place.begin(begin)
             done.append(number)
 
-    open_gate = asyncio.Event()
-    open_gate.set()
     first, second, third = (
-        asyncio.create_task(ask(number, gate))
-        for number, gate in enumerate((release, open_gate, open_gate))
+        asyncio.create_task(ask(number, begin))
+        for number, begin in enumerate((lambda: work, finished, finished))
     )
     await asyncio.sleep(0)
     first.add_done_callback(lambda _: second.cancel())  # just as its turn came
-    release.set()
+    work.set_result(None)
     await asyncio.gather(first, third)
     assert done == [0, 2]
     await asyncio.wait([second])
