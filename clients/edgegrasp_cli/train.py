@@ -42,6 +42,9 @@ def train(
     validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
     seed: Annotated[int, Option(min=0, help="Seed of weights, split and batches.")] = 0,
     device: Annotated[str, Option(help="cpu or cuda.")] = "cpu",
+    mixed_precision: Annotated[
+        bool, Option("--mixed-precision", help="Products in bfloat16: for a GPU.")
+    ] = False,
 ) -> None:
     """Train weights on labelled views.
 
@@ -63,6 +66,7 @@ def train(
         schedule=schedule,
         rotations=rotations,
         evaluate_every=evaluate_every,
+        mixed_precision=mixed_precision,
         seed=seed,
     )
     try:

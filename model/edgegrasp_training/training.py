@@ -61,6 +61,7 @@ class TrainingOptions:
     unknown: float = 0.1  # share of training views without their table, and without their camera
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate
+    mixed_precision: bool = False  # products in bfloat16: for a GPU
     seed: int = 0
 
 
@@ -196,7 +197,9 @@ class Trainer:
     def _train_step(self) -> float:
         self.network.train()
         packed = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
-        logit = self._training_logits(packed.batch.to(self.device))
+        kind, mixed = torch.device(self.device).type, self.options.mixed_precision
+        with torch.autocast(kind, torch.bfloat16, enabled=mixed):
+            logit = self._training_logits(packed.batch.to(self.device)).float()
         label, weight = packed.label.to(self.device), packed.weight.to(self.device)
         loss = F.binary_cross_entropy_with_logits(logit, label, weight, reduction="sum")
         loss = loss / weight.sum()

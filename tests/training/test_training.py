@@ -28,6 +28,7 @@ from edgegrasp_training.views import LabelledView, split_by_scene
 
 MakeView = Callable[[int], LabelledView]
 TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04)
+VN = NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 9, 9), (9, 9), (16, 8, 4), crop_radius=0.04)
 HAND = NetworkConfig(
     "hand", hand_widths=(8, 16), hand_points=16, classifier_widths=(16, 8), crop_radius=0.04
 )
@@ -79,6 +80,20 @@ def test_pausing_and_resuming_is_the_same_as_going_through(
         through.network.state_dict().values(), resumed.network.state_dict().values(), strict=True
     ):
         torch.testing.assert_close(one, other, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("config", [TINY, VN, HAND], ids=["balls", "vn", "hands"])
+def test_mixed_precision_steps_are_nearly_those_in_full(
+    views: list[Path], tmp_path: Path, config: NetworkConfig
+) -> None:
+    losses: dict[bool, list[float]] = {False: [], True: []}
+    for mixed, kept in losses.items():
+        run = trainer(views, tmp_path / str(mixed), config)
+        run.options = replace(run.options, mixed_precision=mixed)
+        run.run(lambda step, loss, kept=kept: kept.append(loss), until=3)
+        assert all(value.dtype == torch.float32 for value in run.network.parameters())
+    assert losses[True] != losses[False]
+    np.testing.assert_allclose(losses[True], losses[False], rtol=0.05)
 
 
 def test_the_seed_decides_everything(views: list[Path], tmp_path: Path) -> None:
