@@ -6,6 +6,10 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
+from torch import Tensor
+
+from edgegrasp_model.products import float32_inference
+
 
 def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a function when it is first called, and keep it on disk where that is possible.
@@ -33,3 +37,15 @@ def point_kernels() -> ModuleType | None:
     if find_spec("numba") is None:
         return None
     return import_module("edgegrasp_model.point_kernels")
+
+
+def fused(module: str, values: Tensor) -> ModuleType | None:
+    """A module of fused layers where it serves: in inference in float32 on a processor, with Numba.
+
+    Args:
+        module: `edge_fused` or `vn_fused`.
+        values: What the layer is to be used on.
+    """
+    if not float32_inference(values) or find_spec("numba") is None:
+        return None
+    return import_module(f"edgegrasp_model.{module}")

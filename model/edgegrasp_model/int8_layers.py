@@ -6,24 +6,20 @@ in whole numbers, so no score depends on what else is in a batch. Every product 
 of rows: oneDNN prepares anew for each, which would take half as long as the product.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
-
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.layers import gather_rows, row_linear
+from edgegrasp_model.layers import gather_rows
 from edgegrasp_model.network import GlobalFeature, PointNetConv
+from edgegrasp_model.pieces import CONVOLVED, BallMaximum, ball_pieces, in_pieces
+from edgegrasp_model.products import linear_layers, row_linear
 
 BYTE, WEIGHT_BYTE = 255, 127  # the largest of a value and of a weight
 # The byte of a large value. Not 255: larger ones have room, and where a processor without VNNI adds
 # two products up in 16 bits they fit.
 LARGE_BYTE = 127
-CONVOLVED = 256  # points at a time in a graph convolution
-ROWS = 512  # points at a time in the global MLPs: 1,024 channels of them stay in cache
 
 
 class Int8Linear(nn.Module):
@@ -115,11 +111,9 @@ class Int8PointNetConv(nn.Module):
         """Maps point features (P, inputs) to (P, width)."""
         u, v = point_parts(self.hidden, features, batch)
         u, v = self.output.scaled(u).add_(0.5), self.output.scaled(v)
-        neighbors, v = _filled_up(batch.neighbors, CONVOLVED), _filled_up(v, CONVOLVED)
         pooled = []
-        for first in range(0, len(v), CONVOLVED):
-            part = slice(first, first + CONVOLVED)
-            hidden = gather_rows(u, neighbors[part]).sub_(v[part].unsqueeze(1))  # (p, k, width)
+        for neighbors, v_here in in_pieces(CONVOLVED, batch.neighbors, v):
+            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1))  # (p, k, width)
             messages = self.output(rounded_down(hidden).flatten(0, 1))
             pooled.append(messages.view(hidden.shape).amax(dim=1))  # (p, width)
         return torch.cat(pooled)[: len(features)]
@@ -140,19 +134,18 @@ class Int8GlobalFeature(nn.Module):
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
         first, second, third = self.first, self.second, self.third
-        points = _filled_up(first.bytes_of(local), ROWS)
-        ball_of_point = _filled_up(batch.ball_of_point, ROWS)
-        maximum = _BallMaximum(batch, len(third.bias))
-        for piece in _pieces(batch):
-            hidden = second(first(points[piece.rows], second), third)
+        pieces = ball_pieces(first.bytes_of(local), batch)
+        maximum = BallMaximum(batch.num_balls)
+        for piece in pieces:
+            hidden = second(first(piece.values, second), third)
             maximum.add(third(hidden), piece)
-        shared = row_linear(maximum.values, self.ball.weight)  # (B, 1024)
-        maximum = _BallMaximum(batch, len(self.last.bias))
-        for piece in _pieces(batch):
-            of_ball = shared.index_select(0, ball_of_point[piece.rows])  # (p, 1024)
-            joined = self.join(points[piece.rows], self.last, of_ball)
+        shared = row_linear(maximum.result(), self.ball.weight)  # (B, 1024)
+        maximum = BallMaximum(batch.num_balls)
+        for piece in pieces:
+            of_ball = shared.index_select(0, piece.ball_of_point)  # (p, 1024)
+            joined = self.join(piece.values, self.last, of_ball)
             maximum.add(self.last(joined), piece)
-        return maximum.values
+        return maximum.result()
 
     def fill(self, layer: GlobalFeature, local: float, hidden: list[float], joined: float) -> None:
         """Take over a float32 layer; each product's largest input is that of `Int8Linear.fill`."""
@@ -169,45 +162,6 @@ class Int8GlobalFeature(nn.Module):
         self.last.fill(last.weight, last.bias, joined)
 
 
-class _Piece(NamedTuple):
-    """Some points, and where in them which ball is."""
-
-    rows: slice
-    balls: list[tuple[int, slice]]  # ball, its rows within the piece
-
-
-def _pieces(batch: BallBatch) -> Iterator[_Piece]:
-    """Pieces of `ROWS` points each, the last one filled up."""
-    ends = torch.tensor(batch.ball_sizes).cumsum(0).tolist()
-    ball, start = 0, 0
-    for first in range(0, ends[-1] if ends else 0, ROWS):
-        balls = []
-        while ball < len(ends) and start < first + ROWS:
-            stop = min(ends[ball], first + ROWS)
-            balls.append((ball, slice(start - first, stop - first)))
-            start = stop
-            ball += stop == ends[ball]
-        yield _Piece(slice(first, first + ROWS), balls)
-
-
-class _BallMaximum:
-    """Maximum over the points of each ball, piece by piece."""
-
-    def __init__(self, batch: BallBatch, width: int) -> None:
-        self.values = torch.full((batch.num_balls, width), -torch.inf)
-
-    def add(self, values: Tensor, piece: _Piece) -> None:
-        """Take in the values (ROWS, width) of a piece."""
-        for ball, rows in piece.balls:
-            here = self.values[ball]
-            torch.maximum(here, values[rows].amax(dim=0), out=here)
-
-
-def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
-    """The linear layers of an MLP, in order."""
-    return [layer for layer in mlp if isinstance(layer, nn.Linear)]
-
-
 def rounded_down(values: Tensor) -> Tensor:
     """Whole bytes of values 0..255, in place; what is beyond becomes the nearest."""
     # By way of int16: the conversion of float32 to uint8 is not vectorised.
@@ -220,9 +174,3 @@ def point_parts(hidden: nn.Linear, features: Tensor, batch: BallBatch) -> tuple[
     feature_weight, point_weight = torch.split(hidden.weight, widths, dim=1)
     v = row_linear(batch.points, point_weight)
     return row_linear(features, feature_weight, hidden.bias) + v, v
-
-
-def _filled_up(values: Tensor, multiple: int) -> Tensor:
-    """Values (M, ...) and rows of zero up to a multiple."""
-    missing = -len(values) % multiple
-    return F.pad(values, (0, 0) * (values.dim() - 1) + (0, missing))

@@ -11,12 +11,12 @@ from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.int8_layers import (
     Int8GlobalFeature,
     Int8PointNetConv,
-    linear_layers,
     point_parts,
 )
 from edgegrasp_model.layers import gather_rows
 from edgegrasp_model.network import EdgeGraspNet
 from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.products import linear_layers
 
 INT8: Final = "edgegrasp-int8"
 COVERED = 0.9999  # share of a product's inputs on a view that its range is made for
@@ -93,16 +93,27 @@ def _largest_inputs(network: EdgeGraspNet, batches: Sequence[BallBatch]) -> dict
 
         return before
 
-    feature = network.ball_feature
+    def ball_feature(layer: Any, inputs: tuple[Tensor, BallBatch]) -> None:
+        local, batch = inputs
+        look("local", local)
+        first, second, last = linear_layers(layer.mlp_1)
+        for points in torch.split(local, batch.ball_sizes):
+            hidden_1 = first(points)
+            hidden_2 = second(hidden_1.relu())
+            ball = last(hidden_2.relu()).amax(dim=0, keepdim=True)  # (1, 512)
+            joined = layer.join(points, ball, points.new_zeros(len(points), dtype=torch.int64))
+            for name, values in (
+                ("hidden_1", hidden_1),
+                ("hidden_2", hidden_2),
+                ("joined", joined),
+            ):
+                look(name, values)
+
     hooks = [
         getattr(network, name).register_forward_pre_hook(convolution(name))
         for name in ("conv1", "conv2", "conv3")
     ]
-    hooks.append(feature.register_forward_pre_hook(lambda _, inputs: look("local", inputs[0])))
-    hidden_1, hidden_2, _ = linear_layers(feature.mlp_1)
-    after = {"hidden_1": hidden_1, "hidden_2": hidden_2, "joined": feature.join}
-    for name, layer in after.items():
-        hooks.append(layer.register_forward_hook(lambda _, __, out, name=name: look(name, out)))
+    hooks.append(network.ball_feature.register_forward_pre_hook(ball_feature))
     try:
         with torch.inference_mode():
             for batch in batches:

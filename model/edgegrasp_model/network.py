@@ -11,18 +11,19 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.compiled import fused
 from edgegrasp_model.hand_network import HandNet
-from edgegrasp_model.layers import (
-    SharedLinear,
-    ball_maximum,
+from edgegrasp_model.layers import SharedLinear, gather_rows, mlp
+from edgegrasp_model.network_config import Architecture, NetworkConfig
+from edgegrasp_model.pieces import (
+    CONVOLVED,
+    EDGE_ROWS,
+    BallMaximum,
     ball_pieces,
-    gather_rows,
     in_pieces,
     maximum,
-    mlp,
-    row_linear,
 )
-from edgegrasp_model.network_config import Architecture, NetworkConfig
+from edgegrasp_model.products import MlpProducts, Product, row_linear
 from edgegrasp_model.vn_network import VNEdgeGraspNet
 
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
@@ -38,17 +39,20 @@ class PointNetConv(nn.Module):
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
+        if (edge_fused := fused("edge_fused", features)) is not None:
+            fused_features: Tensor = edge_fused.convolution(self, features, batch)
+            return fused_features
         # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
         widths = [features.shape[1], 3]
         feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
         v = row_linear(batch.points, point_weight)  # (P, width)
         u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
-        pooled = []
-        for neighbors, v_here in zip(in_pieces(batch.neighbors), in_pieces(v), strict=True):
+        output, pooled = Product(self.output.weight), []
+        for neighbors, v_here in in_pieces(CONVOLVED, batch.neighbors, v):
             hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
-            pooled.append(maximum(row_linear(hidden, self.output.weight), dim=1))  # (p, width)
+            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
-        return torch.cat(pooled) + self.output.bias
+        return torch.cat(pooled)[: len(v)] + self.output.bias
 
 
 class GlobalFeature(nn.Module):
@@ -63,12 +67,15 @@ class GlobalFeature(nn.Module):
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
         pieces = ball_pieces(local, batch)
-        pooled = [ball_maximum(self.mlp_1(piece.values), piece.ball_sizes) for piece in pieces]
-        features = []
-        for piece, ball in zip(pieces, pooled, strict=True):  # ball: (b, 512)
-            joined = self.join(piece.values, ball, piece.ball_of_point).relu_()  # (p, 1024)
-            features.append(ball_maximum(self.mlp_2(joined), piece.ball_sizes))
-        return torch.cat(features)
+        mlp_1, maximum_1 = MlpProducts(self.mlp_1), BallMaximum(batch.num_balls)
+        for piece in pieces:
+            maximum_1.add(mlp_1(piece.values), piece)
+        join = self.join.on(maximum_1.result())  # of (B, 512)
+        mlp_2, maximum_2 = MlpProducts(self.mlp_2), BallMaximum(batch.num_balls)
+        for piece in pieces:
+            joined = join(piece.values, piece.ball_of_point).relu_()  # (p, 1024)
+            maximum_2.add(mlp_2(joined), piece)
+        return maximum_2.result()
 
 
 class EdgeGraspNet(nn.Module):
@@ -97,9 +104,10 @@ class EdgeGraspNet(nn.Module):
         f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
         grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
-        hidden = F.relu(self.join(grasp, ball, batch.ball_of_edge))  # (E, 512)
-        logits: Tensor = self.classifier(hidden).squeeze(1)  # (E, 1) -> (E,)
-        return logits
+        join, classifier, logits = self.join.on(ball), MlpProducts(self.classifier), []
+        for own, ball_of_edge in in_pieces(EDGE_ROWS, grasp, batch.ball_of_edge):
+            logits.append(classifier(join(own, ball_of_edge).relu_()))  # (e, 1)
+        return torch.cat(logits).squeeze(1)[: len(grasp)]
 
     def _grasp_features(self, batch: BallBatch) -> Tensor:
         """What is told of each grasp itself, (E, 10)."""

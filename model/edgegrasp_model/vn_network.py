@@ -4,15 +4,15 @@ Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. 
 (M, 3, C), see `vn_layers`; P points in B balls, E grasps.
 """
 
-from importlib.util import find_spec
-from types import ModuleType
-
 import torch
 from torch import Tensor, nn
 
 from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.layers import RowLinear, gather_rows, in_pieces, mlp, row_linear
+from edgegrasp_model.compiled import fused
+from edgegrasp_model.layers import RowLinear, gather_rows, mlp
 from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.pieces import CONVOLVED, in_pieces
+from edgegrasp_model.products import row_linear
 from edgegrasp_model.vn_layers import (
     VNLinearReLU,
     VNReLU,
@@ -35,8 +35,8 @@ class VNPointNetConv(nn.Module):
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, inputs) to (P, 3, width)."""
-        if (fused := _fused_inference(features)) is not None:
-            fused_vectors: Tensor = fused.convolution(self, features, batch)
+        if (vn_fused := fused("vn_fused", features)) is not None:
+            fused_vectors: Tensor = vn_fused.convolution(self, features, batch)
             return fused_vectors
         # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
         widths = [features.shape[2], 1]
@@ -45,14 +45,14 @@ class VNPointNetConv(nn.Module):
         u = row_linear(features, feature_weight) + v  # (P, 3, width)
         u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
         pooled = []
-        for neighbors, v_here, v_direction_here in zip(
-            in_pieces(batch.neighbors), in_pieces(v), in_pieces(v_direction), strict=True
+        for neighbors, v_here, v_direction_here in in_pieces(
+            CONVOLVED, batch.neighbors, v, v_direction
         ):
             hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
             direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
             messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
             pooled.append(vector_maximum(messages, self.reach, dim=1))
-        vectors: Tensor = self.output_relu(torch.cat(pooled))
+        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(v)])
         return vectors
 
 
@@ -87,8 +87,8 @@ class VNGlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
-        if (fused := _fused_inference(local)) is not None:
-            fused_ball: Tensor = fused.ball_feature(self, local, batch)
+        if (vn_fused := fused("vn_fused", local)) is not None:
+            fused_ball: Tensor = vn_fused.ball_feature(self, local, batch)
             return fused_ball
         hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
         pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
@@ -125,6 +125,9 @@ class VNEdgeGraspNet(nn.Module):
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=2), batch)  # (B, 3, 381)
         named = (batch.approach, batch.points[contact], batch.normals[contact])
         grasp = torch.cat((torch.stack(named, dim=2), f3[contact]), dim=2)  # (E, 3, 131)
+        if (vn_fused := fused("vn_fused", ball)) is not None:
+            fused_logits: Tensor = vn_fused.logits(self, grasp, ball, batch.ball_of_edge)
+            return fused_logits
 
         # Three vectors learned from the grasp turn with it: coordinates along them are invariant.
         frame = self.frame_3(self.frame_2(self.frame_1(grasp, ball, batch.ball_of_edge)))
@@ -132,13 +135,3 @@ class VNEdgeGraspNet(nn.Module):
         invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (E, 512, 3) -> (E, 1536)
         logits: Tensor = self.classifier(invariant).squeeze(1)  # (E, 1) -> (E,)
         return logits
-
-
-def _fused_inference(values: Tensor) -> ModuleType | None:
-    """`vn_fused` where it serves: inference in float32 on a processor, with Numba installed."""
-    plain = torch.is_grad_enabled() or values.device.type != "cpu" or values.dtype != torch.float32
-    if plain or find_spec("numba") is None:
-        return None
-    from edgegrasp_model import vn_fused
-
-    return vn_fused

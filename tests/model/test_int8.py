@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_model.int8_layers import Int8Linear
 from edgegrasp_model.int8_network import INT8, quantise
 from edgegrasp_model.network import build_network
+from edgegrasp_model.pieces import ball_pieces
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +82,7 @@ def test_no_bit_of_a_score_depends_on_the_rest_of_a_batch(quantised, batches):
 
 def test_balls_may_lie_across_pieces(quantised, batches, monkeypatch):
     expected = logits(quantised, batches[0])
-    monkeypatch.setattr(int8_layers, "ROWS", 7)
+    monkeypatch.setattr(int8_layers, "ball_pieces", partial(ball_pieces, rows=7))
     monkeypatch.setattr(int8_layers, "CONVOLVED", 5)
     np.testing.assert_array_equal(logits(quantised, batches[0]), expected)
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model import vn_network
+from edgegrasp_model import compiled
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.network import build_network
 from edgegrasp_model.vn_layers import vector_maximum, vector_relu
@@ -24,7 +24,7 @@ def network(tiny_config):
 
 @pytest.fixture
 def without_numba(monkeypatch):
-    monkeypatch.setattr(vn_network, "find_spec", lambda name: None)
+    monkeypatch.setattr(compiled, "find_spec", lambda name: None)
 
 
 def random_vectors(seed: int, *shape: int) -> torch.Tensor:
@@ -45,7 +45,7 @@ def scores(network: torch.nn.Module, batch: BallBatch) -> np.ndarray:
 def test_inference_scores_as_the_plain_layers_do(random_scene, network, monkeypatch):
     batches = [single(random_scene(seed).batch()) for seed in range(6)]
     fused = [scores(network, batch) for batch in batches]
-    monkeypatch.setattr(vn_network, "find_spec", lambda name: None)
+    monkeypatch.setattr(compiled, "find_spec", lambda name: None)
     plain = [scores(network, batch) for batch in batches]
     # A near tie may fall to another vector, in a scene at most.
     close = [
@@ -55,17 +55,19 @@ def test_inference_scores_as_the_plain_layers_do(random_scene, network, monkeypa
 
 
 def test_only_inference_in_float32_is_fused(network, monkeypatch):
-    monkeypatch.setattr(vn_network, "find_spec", lambda name: object())
+    monkeypatch.setattr(compiled, "find_spec", lambda name: object())
     values = torch.zeros(1, 3, 2)
-    assert vn_network._fused_inference(values) is None
+    assert compiled.fused("vn_fused", values) is None
     with torch.no_grad():
-        assert vn_network._fused_inference(values.double()) is None
-        assert vn_network._fused_inference(values) is vn_fused
+        assert compiled.fused("vn_fused", values.double()) is None
+        assert compiled.fused("vn_fused", values) is vn_fused
+        with torch.autocast("cpu", torch.bfloat16):
+            assert compiled.fused("vn_fused", values) is None
 
 
 def test_inference_needs_no_numba(random_scene, network, without_numba):
     with torch.no_grad():
-        assert vn_network._fused_inference(torch.zeros(1, 3, 2)) is None
+        assert compiled.fused("vn_fused", torch.zeros(1, 3, 2)) is None
     assert np.isfinite(scores(network, single(random_scene(0).batch()))).all()
 
 
@@ -82,6 +84,15 @@ def test_compiled_relu_of_a_vanishing_direction_is_the_vector():
     torch.testing.assert_close(vn_fused._relu(both), both[..., :4], rtol=0, atol=0)
 
 
+def furthest(*parts: torch.Tensor) -> torch.Tensor:
+    """The furthest of all vectors, part after part."""
+    width = parts[0].shape[2] // 2
+    best, result = np.full((1, width), -np.inf, np.float32), torch.zeros(1, 3, width)
+    for part in parts:
+        vn_fused._furthest(part.numpy(), np.array([0, len(part)]), best, result.numpy())
+    return result[0]
+
+
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS, rows=st.integers(1, 40), width=st.integers(1, 20))
 def test_compiled_maximum_is_the_plain_one(seed, rows, width):
@@ -91,14 +102,15 @@ def test_compiled_maximum_is_the_plain_one(seed, rows, width):
     with torch.no_grad():
         both = torch.cat((vectors, direction(vectors)), dim=2)
         expected = vector_maximum(vectors, direction, dim=0)
-    torch.testing.assert_close(vn_fused._pooled(both), expected, rtol=0, atol=0)
+    torch.testing.assert_close(furthest(both), expected, rtol=0, atol=0)
+    torch.testing.assert_close(furthest(both[:1], both[1:]), expected, rtol=0, atol=0)
 
 
 def test_neighbours_are_gathered_from_their_own_rows():
-    u, v = random_vectors(1, 5, 3, 8), random_vectors(2, 2, 3, 8)
+    u, points, offset = random_vectors(1, 5, 3, 8), random_vectors(2, 2, 3), random_vectors(3, 8)
     neighbors = np.array([[0, 4, 2], [3, 3, 1]])
     result = torch.empty(6, 3, 4)
-    vn_fused._gathered_relu(u.numpy(), v.numpy(), neighbors, result.numpy())
-    edges = u[torch.from_numpy(neighbors)] - v[:, None]
+    vn_fused._gathered_relu(u.numpy(), points.numpy(), offset.numpy(), neighbors, result.numpy())
+    edges = u[torch.from_numpy(neighbors)] - (points[:, :, None] * offset)[:, None]
     expected = vector_relu(edges[..., :4], edges[..., 4:]).flatten(0, 1)
     torch.testing.assert_close(result, expected, rtol=1e-4, atol=1e-5)
