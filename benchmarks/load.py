@@ -72,7 +72,11 @@ def main() -> None:
 
 def machine() -> dict[str, Any]:
     """Where it was measured."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
+        "processor": models[0] if models else platform.processor(),
         "cores": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "load_average": os.getloadavg()[0],  # other work on the machine makes everything slower
