@@ -86,7 +86,7 @@ def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
 def onednn_is_faster() -> bool:
     """Whether oneDNN multiplies in float32 about twice as fast as MKL, which is behind F.linear.
 
-    So it is on AMD processors with AVX-512: MKL uses half of a register there.
+    So it is on AMD processors with AVX-512, measured on an EPYC.
     """
     ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and "AMD" in _processor()
     there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
@@ -95,7 +95,7 @@ def onednn_is_faster() -> bool:
 
 def _processor() -> str:
     """The processor's name."""
-    get = getattr(torch.cpu, "get_capabilities", None)  # from PyTorch 2.10 on
+    get = getattr(torch.cpu, "get_capabilities", None)  # newer PyTorch has it
     return "" if get is None else str(get().get("cpu_name", ""))
 
 
