@@ -19,6 +19,7 @@ from edgegrasp_service.core import GraspService, in_time
 from edgegrasp_service.errors import Cancelled, report
 from edgegrasp_service.http_bodies import (
     KIND_PREFIX,
+    AnswerResponse,
     DetectionBody,
     HealthBody,
     ModelsBody,
@@ -88,7 +89,7 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
     async def detect_grasps(request: Request) -> JSONResponse:
         call = Call("http", "DetectGrasps", request_id=REQUEST_ID.get())
         detection = await _answer(service, request, call, receive_request, service.detect)
-        return JSONResponse(detection_body(detection))
+        return AnswerResponse(detection_body(detection))
 
     @app.post(
         "/v1/grasps:score",
@@ -100,7 +101,7 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
     async def score_grasps(request: Request) -> JSONResponse:
         call = Call("http", "ScoreGrasps", request_id=REQUEST_ID.get())
         scoring = await _answer(service, request, call, receive_score_request, service.score)
-        return JSONResponse(scoring_body(scoring))
+        return AnswerResponse(scoring_body(scoring))
 
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
     async def list_models() -> JSONResponse:

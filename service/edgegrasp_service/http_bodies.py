@@ -4,6 +4,8 @@ import math
 from typing import Annotated
 
 import numpy as np
+import orjson
+from fastapi.responses import JSONResponse
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -125,6 +127,14 @@ class ProblemBody(_Body):
     retry_after: float | None = Field(
         description="seconds until another try is worth it, as in Retry-After; null: unknown"
     )
+
+
+class AnswerResponse(JSONResponse):
+    """Thousands of numbers, which Python's own encoder takes milliseconds for; the same numbers."""
+
+    def render(self, content: object) -> bytes:
+        """The body."""
+        return orjson.dumps(content)
 
 
 def detection_body(detection: Detection) -> dict[str, object]:
