@@ -83,7 +83,7 @@ def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]
     return {
         "points": {n: partial(small.detect, clouds[n], usual) for n in POINTS},
         "approach points": {n: around(n) for n in APPROACH_POINTS},
-        "candidates": {n: scoring(n) for n in CANDIDATES},
+        f"candidates ({MANY_APPROACH_POINTS} approach points)": {n: scoring(n) for n in CANDIDATES},
         "scenes in a batch": {n: partial(batched, n) for n in BATCHES},
         "threads": {n: partial(threaded, n) for n in THREADS},
     }
@@ -122,22 +122,29 @@ def draw(curves: Mapping[str, Any], path: Path) -> None:
     """Time above memory, a column for each quantity."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(14, 4.6), layout="constrained")
-    axes = figure.subplots(2, len(curves), sharex="col")
+    figure = Figure(figsize=(14, 5), layout="constrained")
+    axes = figure.subplots(2, len(curves), sharex="col", squeeze=False)
     for (above, below), (name, curve) in zip(axes.T, curves.items(), strict=True):
         for plot, key in ((above, "seconds"), (below, "memory_mb")):
-            values = [int(value) for value in curve[key]]
-            plot.plot(values, list(curve[key].values()), "o-")
-            plot.set(xscale="log", ylim=(0, None))
+            values, measured = [int(value) for value in curve[key]], list(curve[key].values())
+            plot.plot(values, measured, "o-")
+            plot.set(xscale="log", ylim=(0, 1.1 * max(measured)))  # room for the highest marker
             plot.grid(visible=True, alpha=0.3)
         below.set(xlabel=name)
-        if name != "points":
-            words = [f"{value // 1000}k" if value >= 1000 else f"{value}" for value in values]
-            below.set_xticks(values, words, minor=False)
-            below.minorticks_off()
+        below.set_xticks(values, [_in_short(value) for value in values], minor=False)
+        below.minorticks_off()
+        below.tick_params(axis="x", labelsize="small")
     axes[0, 0].set_ylabel("seconds")
     axes[1, 0].set_ylabel("peak memory, MB")
     figure.savefig(path, dpi=90)
+
+
+def _in_short(count: int) -> str:
+    """1000 as 1k."""
+    for unit, name in ((1_000_000, "M"), (1_000, "k")):
+        if count >= unit:
+            return f"{count // unit}{name}"
+    return str(count)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,11 @@ def test_every_curve_asks_for_its_values() -> None:
     variants = curves.curves(seen)
     assert list(variants["points"]) == list(curves.POINTS)
     assert len(variants["points"][1_000].args[0]) == 1_000  # type: ignore[attr-defined]
-    asked = {name: variants[name] for name in ("approach points", "candidates")}
+    names = {
+        "approach points": "approach points",
+        "candidates": "candidates (256 approach points)",
+    }
+    asked = {name: variants[title] for name, title in names.items()}
     options = {name: [run.args[1] for run in runs.values()] for name, runs in asked.items()}
     assert [o.num_approach_points for o in options["approach points"]] == [8, 16, 32, 64, 128, 256]
     assert [o.num_candidates for o in options["candidates"]] == list(curves.CANDIDATES)
