@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = ("known", "ransac")
-SELECTIONS = ("best", "highest")
+SELECTIONS = ("best", "highest", "elsewhere")
 
 Range = tuple[float, float]
 
@@ -141,7 +141,8 @@ class PlanningRules:
         voxel_size: metres; network weights carry their own.
         num_approach_points: approach points sampled.
         num_candidates: candidates scored at most.
-        selection: `best` score, or the `highest` grasp among those of `min_score` and more.
+        selection: `best` score; the `highest` grasp among those of `min_score` and more; or
+            `elsewhere`, the best score away from grasps that have failed in the round.
         min_score: for `highest`.
     """
 

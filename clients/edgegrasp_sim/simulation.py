@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -61,6 +61,7 @@ class Observation:
         camera_positions: (V, 3) float32, every camera, world frame, metres.
         view_ids: (N,) int32, which camera saw each point.
         has_table: whether the cloud holds the table, which then has to be found.
+        failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
     """
 
     cloud: NDArray[np.float32]
@@ -71,6 +72,7 @@ class Observation:
     camera_positions: NDArray[np.float32]
     view_ids: NDArray[np.int32]
     has_table: bool = False
+    failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
 @dataclass(frozen=True, slots=True)

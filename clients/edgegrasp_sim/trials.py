@@ -215,7 +215,7 @@ class RoundDriver:
     def look(self) -> Observation:
         """Take the next view; the round ends if it shows next to nothing."""
         rules = self.protocol
-        self._seen = self.simulation.observe(
+        seen = self.simulation.observe(
             self._camera,
             self._noise,
             views=rules.camera.view_range(),
@@ -225,6 +225,8 @@ class RoundDriver:
             with_table=rules.planning.table == "ransac",
             surface_voxel=rules.camera.surface_voxel,
         )
+        failed = [each.T_world_hand for each in self._round.attempts if not each.success]
+        self._seen = replace(seen, failed=np.array(failed).reshape(-1, 4, 4))
         self.view += 1
         above = self._seen.cloud[:, 2] > self._seen.table_height + 0.005
         if np.count_nonzero(above) < MIN_POINTS:

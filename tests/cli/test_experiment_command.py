@@ -46,7 +46,10 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(
         (("guess",), "robustness, samples, families, baselines"),
         (("samples", "--scene", "shelf"), "shelf"),
         (("samples", "--model", "none.safetensors"), "no such file"),
-        (("samples", "--protocol", "paper"), "edgegrasp, edgegrasp-fused, giga, robot, vgn"),
+        (
+            ("samples", "--protocol", "paper"),
+            "edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn",
+        ),
     ],
 )
 def test_wrong_arguments_end_with_a_sentence(

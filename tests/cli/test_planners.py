@@ -22,6 +22,8 @@ from edgegrasp_sim.simulation import ClutterSimulation, Observation
 from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
 
 PAPER, ROBOT = load_protocol("edgegrasp").planning, load_protocol("robot").planning
+MEMORY = load_protocol("edgegrasp-memory").planning
+NONE_FAILED = np.empty((0, 4, 4))
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,10 @@ class Found:
         T[2, 3] = self.height
         return T
 
+    @property
+    def T_cloud_hand(self) -> np.ndarray:  # noqa: N802
+        return self.T_cloud_tcp @ translation(0.0, 0.0, -0.1).astype(np.float32)
+
 
 def seen_under(name: str) -> Observation:
     with ClutterSimulation() as simulation:
@@ -44,10 +50,41 @@ def seen_under(name: str) -> Observation:
 
 def test_the_robot_protocol_takes_the_highest_of_the_good() -> None:
     best, higher, bad = Found(0.99, 0.1), Found(0.92, 0.2), Found(0.5, 0.3)
-    assert choose([best, higher, bad], PAPER) is best
-    assert choose([best, higher, bad], ROBOT) is higher
-    assert choose([bad, replace(bad, score=0.4, height=0.9)], ROBOT) is bad
-    assert choose([], ROBOT) is None
+    assert choose([best, higher, bad], PAPER, NONE_FAILED) is best
+    assert choose([best, higher, bad], ROBOT, NONE_FAILED) is higher
+    assert choose([bad, replace(bad, score=0.4, height=0.9)], ROBOT, NONE_FAILED) is bad
+    assert choose([], ROBOT, NONE_FAILED) is None
+
+
+def test_with_a_memory_other_objects_and_other_grips_come_first() -> None:
+    best, beside, away, far_worse = (
+        Found(0.99, 0.1),
+        Found(0.98, 0.13),
+        Found(0.85, 0.2),
+        Found(0.4, 0.3),
+    )
+    every = [best, beside, away, far_worse]
+    failed = np.stack([best.T_cloud_hand])
+    assert choose(every, MEMORY, NONE_FAILED) is best
+    assert choose(every, PAPER, failed) is best
+    assert choose(every, MEMORY, failed) is away  # 0.85 against 0.8 times 0.98
+    assert choose([best, beside, far_worse], MEMORY, failed) is beside
+    assert choose([best, far_worse], MEMORY, failed) is best  # 0.8 times 0.6 of it is still more
+    twice = np.stack([best.T_cloud_hand, beside.T_cloud_hand])
+    assert choose([best, beside, far_worse], MEMORY, twice) is far_worse
+    turned = failed @ np.diag([-1.0, -1.0, 1.0, 1.0])  # fingers swapped: the same grip
+    assert choose([best, replace(beside, score=0.6)], MEMORY, turned) is not best
+    assert choose([], MEMORY, failed) is None
+
+
+def test_observations_say_what_has_failed_in_the_round() -> None:
+    with ClutterSimulation() as simulation:
+        rules = load_protocol("edgegrasp")
+        driver = RoundDriver(simulation, SceneKind.PACKED, rules, seed=0, index=0)
+        assert driver.look().failed.shape == (0, 4, 4)
+        nowhere = translation(0.15, 0.15, 0.6)
+        assert not driver.execute(PlannedGrasp(nowhere, 1.0, 0.08)).success
+        np.testing.assert_allclose(driver.look().failed, nowhere[None])
 
 
 def test_requests_follow_the_protocol() -> None:

@@ -122,7 +122,7 @@ def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None
     assert "shelf" in refused("benchmark", "--scene", "shelf")
     assert "urdf" in refused("benchmark", "--scene", "pile", "--objects", tmp_path)
     assert "rounds is 0" in refused("benchmark", "--rounds", 0)
-    assert "edgegrasp, edgegrasp-fused, giga, robot, vgn" in refused(
+    assert "edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn" in refused(
         "benchmark", "--protocol", "paper"
     )
     assert "edge-sample" in refused("benchmark", "--planner", "guess")

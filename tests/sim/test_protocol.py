@@ -14,12 +14,17 @@ if TYPE_CHECKING:
 
 
 def test_the_named_protocols_differ_where_they_should() -> None:
-    assert protocol_names() == ["edgegrasp", "edgegrasp-fused", "giga", "robot", "vgn"]
+    names = ["edgegrasp", "edgegrasp-fused", "edgegrasp-memory", "giga", "robot", "vgn"]
+    assert protocol_names() == names
     paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
     fused = load_protocol("edgegrasp-fused")
     assert fused.camera.surface_voxel == pytest.approx(0.30 / 180)
     camera = replace(fused.camera, surface_voxel=0.0)
     assert replace(fused, name="edgegrasp", camera=camera) == paper
+    memory = load_protocol("edgegrasp-memory")
+    planning = replace(memory.planning, selection="best")
+    assert memory.planning.selection == "elsewhere"
+    assert replace(memory, name="edgegrasp", source=paper.source, planning=planning) == paper
     assert (paper.rounds, paper.seeds) == (100, (0, 1, 2, 3, 4))
     assert paper.noise.point_std == 0.001
     assert paper.planning.voxel_size == 0.004
@@ -72,7 +77,9 @@ def test_a_wrong_file_is_told(tmp_path: Path, old: str, new: str, message: str) 
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(FileNotFoundError, match="edgegrasp, edgegrasp-fused, giga, robot, vgn"):
+    with pytest.raises(
+        FileNotFoundError, match="edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn"
+    ):
         load_protocol("paper")
 
 

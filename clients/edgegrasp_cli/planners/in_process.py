@@ -71,7 +71,7 @@ class InProcessPlanner:
             if self.flipped_normals > 0:
                 cloud = self._with_flipped_normals(cloud, options)
             detection = self.detector.detect(cloud, options)
-        best = choose(detection.grasps, self.rules)
+        best = choose(detection.grasps, self.rules, observation.failed)
         return PlannedGrasp(best.T_cloud_hand, best.score, best.width) if best else None
 
     def _with_flipped_normals(self, cloud: CloudInput, options: DetectOptions) -> CloudInput:

@@ -71,7 +71,7 @@ class ServerPlanner:
         except (ServerUnavailableError, DeadlineError) as error:
             self.close()
             raise PlannerUnavailableError(f"{self.settings.address}: {error}") from None
-        best = choose(detection.grasps, rules)
+        best = choose(detection.grasps, rules, observation.failed)
         return PlannedGrasp(best.T_cloud_hand, best.score, best.width) if best else None
 
     def close(self) -> None:
