@@ -10,7 +10,7 @@ from edgegrasp_model.hand_view import HandView
 Float32 = NDArray[np.float32]
 
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
-BESIDE, OUTSIDE, BEHIND, BEYOND = 0.0115, 0.035, 0.016, 0.012
+BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
 
 
 def points_around_fingers(

@@ -27,7 +27,7 @@ class NetworkConfig:
     global_widths_2: tuple[int, ...] = ()  # shared MLP before the second
     classifier_widths: tuple[int, ...] = ()  # hidden layers
     hand_widths: tuple[int, ...] = ()  # of `hand`: shared MLP before the maximum over the points
-    hand_points: int = 64  # of `hand`: points around the fingers
+    hand_points: int = 128  # of `hand`: points around the fingers
     k: int = 16  # neighbours in the graph, the point itself included
     crop_radius: float = 0.05  # ball radius, metres
 

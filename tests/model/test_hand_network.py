@@ -58,8 +58,8 @@ def test_points_are_those_between_and_around_the_fingers() -> None:
     turn, shift = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     seen = np.einsum("end,edk->enk", cloud.points - shift[:, None], turn)  # (E, N, 3)
     seen[:, :, 2] -= PANDA.tip_z
-    inside = (np.abs(seen) < (0.022, 0.075, np.inf)).all(axis=2)
-    inside &= (seen[:, :, 2] > PANDA.palm_z - 0.016 - PANDA.tip_z) & (seen[:, :, 2] < 0.012)
+    inside = (np.abs(seen) < (0.0375, 0.1, np.inf)).all(axis=2)
+    inside &= (seen[:, :, 2] > PANDA.palm_z - 0.026 - PANDA.tip_z) & (seen[:, :, 2] < 0.012)
     # Points within rounding of the region's edge may fall on its other side.
     assert (np.abs(batch.point_count.numpy() - inside.sum(axis=1)) <= 1).all()
     for hand in np.flatnonzero(batch.point_count.numpy() == inside.sum(axis=1)):
