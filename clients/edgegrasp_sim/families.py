@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgegrasp_sim.scene import OBJECT_MASS
+from edgegrasp_sim.made_objects import write_object
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,23 +44,6 @@ class Prism:
         lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in corners]
         lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
         return "\n".join(lines) + "\n"
-
-
-def _urdf(name: str) -> str:
-    """The description of the object whose surface is `<name>.obj`."""
-    shape = f'<mesh filename="{name}.obj"/>'
-    return f"""<?xml version="1.0"?>
-<robot name="{name}">
-  <link name="base_link">
-    <inertial>
-      <mass value="{OBJECT_MASS}"/>
-      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
-    </inertial>
-    <visual><geometry>{shape}</geometry></visual>
-    <collision><geometry>{shape}</geometry></collision>
-  </link>
-</robot>
-"""
 
 
 def _box(x: float, y: float, z: float) -> Prism:
@@ -123,9 +106,6 @@ def write_family(name: str, folder: Path) -> Path:
         name: one of `FAMILIES`.
         folder: made if need be.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     for number, shape in enumerate(FAMILIES[name]):
-        title = f"{name}-{number}"
-        (folder / f"{title}.obj").write_text(shape.obj())
-        (folder / f"{title}.urdf").write_text(_urdf(title))
+        write_object(f"{name}-{number}", shape.obj(), folder)
     return folder

@@ -136,15 +136,15 @@ def _make_scene(
 ) -> Question | None:
     """Make a scene; where there are weights, mostly one with a view that they find hard."""
     rng = streams[SCENE_STREAM]
-    look = options.weights is not None and rng.random() < HARD_SHARE
-    hard = None
-    for _ in range(HARD_LOOKS if look else 1):
+    guide = None
+    if options.weights is not None and rng.random() < HARD_SHARE:
+        guide = detector(options.weights)
+    for _ in range(1 if guide is None else HARD_LOOKS):
         simulation.reset(kind, rng, 1 + int(rng.poisson(MEAN_FURTHER_OBJECTS)), scales)
-        if look and options.weights is not None:
-            hard = _hard_view(simulation, detector(options.weights), options, streams)
+        hard = None if guide is None else _hard_view(simulation, guide, options, streams)
         if hard is not None:
-            break
-    return hard
+            return hard
+    return None
 
 
 def _hard_view(
@@ -203,12 +203,13 @@ def _views(
     """Labelled views of the scene that stands in the simulation, the hard one first."""
     choice = Choice(options.grasps_per_view, options.weights, hard is not None)
     models = [model.origin or model for model in simulation.object_models]
+    names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
     for number in range(options.views_per_scene):
         question = hard if hard and number == 0 else _ask(simulation, options, streams)
         yield replace(
             label(simulation, question, choice, streams[CHOICE_STREAM]),
-            objects=tuple(model.name for model in models),
-            object_digests=tuple(model.digest for model in models),
+            objects=names,
+            object_digests=digests,
         )
 
 

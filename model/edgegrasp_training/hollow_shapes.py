@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_sim.made_objects import write_object
 from edgegrasp_sim.objects import ObjectModel
 
 SEGMENTS = 24  # around the axis
 AXIS = 1e-4  # metres; profiles keep off the axis, where triangles would have no area
-MASS = 0.5  # kg
 Profile = NDArray[np.float64]  # (P, 2) radius and height, metres; closed, counter-clockwise
 
 
@@ -87,26 +87,7 @@ def write_hollow_shapes(folder: Path) -> tuple[ObjectModel, ...]:
     Args:
         folder: Made if need be.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    models = []
-    for name, profile in SHAPES.items():
-        (folder / f"{name}.obj").write_text(revolved(profile))
-        (folder / f"{name}.urdf").write_text(_urdf(name))
-        models.append(ObjectModel(name, folder / f"{name}.urdf"))
-    return tuple(models)
-
-
-def _urdf(name: str) -> str:
-    shape = f'<geometry><mesh filename="{name}.obj"/></geometry>'
-    return f"""<?xml version="1.0"?>
-<robot name="{name}">
-  <link name="base_link">
-    <inertial>
-      <mass value="{MASS}"/>
-      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
-    </inertial>
-    <visual>{shape}</visual>
-    <collision>{shape}</collision>
-  </link>
-</robot>
-"""
+    return tuple(
+        ObjectModel(name, write_object(name, revolved(profile), folder))
+        for name, profile in SHAPES.items()
+    )
