@@ -1,7 +1,6 @@
 """One request on its way through the server: who asked, by when, and whether anyone waits."""
 
 import re
-import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -48,7 +47,7 @@ class Call:
         self._clock = clock
         self._start = clock()
         self._deadline = None if timeout is None else self._start + timeout
-        self._cancelled = threading.Event()
+        self._cancelled = False
 
     @property
     def seconds(self) -> float:
@@ -63,12 +62,12 @@ class Call:
     @property
     def cancelled(self) -> bool:
         """Whether nobody waits for the answer any more."""
-        return self._cancelled.is_set()
+        return self._cancelled
 
     @property
     def over(self) -> bool:
         """Whether an answer would come in vain: cancelled, or after the deadline."""
-        return self.cancelled or (self.remaining is not None and self.remaining <= 0.0)
+        return self._cancelled or (self._deadline is not None and self._deadline <= self._clock())
 
     def limit(self, timeout: float) -> None:
         """Bring the deadline forward to `timeout` seconds after it came in, if it is later."""
@@ -77,7 +76,7 @@ class Call:
 
     def cancel(self) -> None:
         """Say that nobody waits any more; work on it ends at the next stage."""
-        self._cancelled.set()
+        self._cancelled = True
 
     def check(self) -> None:
         """Pass where the answer is still wanted; called before every stage.

@@ -6,6 +6,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future
 from contextvars import copy_context
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,16 +27,21 @@ from edgegrasp_service.errors import (
     WorkerLost,
 )
 from edgegrasp_service.given_grasps import GivenGrasps
-from edgegrasp_service.network_worker import LOST, NetworkWorker, out_of_memory
+from edgegrasp_service.network_worker import LOST, Job, NetworkWorker, out_of_memory
 from edgegrasp_service.observer import Observer
 from edgegrasp_service.sent_cloud import SentCloud, decode_cloud
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.stage_pools import StagePools, then
+from edgegrasp_service.stage_pools import StagePools, Step, Steps
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-Answer = TypeVar("Answer", Detection, Scoring)
+Written = TypeVar("Written")
+
+
+def as_it_is(answer: Any) -> Any:
+    """What is written of an answer where nothing is: itself."""
+    return answer
 
 
 @dataclass(frozen=True)
@@ -82,8 +88,8 @@ class ModelInfo:
 class GraspService:
     """Answers requests with the detectors of one catalogue.
 
-    Clouds are decoded and prepared, and grasps ranked, in pools of threads; one thread runs the
-    networks. Every stage begins only where the answer is still wanted.
+    Requests go from stage to stage in threads, one network runs at a time, and every stage begins
+    only where the answer is still wanted.
 
     Args:
         load: Makes the catalogue; called by `start` and `reload`, in a thread.
@@ -105,8 +111,8 @@ class GraspService:
         self._admission = Admission(
             self.settings.max_concurrent_requests, self.settings.max_queue_length, self.observer
         )
-        self._pools = StagePools(self.settings.prepare_threads, self.observer)
         self._worker = NetworkWorker(BatchPolicy.from_settings(self.settings), self.observer)
+        self._pools = StagePools(self.settings.prepare_threads, self._worker, self.observer)
 
     async def start(self) -> None:
         """Load and warm up; ready once this returns.
@@ -181,40 +187,50 @@ class GraspService:
         call.check()
         return self._admission.enter(call)
 
-    async def detect(self, read: Callable[[], DetectRequest], place: Place) -> Detection:
+    async def detect(
+        self,
+        read: Callable[[], DetectRequest],
+        place: Place,
+        write: Callable[[Detection], Written] = as_it_is,
+    ) -> Written:
         """Find grasps.
 
         Args:
-            read: Makes the request of what was sent; called in the pool that decodes.
+            read: Makes the request of what was sent; called in a thread, as `write` is.
             place: Its place.
+            write: Makes what is sent of the grasps.
 
         Raises:
             EdgeGraspError: One of the errors in the table of `edgegrasp_service.errors`.
         """
         call = place.call
+        options: list[DetectOptions] = []  # known once they are read
 
-        def stages(asked: Decoded) -> Future[Detection]:
+        def steps() -> Steps:
+            asked: Decoded = yield Step("decode", lambda: self._decoded(read(), options))
             detector = asked.detector
-            prepared = self._pools.submit(
-                call, "prepare", detector.prepare, asked.cloud, asked.options
+            prepared: Prepared = yield Step(
+                "prepare", partial(detector.prepare, asked.cloud, asked.options)
             )
-            return then(prepared, lambda prepared: self._scored(call, detector, prepared))
+            del asked  # nothing here keeps what was read: as JSON it takes many times its room
+            logits, seconds = np.empty(0, np.float32), 0.0
+            if prepared.batch is not None:
+                logits, seconds = yield Job(call, detector, prepared.batch)
+            prepared.seconds["network"] = seconds
+            detection = yield Step("finish", partial(detector.finish, prepared, logits))
+            return detection, write(detection)
 
-        return await self._answer(read, place, stages)
+        written: Written = await self._answer(steps(), place, options)
+        return written
 
-    def _scored(self, call: Call, detector: Detector, prepared: Prepared) -> Future[Detection]:
-        """The network, and what follows."""
-
-        def finish(scored: tuple[Any, float]) -> Future[Detection]:
-            logits, prepared.seconds["network"] = scored
-            return self._pools.submit(call, "finish", detector.finish, prepared, logits)
-
-        if prepared.batch is None:
-            return finish((np.empty(0, np.float32), 0.0))
-        return then(self._worker.score(call, detector, prepared.batch), finish)
-
-    async def score(self, read: Callable[[], ScoreRequest], place: Place) -> Scoring:
+    async def score(
+        self,
+        read: Callable[[], ScoreRequest],
+        place: Place,
+        write: Callable[[Scoring], Written] = as_it_is,
+    ) -> Written:
         """Score edges or hand poses that the caller gives; arguments and errors as of `detect`."""
+        options: list[DetectOptions] = []
 
         def checked() -> ScoreRequest:
             request = read()
@@ -223,54 +239,44 @@ class GraspService:
                 _limit(name, 0 if given is None else len(given), self.settings.max_candidates)
             return request
 
-        def stages(asked: Decoded) -> Future[Scoring]:
-            given = asked.given
+        def steps() -> Steps:
+            asked: Decoded = yield Step("decode", lambda: self._decoded(checked(), options))
+            edges, poses = asked.given.edges, asked.given.hand_poses
+            score = partial(asked.detector.score, asked.cloud, asked.options)
+            work = partial(score, edges=edges, hand_poses=poses)
+            scoring = yield Job(place.call, work=work)
+            return scoring, write(scoring)
 
-            def score() -> Scoring:
-                return asked.detector.score(
-                    asked.cloud, asked.options, edges=given.edges, hand_poses=given.hand_poses
-                )
+        written: Written = await self._answer(steps(), place, options)
+        return written
 
-            return self._worker.run(place.call, score)
-
-        return await self._answer(checked, place, stages)
-
-    async def _answer(
-        self,
-        read: Callable[[], DetectRequest],
-        place: Place,
-        stages: Callable[[Decoded], Future[Answer]],
-    ) -> Answer:
-        """Decode a request and do what follows, in its turn and before its deadline."""
+    async def _answer(self, steps: Steps, place: Place, options: list[DetectOptions]) -> Any:
+        """Take a request through its steps, in its turn and before its deadline."""
         call = place.call
-        options: list[DetectOptions] = []  # known once they are read
 
-        def decode() -> Decoded:
-            request = read()
-            options.append(parse_options(dict(request.options)))
-            return self._decoded(request, options[0])
-
-        def work() -> Future[Answer]:
+        def work() -> Future[Any]:
             self.observer.stage(call, "admission", call.seconds)
-            # Nothing here keeps what was read: as JSON it takes many times the cloud's room.
-            last = then(self._pools.submit(call, "decode", decode), stages)
+            answer = self._pools.begin(call, steps)
             named = copy_context()  # with the request's id
-            last.add_done_callback(lambda ended: named.run(_log_fault, ended, call, options))
-            return last
+            answer.add_done_callback(lambda ended: named.run(_log_fault, ended, call, options))
+            return answer
 
         try:
-            answer = await in_time(call, place.begin(work))
+            answer, written = await in_time(call, place.begin(work))
         except EdgeGraspError:
             raise
         except Exception as error:
             if out_of_memory(error):
                 raise WorkerLost(LOST) from None
             raise DetectorFailed("The detector failed; the server's log says why.") from None
-        self.observer.answered(call, answer)
-        return answer
+        # Once it is on its way.
+        asyncio.get_running_loop().call_soon(self.observer.answered, call, answer)
+        return written
 
-    def _decoded(self, request: DetectRequest, options: DetectOptions) -> Decoded:
-        """A request within the bounds, with its cloud decoded."""
+    def _decoded(self, request: DetectRequest, known: list[DetectOptions]) -> Decoded:
+        """A request within the bounds, with its cloud decoded; its options are `known` first."""
+        options = parse_options(dict(request.options))
+        known.append(options)
         _limit("options.num_approach_points", options.num_approach_points, self.settings.max_balls)
         _limit("options.num_candidates", options.num_candidates, self.settings.max_candidates)
         assert self._catalogue is not None  # or there would be no place

@@ -72,12 +72,18 @@ class Edge:
         try:
             yield request_id
         finally:
-            self._count(answered, -1)
             seconds = time.monotonic() - start
-            timed = None if answered.long else seconds
-            self.metrics.request(transport, method, answered.code, timed)
-            fields = {"transport": transport, "method": method, "code": answered.code}
-            level = logging.DEBUG if method in PROBES else logging.INFO
+            # Once the answer is on its way; in this task's context, which knows the request's id.
+            loop = asyncio.get_running_loop()
+            loop.call_soon(self._ended, transport, method, answered, seconds)
+
+    def _ended(self, transport: str, method: str, answered: Answered, seconds: float) -> None:
+        self._count(answered, -1)
+        timed = None if answered.long else seconds
+        self.metrics.request(transport, method, answered.code, timed)
+        fields = {"transport": transport, "method": method, "code": answered.code}
+        level = logging.DEBUG if method in PROBES else logging.INFO
+        if logger.isEnabledFor(level):
             logger.log(level, "request", extra={"fields": fields | {"seconds": round(seconds, 6)}})
 
     @contextmanager

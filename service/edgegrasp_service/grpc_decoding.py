@@ -1,11 +1,12 @@
-"""Messages that are none: the caller's mistake, which gRPC takes for one of the server."""
+"""Messages that are none, or too long: mistakes of callers, which gRPC takes for the server's."""
 
 from collections.abc import AsyncIterator, Callable
 from typing import Any, Self
 
 from google.protobuf.message import DecodeError
 
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
+from edgegrasp_service.body_limit import too_large
 
 Decode = Callable[[bytes], Any]
 
@@ -17,21 +18,29 @@ class Undecodable:
         error: What to tell the caller.
     """
 
-    def __init__(self, size: int) -> None:
-        value = f"{size} bytes that are no message of this method"
-        self.error = InvalidRequest("request", value, "Send a message as the .proto file has it.")
+    def __init__(self, error: EdgeGraspError) -> None:
+        self.error = error
 
 
-def tolerant(decode: Decode | None) -> Decode | None:
-    """A decoder that gives back Undecodable where `decode` fails; None: messages stay bytes."""
+def tolerant(decode: Decode | None, longest: int | None) -> Decode | None:
+    """A decoder that gives back Undecodable where `decode` fails.
+
+    Args:
+        decode: None: messages stay bytes.
+        longest: Most bytes of a message that is decoded; None: any.
+    """
     if decode is None:
         return None
 
     def read(data: bytes) -> Any:
+        if longest is not None and len(data) > longest:
+            return Undecodable(too_large(len(data), longest))
         try:
             return decode(data)
         except DecodeError:
-            return Undecodable(len(data))
+            value = f"{len(data)} bytes that are no message of this method"
+            fix = "Send a message as the .proto file has it."
+            return Undecodable(InvalidRequest("request", value, fix))
 
     return read
 

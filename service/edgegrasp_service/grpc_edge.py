@@ -31,10 +31,16 @@ Handler = Any  # grpc.RpcMethodHandler, of which the stubs know no fields
 
 
 class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in its stubs only
-    """Interceptor before every method, those of health checks and reflection included."""
+    """Interceptor before every method, those of health checks and reflection included.
 
-    def __init__(self, edge: Edge) -> None:
+    Args:
+        edge: What is the same for both transports.
+        max_body_bytes: Of a single message; those of streams are refused one by one.
+    """
+
+    def __init__(self, edge: Edge, max_body_bytes: int) -> None:
         self._edge = edge
+        self._max_body_bytes = max_body_bytes
         self._around: dict[str, tuple[Handler, Handler]] = {}  # by path: a handler, and its own
 
     async def intercept_service(
@@ -94,7 +100,7 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
                     raise
                 return answer
 
-        return _handler(kind, named, handler)
+        return self._handler(kind, named, handler)
 
     def _around_generator(self, method: str, behavior: Any, kind: str, handler: Handler) -> Handler:
         """A handler that yields its answers."""
@@ -114,7 +120,18 @@ class GrpcEdge(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in i
                     answered.code = _code(error, context)
                     raise
 
-        return _handler(kind, named, handler)
+        return self._handler(kind, named, handler)
+
+    def _handler(self, kind: str, behavior: Any, original: Handler) -> Handler:
+        make = getattr(grpc, f"{kind}_rpc_method_handler")
+        if original is None:
+            return make(behavior)
+        longest = self._max_body_bytes if kind.startswith("unary") else None
+        return make(
+            behavior,
+            request_deserializer=tolerant(original.request_deserializer, longest),
+            response_serializer=original.response_serializer,
+        )
 
 
 def refusal(error: Exception) -> Callable[[Any, Any], Awaitable[None]]:
@@ -147,14 +164,3 @@ def _code(error: BaseException, context: Any) -> str:
         return "CANCELLED"
     code = context.code()
     return code.name if isinstance(code, grpc.StatusCode) else "UNKNOWN"
-
-
-def _handler(kind: str, behavior: Any, original: Handler) -> Handler:
-    make = getattr(grpc, f"{kind}_rpc_method_handler")
-    if original is None:
-        return make(behavior)
-    return make(
-        behavior,
-        request_deserializer=tolerant(original.request_deserializer),
-        response_serializer=original.response_serializer,
-    )

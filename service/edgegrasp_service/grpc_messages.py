@@ -141,13 +141,11 @@ def error_message(problem: ErrorReport) -> grasp_pb2.ErrorDetail:
 
 
 def stream_response(
-    request_id: str, answer: Detection | ErrorReport
+    request_id: str, answer: grasp_pb2.DetectGraspsResponse | ErrorReport
 ) -> grasp_pb2.DetectGraspsStreamResponse:
     """The answer to one request of a stream."""
-    if isinstance(answer, Detection):
-        return grasp_pb2.DetectGraspsStreamResponse(
-            request_id=request_id, detection=detection_message(answer)
-        )
+    if isinstance(answer, grasp_pb2.DetectGraspsResponse):
+        return grasp_pb2.DetectGraspsStreamResponse(request_id=request_id, detection=answer)
     error = grasp_pb2.StreamError(
         code=answer.code.value[0], message=answer.detail, detail=error_message(answer)
     )
@@ -157,8 +155,8 @@ def stream_response(
 def _grasp_message(grasp: Grasp) -> grasp_pb2.Grasp:
     return grasp_pb2.Grasp(
         score=grasp.score,
-        T_cloud_hand=np.ravel(grasp.T_cloud_hand).tolist(),
-        T_cloud_tcp=np.ravel(grasp.T_cloud_tcp).tolist(),
+        T_cloud_hand=grasp.T_cloud_hand.ravel().tolist(),
+        T_cloud_tcp=grasp.T_cloud_tcp.ravel().tolist(),
         width=grasp.width,
         approach_point=grasp.approach_point.tolist(),
         contact_point=grasp.contact_point.tolist(),

@@ -18,13 +18,12 @@ from edgegrasp_service.errors import AddressInUse, report
 from edgegrasp_service.grpc_door import GrpcDoor
 from edgegrasp_service.grpc_edge import GrpcEdge, abort
 from edgegrasp_service.grpc_messages import (
-    detection_message,
     models_message,
     reloaded_message,
     score_request_from_message,
     scoring_message,
 )
-from edgegrasp_service.grpc_stream import answer_stream, check_size, detect
+from edgegrasp_service.grpc_stream import answer_stream, detect
 from edgegrasp_service.observer import observed
 from edgegrasp_service.reload import Reloader, reload_models
 from edgegrasp_service.request_id import REQUEST_ID
@@ -47,7 +46,7 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         """Find grasps in one cloud."""
         call = _call("DetectGrasps", context)
         try:
-            return detection_message(await detect(self._service, request, call))
+            return await detect(self._service, request, call)
         except Exception as error:
             await _abort(context, error)
 
@@ -58,9 +57,8 @@ class GraspServicer(grasp_pb2_grpc.GraspServiceServicer):
         call = _call("ScoreGrasps", context)
         try:
             with observed(self._service.observer, call), self._service.admit(call) as place:
-                check_size(request, self._service.settings.max_body_bytes)
                 read = partial(score_request_from_message, request)
-                return scoring_message(await self._service.score(read, place))
+                return await self._service.score(read, place, scoring_message)
         except Exception as error:
             await _abort(context, error)
 

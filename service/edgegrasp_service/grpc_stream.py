@@ -6,16 +6,17 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import NamedTuple
 
-from google.protobuf.message import Message
-
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.results import Detection
 from edgegrasp_service.body_limit import too_large
 from edgegrasp_service.call import Call
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.errors import STOPPING, ErrorReport, NotReady, report
-from edgegrasp_service.grpc_messages import request_from_message, stream_response
+from edgegrasp_service.grpc_messages import (
+    detection_message,
+    request_from_message,
+    stream_response,
+)
 from edgegrasp_service.observer import observed
 from edgegrasp_service.option_messages import refuse_unknown_fields
 
@@ -27,22 +28,15 @@ class _Ahead(NamedTuple):
     """A request of the stream that is not answered yet."""
 
     request_id: str
-    work: asyncio.Task[Detection | ErrorReport]
+    work: asyncio.Task[grasp_pb2.DetectGraspsResponse | ErrorReport]
 
 
 async def detect(
     service: GraspService, message: grasp_pb2.DetectGraspsRequest, call: Call
-) -> Detection:
+) -> grasp_pb2.DetectGraspsResponse:
     """Answer one message; raises an error of the table in `edgegrasp_service.errors`."""
     with observed(service.observer, call), service.admit(call) as place:
-        check_size(message, service.settings.max_body_bytes)
-        return await service.detect(lambda: request_from_message(message), place)
-
-
-def check_size(message: Message, max_body_bytes: int) -> None:
-    """Raise PayloadTooLarge for a message over the limit."""
-    if (size := message.ByteSize()) > max_body_bytes:
-        raise too_large(size, max_body_bytes)
+        return await service.detect(lambda: request_from_message(message), place, detection_message)
 
 
 async def answer_stream(service: GraspService, requests: Requests) -> AsyncIterator[Response]:
@@ -96,13 +90,15 @@ def _read(
 
 async def _answer(
     service: GraspService, request: grasp_pb2.DetectGraspsStreamRequest
-) -> Detection | ErrorReport:
+) -> grasp_pb2.DetectGraspsResponse | ErrorReport:
     """A detection, or why there is none."""
     call = Call("grpc", "DetectGraspsStream", request_id=request.request_id)
     try:
         refuse_unknown_fields(request, "request")
         if request.HasField("timeout"):
             call.limit(_checked(request.timeout))
+        if (size := request.request.ByteSize()) > service.settings.max_body_bytes:
+            raise too_large(size, service.settings.max_body_bytes)
         return await detect(service, request.request, call)
     except Exception as error:
         return report(error)

@@ -4,10 +4,11 @@ import asyncio
 import http
 import logging
 from collections.abc import Awaitable, Callable, Coroutine
+from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -19,7 +20,6 @@ from edgegrasp_service.core import GraspService, in_time
 from edgegrasp_service.errors import Cancelled, report
 from edgegrasp_service.http_bodies import (
     KIND_PREFIX,
-    AnswerResponse,
     DetectionBody,
     HealthBody,
     ModelsBody,
@@ -28,6 +28,7 @@ from edgegrasp_service.http_bodies import (
     detection_body,
     models_body,
     scoring_body,
+    written,
 )
 from edgegrasp_service.http_openapi import OPENAPI_DETECT, OPENAPI_SCORE
 from edgegrasp_service.http_problem import problem_response
@@ -39,7 +40,6 @@ from edgegrasp_service.request_id import REQUEST_ID
 logger = logging.getLogger(__name__)
 
 Asked = TypeVar("Asked")
-Answer = TypeVar("Answer")
 
 DESCRIPTION = """Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
 
@@ -86,10 +86,10 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
         responses=PROBLEMS,
         openapi_extra=OPENAPI_DETECT,
     )
-    async def detect_grasps(request: Request) -> JSONResponse:
+    async def detect_grasps(request: Request) -> Response:
         call = Call("http", "DetectGrasps", request_id=REQUEST_ID.get())
-        detection = await _answer(service, request, call, receive_request, service.detect)
-        return AnswerResponse(detection_body(detection))
+        work = partial(service.detect, write=lambda answer: written(detection_body(answer)))
+        return await _answer(service, request, call, receive_request, work)
 
     @app.post(
         "/v1/grasps:score",
@@ -98,10 +98,10 @@ def create_app(service: GraspService, reloader: Reloader | None = None) -> FastA
         responses=PROBLEMS,
         openapi_extra=OPENAPI_SCORE,
     )
-    async def score_grasps(request: Request) -> JSONResponse:
+    async def score_grasps(request: Request) -> Response:
         call = Call("http", "ScoreGrasps", request_id=REQUEST_ID.get())
-        scoring = await _answer(service, request, call, receive_score_request, service.score)
-        return AnswerResponse(scoring_body(scoring))
+        work = partial(service.score, write=lambda answer: written(scoring_body(answer)))
+        return await _answer(service, request, call, receive_score_request, work)
 
     @app.get("/v1/models", summary="List the loaded weights", response_model=ModelsBody)
     async def list_models() -> JSONResponse:
@@ -139,8 +139,8 @@ async def _answer(
     request: Request,
     call: Call,
     receive: Callable[[Request], Coroutine[Any, Any, Callable[[], Asked]]],
-    work: Callable[[Callable[[], Asked], Place], Coroutine[Any, Any, Answer]],
-) -> Answer:
+    work: Callable[[Callable[[], Asked], Place], Coroutine[Any, Any, bytes]],
+) -> Response:
     """Take a place, receive the request, and work on it while the client is there."""
     with observed(service.observer, call):
         if (timeout := read_timeout(request)) is not None:
@@ -150,10 +150,11 @@ async def _answer(
                 read = await in_time(call, receive(request))
             except ClientDisconnect:
                 raise Cancelled("The client left before its request was whole.") from None
-            return await _unless_gone(request, work(read, place))
+            body = await _unless_gone(request, work(read, place))
+            return Response(body, media_type="application/json")
 
 
-async def _unless_gone(request: Request, work: Coroutine[Any, Any, Answer]) -> Answer:
+async def _unless_gone(request: Request, work: Coroutine[Any, Any, bytes]) -> bytes:
     """What the work gives; once the client closes, it is cancelled, and Cancelled raised."""
     working = asyncio.create_task(work)
     gone = asyncio.create_task(_gone(request.receive))

@@ -42,6 +42,7 @@ class Metrics(Observer):
         self._seconds = self._histogram("request_seconds", "from headers to answer", SECONDS, calls)
         self._in_flight = self._gauge("requests_in_flight", "requests not yet answered")
         self._stages = self._histogram("stage_seconds", "stages of a request", SECONDS, ("stage",))
+        self._stage = {stage: self._stages.labels(stage) for stage in STAGES}
         self._active = self._gauge("requests_active", "requests that are worked on")
         self._waiting = self._gauge("queue_depth", "requests that wait to be worked on")
         self._batch_requests = self._histogram("batch_requests", "requests of a forward pass", FEW)
@@ -69,7 +70,7 @@ class Metrics(Observer):
 
     def stage(self, call: Call, name: str, seconds: float) -> None:
         """Take the duration of a stage."""
-        self._stages.labels(name if name in STAGES else OTHER).observe(seconds)
+        (self._stage.get(name) or self._stages.labels(OTHER)).observe(seconds)
 
     def places(self, active: int, waiting: int) -> None:
         """Take the numbers of requests in work and in the queue."""

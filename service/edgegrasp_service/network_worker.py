@@ -23,10 +23,14 @@ LOST = "The network's worker was lost with this request, and replaced. Try again
 
 @dataclass(eq=False)
 class Job:
-    """Something that needs the network."""
+    """Something that needs the network.
+
+    It is answered with logits (E,) of its batch and the seconds the forward pass took, or with
+    what its work returns.
+    """
 
     call: Call
-    detector: Detector | None = None  # None: `work` does it all
+    detector: Detector | None = None  # its network is to score `batch`; None: `work` does it all
     batch: Batch | None = None
     work: Callable[[], Any] | None = None
     answer: Future[Any] = field(default_factory=Future)
@@ -42,7 +46,8 @@ class Job:
 class NetworkWorker:
     """Runs jobs one after the other, or several in one forward pass.
 
-    A job whose call is over is dropped when its turn comes. Where a forward pass of several fails,
+    A job that finds nothing to wait for can run in the thread that brings it. A job whose call is
+    over is dropped when its turn comes. Where a forward pass of several fails,
     each is tried alone, so that one request cannot spoil the others'.
     """
 
@@ -51,19 +56,43 @@ class NetworkWorker:
         self._observer = observer
         self._jobs: list[Job] = []
         self._changed = threading.Condition()
+        self._running = False
         self._closed = False
 
     def start(self) -> None:
         """Start the thread."""
         threading.Thread(target=self._main, name="network", daemon=True).start()
 
-    def score(self, call: Call, detector: Detector, batch: Batch) -> "Future[tuple[Any, float]]":
-        """Logits (E,) of a batch, and the seconds the forward pass took."""
-        return self._submit(Job(call, detector, batch))
+    def submit(self, job: Job) -> "Future[Any]":
+        """Let a job wait for its turn; raises NotReady once this is closed."""
+        with self._changed:
+            self._queue(job)
+        return job.answer
 
-    def run(self, call: Call, work: Callable[[], Any]) -> "Future[Any]":
-        """What a function returns that uses the network itself."""
-        return self._submit(Job(call, work=work))
+    def here(self, job: Job) -> Any:
+        """Run a job in the calling thread where nothing comes first, or else wait for its turn.
+
+        Returns:
+            Its answer.
+
+        Raises:
+            WorkerLost: Memory ran out, or something tried to end a thread: this one should end.
+            NotReady: This is closed.
+            Exception: Whatever the job raises.
+        """
+        with self._changed:
+            now = not (self._closed or self._running or self._jobs) and self._complete(job)
+            if now:
+                self._running = True
+            else:
+                self._queue(job)
+        if now:
+            try:
+                self._work([job])
+                self._rest()
+            except BaseException as error:
+                self._lose([job], error)
+        return job.answer.result()
 
     def close(self) -> None:
         """End the thread when it has done what it does now; what waits fails as not ready."""
@@ -75,37 +104,55 @@ class NetworkWorker:
             if job.answer.set_running_or_notify_cancel():
                 job.answer.set_exception(NotReady(STOPPING))
 
-    def _submit(self, job: Job) -> "Future[Any]":
-        with self._changed:
-            if self._closed:
-                raise NotReady(STOPPING)
-            self._jobs.append(job)
-            self._changed.notify_all()
-        return job.answer
+    def _queue(self, job: Job) -> None:
+        if self._closed:
+            raise NotReady(STOPPING)
+        self._jobs.append(job)
+        self._changed.notify_all()
+
+    def _complete(self, job: Job) -> bool:
+        """Whether a job would not be joined by others if it waited."""
+        return job.detector is None or self._policy.choose([job.size]).complete
 
     def _main(self) -> None:
         jobs: Sequence[Job] = ()
         try:
             while jobs := self._take():
                 self._work(jobs)
+                self._rest()
         except BaseException as error:
-            # Also SystemExit: whatever ends this thread, its requests end and there is a new one.
-            logger.exception("the network's worker died; it is replaced")
-            for job in jobs:
-                if not job.answer.done():
-                    job.answer.set_exception(WorkerLost(LOST))
-            self._observer.worker_replaced(type(error).__name__)
+            self._lose(jobs, error)
             self.start()
+
+    def _lose(self, jobs: Sequence[Job], error: BaseException) -> None:
+        """Also SystemExit: whatever ends a thread, its requests end and there is a new one."""
+        logger.error("the network's worker died; it is replaced", exc_info=error)
+        for job in jobs:
+            if not job.answer.done():
+                job.answer.set_exception(WorkerLost(LOST))
+        self._observer.worker_replaced(type(error).__name__)
+        self._rest()
+
+    def _rest(self) -> None:
+        """Let the next jobs run."""
+        with self._changed:
+            self._running = False
+            if self._jobs:
+                self._changed.notify_all()
 
     def _take(self) -> Sequence[Job]:
         """Wait for the next jobs to run together; none: the worker is closed."""
         with self._changed:
             while not self._closed:
-                if self._jobs and (jobs := self._together()):
+                if self._running:
+                    self._changed.wait()
+                elif self._jobs and (jobs := self._together()):
                     taken = {id(job) for job in jobs}
                     self._jobs = [job for job in self._jobs if id(job) not in taken]
+                    self._running = True
                     return jobs
-                self._changed.wait(self._patience())
+                else:
+                    self._changed.wait(self._patience())
             return ()
 
     def _together(self) -> Sequence[Job]:
@@ -178,8 +225,9 @@ class NetworkWorker:
         start = time.perf_counter()
         logits = detector.run(joined)
         seconds = time.perf_counter() - start
-        ends = np.cumsum([len(batch.contact) for batch in batches])
-        parts = np.split(logits, ends[:-1])
+        parts = [logits]
+        if len(batches) > 1:
+            parts = np.split(logits, np.cumsum([len(batch.contact) for batch in batches])[:-1])
         for job, part in zip(jobs, parts, strict=True):
             self._observer.stage(job.call, "network", seconds)
             job.answer.set_result((part, seconds))

@@ -1,5 +1,6 @@
 """What the server tells of its work, to whoever counts, logs or traces it."""
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -49,7 +50,7 @@ STAGES = ("admission", "decode", "prepare", "wait", "network", "finish", "score"
 
 @contextmanager
 def observed(observer: Observer, call: Call) -> Iterator[None]:
-    """Tell of a call's start, and of its end however it comes."""
+    """Tell of a call's start, and of its end however it comes, once its answer is on its way."""
     observer.started(call)
     problem = None
     try:
@@ -61,4 +62,4 @@ def observed(observer: Observer, call: Call) -> Iterator[None]:
         problem = report(Cancelled("The caller cancelled the request."))
         raise
     finally:
-        observer.finished(call, problem)
+        asyncio.get_running_loop().call_soon(observer.finished, call, problem)

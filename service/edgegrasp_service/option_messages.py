@@ -1,8 +1,10 @@
 """Options messages as the plain values in which the same options are written in JSON."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
+from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
@@ -16,14 +18,22 @@ def refuse_unknown_fields(message: Message, name: str) -> None:
         numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
         fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
         raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
-    for field, value in message.ListFields():
-        if field.message_type is None:
-            continue
-        if field.is_repeated:
-            for row, part in enumerate(value):
-                refuse_unknown_fields(part, f"{name}.{field.name}.{row}")
-        else:
-            refuse_unknown_fields(value, f"{name}.{field.name}")
+    for part, is_repeated in _parts(message.DESCRIPTOR):
+        if is_repeated:
+            for row, each in enumerate(getattr(message, part)):
+                refuse_unknown_fields(each, f"{name}.{part}.{row}")
+        elif message.HasField(part):
+            refuse_unknown_fields(getattr(message, part), f"{name}.{part}")
+
+
+@cache
+def _parts(descriptor: Descriptor) -> list[tuple[str, bool]]:
+    """Fields that are messages, and whether there may be several; asking for bytes copies them."""
+    return [
+        (field.name, field.is_repeated)
+        for field in descriptor.fields
+        if field.message_type is not None
+    ]
 
 
 def options_from_message(message: grasp_pb2.DetectOptions) -> dict[str, object]:

@@ -149,7 +149,7 @@ class Server:
             self._service,
             self._settings.host,
             self._settings.grpc_port,
-            interceptors=[GrpcEdge(self._edge)],
+            interceptors=[GrpcEdge(self._edge, self._settings.max_body_bytes)],
             credentials=None if self._tls is None else self._tls.grpc,
             reloader=self.reloader,
         )

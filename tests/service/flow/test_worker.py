@@ -10,7 +10,7 @@ from edgegrasp_service.batching import BatchPolicy
 from edgegrasp_service.call import Call
 from edgegrasp_service.dummy import DummyBatch, DummyDetector
 from edgegrasp_service.errors import NotReady, WorkerLost
-from edgegrasp_service.network_worker import NetworkWorker
+from edgegrasp_service.network_worker import Job, NetworkWorker
 from edgegrasp_service.observer import Observer
 
 FAULTS = [
@@ -103,8 +103,8 @@ def test_a_thread_that_is_gone_is_replaced() -> None:
     call = Call("grpc", "DetectGrasps")
     for _ in range(3):
         with pytest.raises(WorkerLost):
-            worker.run(call, end).result(20)
-    logits, _ = worker.score(call, DummyDetector(), batch()).result(20)
+            worker.submit(Job(call, work=end)).result(20)
+    logits, _ = worker.submit(Job(call, DummyDetector(), batch())).result(20)
     assert logits.tolist() == [0.5, 0.25]
     assert told == ["Ends"] * 3
     worker.close()
@@ -121,13 +121,13 @@ def test_what_waits_when_the_worker_closes_hears_of_it() -> None:
     worker = NetworkWorker(BatchPolicy(), Observer())
     worker.start()
     call = Call("grpc", "DetectGrasps")
-    running = worker.run(call, hold)
-    waiting = worker.score(call, DummyDetector(), batch())
+    running = worker.submit(Job(call, work=hold))
+    waiting = worker.submit(Job(call, DummyDetector(), batch()))
     assert begun.wait(20)
     worker.close()
     with pytest.raises(NotReady):
         waiting.result(20)
     with pytest.raises(NotReady):
-        worker.run(call, hold)
+        worker.submit(Job(call, work=hold))
     release.set()
     assert running.result(20) == "done"
