@@ -1,6 +1,7 @@
 """The door: how many requests are in the server, how many wait, and who is refused at once."""
 
 import asyncio
+import contextlib
 import math
 import time
 from collections import deque
@@ -147,7 +148,8 @@ class Place:
         await self._admission.turn()
         self._had_turn = True
         self._work = work()
-        return await asyncio.wrap_future(self._work)
+        await _done(self._work)
+        return self._work.result()
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -166,6 +168,23 @@ class Place:
             loop = asyncio.get_running_loop()
             leave = partial(self._admission.leave, self._had_turn)
             self._work.add_done_callback(lambda work: loop.call_soon_threadsafe(leave))
+
+
+async def _done(work: Future[Any]) -> None:
+    """Wait for work; less than asyncio.wrap_future does, which would also try to cancel it."""
+    loop = asyncio.get_running_loop()
+    ended: asyncio.Future[None] = loop.create_future()
+
+    def tell() -> None:
+        if not ended.done():
+            ended.set_result(None)
+
+    def wake(work: Future[Any]) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+            loop.call_soon_threadsafe(tell)
+
+    work.add_done_callback(wake)
+    await ended
 
 
 def _whole_seconds(wait: float) -> int:

@@ -30,6 +30,8 @@ from edgegrasp_service.request_id import REQUEST_ID
 
 logger = logging.getLogger(__name__)
 
+LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
+
 SERVICE_NAME = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"].full_name
 
 
@@ -128,6 +130,8 @@ class GrpcServer:
             # What is compressed is unpacked before its length is known: none of it.
             ("grpc.compression_enabled_algorithms_bitset", 1),
             ("grpc.so_reuseport", 0),
+            # A cloud comes in one go, without waiting for leave to send the rest of it.
+            ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
             # A client that vanished without a word is found out, and its streams end.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),

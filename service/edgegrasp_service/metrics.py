@@ -2,6 +2,7 @@
 
 import contextlib
 import http
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
 import grpc
@@ -37,6 +38,8 @@ class Metrics(Observer):
         self.registry = CollectorRegistry()
         self._methods = frozenset(methods)
         ProcessCollector(registry=self.registry)
+        # Counted once a request is answered, or metrics are read: it takes tens of microseconds.
+        self._noted: deque[tuple[Callable[[float], None], float]] = deque()
         calls = ("transport", "method")
         self._requests = self._counter("requests", "requests answered", (*calls, "code"))
         self._seconds = self._histogram("request_seconds", "from headers to answer", SECONDS, calls)
@@ -55,6 +58,7 @@ class Metrics(Observer):
 
     def request(self, transport: str, method: str, code: str, seconds: float | None) -> None:
         """Count a request that is answered; a stream has no `seconds`."""
+        self._take_noted()
         method = method if method in self._methods else OTHER
         self._requests.labels(transport, method, code if code in _CODES else OTHER).inc()
         if seconds is not None:
@@ -62,7 +66,7 @@ class Metrics(Observer):
 
     def in_flight(self, change: int) -> None:
         """Count a request that came in, +1, or is answered, -1."""
-        self._in_flight.inc(change)
+        self._noted.append((self._in_flight.inc, change))
 
     def reloaded(self, succeeded: bool) -> None:
         """Count a reload."""
@@ -70,17 +74,16 @@ class Metrics(Observer):
 
     def stage(self, call: Call, name: str, seconds: float) -> None:
         """Take the duration of a stage."""
-        (self._stage.get(name) or self._stages.labels(OTHER)).observe(seconds)
+        stage = self._stage.get(name) or self._stages.labels(OTHER)
+        self._noted.append((stage.observe, seconds))
 
     def places(self, active: int, waiting: int) -> None:
         """Take the numbers of requests in work and in the queue."""
-        self._active.set(active)
-        self._waiting.set(waiting)
+        self._noted += (self._active.set, active), (self._waiting.set, waiting)
 
     def batched(self, requests: int, balls: int, points: int) -> None:
         """Take the size of a batch."""
-        self._batch_requests.observe(requests)
-        self._batch_balls.observe(balls)
+        self._noted += (self._batch_requests.observe, requests), (self._batch_balls.observe, balls)
 
     def answered(self, call: Call, answer: Detection | Scoring) -> None:
         """Take the size of an answer."""
@@ -94,6 +97,7 @@ class Metrics(Observer):
 
     def finished(self, call: Call, problem: ErrorReport | None) -> None:
         """Count a result of a stream; requests are counted at the transports' edge."""
+        self._take_noted()
         if call.method.endswith("Stream"):
             self._results.labels("OK" if problem is None else problem.code.name).inc()
 
@@ -111,8 +115,16 @@ class Metrics(Observer):
         Args:
             accept: The header of that name; OpenMetrics to whom asks for it.
         """
+        self._take_noted()
         encoder, content_type = choose_encoder(accept)
         return encoder(self.registry), content_type
+
+    def _take_noted(self) -> None:
+        """Count what was noted while requests were on their way."""
+        with contextlib.suppress(IndexError):
+            while True:
+                count, value = self._noted.popleft()
+                count(value)
 
     def _counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
         return Counter(f"edgegrasp_{name}", meaning, labels, registry=self.registry)

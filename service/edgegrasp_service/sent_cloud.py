@@ -110,4 +110,4 @@ def decode_cloud(
             value = "an array beside the one in the cloud"
             raise InvalidRequest(name, value, "Send it once.")
         arrays[name] = array.decode(name, max_points)
-    return replace(cloud, **arrays), options
+    return replace(cloud, **arrays) if arrays else cloud, options

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
 from typing import Any, NamedTuple
 
@@ -35,15 +36,16 @@ class Course:
     call: Call
     steps: Steps
     answer: "Future[Any]"
+    end: Callable[[], None] = lambda: None
 
     def next(self, result: Any = None, error: BaseException | None = None) -> Step | Job | None:
-        """What to do after a step's result or error; None: there is an answer, or an error."""
+        """What to do after a step's result or error; None: nothing, and `end` gives the answer."""
         try:
             return self.steps.send(result) if error is None else self.steps.throw(error)
         except StopIteration as end:
-            self.answer.set_result(end.value)
-        except BaseException as error:
-            self.answer.set_exception(error)
+            self.end = partial(self.answer.set_result, end.value)
+        except BaseException as raised:
+            self.end = partial(self.answer.set_exception, raised)
         return None
 
 
@@ -94,12 +96,12 @@ class StagePools:
         for pool in self._pools.values():
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _accompany(self, course: Course) -> None:
-        """Take a request through all steps in this thread; raises WorkerLost where it should end.
+    def _accompany(self, course: Course) -> bool:
+        """Take a request through all steps in this thread; False: the thread should end.
 
         It waits at a stage that others fill, as it would in that stage's pool.
         """
-        lost = None
+        healthy = True
         step = course.next()
         while step is not None:
             result = error = None
@@ -110,11 +112,10 @@ class StagePools:
                     result = self._stage(course.call, step)
             except BaseException as raised:
                 error = raised
-                lost = raised if isinstance(raised, WorkerLost) else None
+                healthy = not isinstance(raised, WorkerLost)
             del step  # it holds what the stage worked on
             step = course.next(result, error)
-        if lost is not None:
-            raise lost
+        return healthy
 
     def _go_on(
         self, course: Course, result: Any = None, error: BaseException | None = None
@@ -123,10 +124,10 @@ class StagePools:
 
         The event loop, which has others to wake for, hears of the answer only.
         """
-        if (step := course.next(result, error)) is not None:
-            self._submit(course.call, step).add_done_callback(
-                lambda last: self._ended(course, last)
-            )
+        if (step := course.next(result, error)) is None:
+            course.end()
+        else:
+            self._submit(course.call, step).add_done_callback(partial(self._ended, course))
 
     def _ended(self, course: Course, step: "Future[Any]") -> None:
         if step.cancelled():  # by pools that close
@@ -168,10 +169,10 @@ class Companion:
     """A thread that takes one request at a time; it is replaced where it dies.
 
     Args:
-        accompany: What it does with a request.
+        accompany: What it does with a request; False: this thread should end.
     """
 
-    def __init__(self, accompany: Callable[[Course], None]) -> None:
+    def __init__(self, accompany: Callable[[Course], bool]) -> None:
         self._accompany = accompany
         self._courses: SimpleQueue[Course | None] = SimpleQueue()
         self._idle = True
@@ -195,11 +196,11 @@ class Companion:
 
     def _main(self) -> None:
         while (course := self._courses.get()) is not None:
-            try:
-                self._accompany(course)
-            except WorkerLost:
+            healthy = self._accompany(course)
+            if not healthy:
                 self._start()
+            self._idle = True  # before there is an answer, as the next request may come right after
+            course.end()
+            del course
+            if not healthy:
                 return
-            finally:
-                del course
-                self._idle = True
