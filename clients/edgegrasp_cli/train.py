@@ -3,6 +3,7 @@
 import shlex
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -37,6 +38,14 @@ def train(
     teacher: Annotated[
         Path | None,
         Option(help="Weights of a hand network whose scores a network of balls learns from too."),
+    ] = None,
+    crop_radius: Annotated[
+        float | None,
+        Option(
+            min=0.01,
+            max=0.99,
+            help="Of the balls, metres, in place of the recipe's; 0.5: the paper's NoBall.",
+        ),
     ] = None,
     evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
     validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
@@ -74,6 +83,8 @@ def train(
         metadata = recipe(model)
         taught = run.parent / "taught"
         guide = None if teacher is None else Teacher(teacher, metadata.crop_radius, taught)
+        if crop_radius is not None:
+            metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
         trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
     except (ValueError, FileNotFoundError, InvalidCheckpoint) as error:
         sys.exit(f"edgegrasp train: {error}")

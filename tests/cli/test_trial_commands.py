@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from edgegrasp_cli.main import app
 from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_training.recipes import recipe
 
 
 def run(*arguments: object) -> str:
@@ -92,6 +94,14 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data: Path, tmp_
     summary = json.loads((result / "summary.json").read_text())
     with (result / "attempts.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == summary["attempts"]
+
+
+def test_balls_may_be_as_large_as_the_scene(data: Path, tmp_path: Path) -> None:
+    network = ("--model", "edgegrasp-small", "--crop-radius", 0.5)
+    amount = ("--steps", 1, "--views-per-step", 1, "--validation-share", 0.3)
+    run("train", data, "--run", tmp_path, *network, *amount)
+    _, metadata = load_checkpoint(tmp_path / "edgegrasp-small.safetensors")
+    assert metadata.network == replace(recipe("edgegrasp-small").network, crop_radius=0.5)
 
 
 def test_the_authors_checkpoint_becomes_one_file(shared_dir: Path, tmp_path: Path) -> None:
