@@ -54,6 +54,14 @@ EXPERIMENTS = {
         "edgegrasp experiment samples --rounds 100 --objects OBJECTS --output DIR",
         "The paper's table: 16, 32 or 64 approach points with 1,000, 2,000 or 4,000 candidates.",
     ),
+    "labels": (
+        "Labels",
+        "edgegrasp experiment labels --model runs/labels/NUMBER/edgegrasp-plus.safetensors "
+        "--rounds 100 --objects OBJECTS --output DIR",
+        "`edgegrasp-plus` trained alike on parts of the data, by `edgegrasp train DATA "
+        "--training-share SHARE --steps 1500 --schedule cosine --views-per-step 24 "
+        "--balls-per-view 4 --run runs/labels/NUMBER`.",
+    ),
     "robustness": (
         "Robustness",
         "edgegrasp experiment robustness --rounds 100 --objects OBJECTS --output DIR",

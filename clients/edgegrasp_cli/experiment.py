@@ -17,7 +17,7 @@ Option = typer.Option
 
 def experiment(
     name: Annotated[
-        str, typer.Argument(help="robustness, samples, families or baselines: what is varied.")
+        str, typer.Argument(help="robustness, samples, labels, families or baselines: what varies.")
     ],
     output: Annotated[
         Path, Option(help="Folder for its results. The same command again resumes.")

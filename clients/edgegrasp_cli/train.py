@@ -49,6 +49,9 @@ def train(
     ] = None,
     evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
     validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
+    training_share: Annotated[
+        float, Option(min=0.0, max=1.0, help="Share of the other scenes to learn from.")
+    ] = 1.0,
     seed: Annotated[int, Option(min=0, help="Seed of weights, split and batches.")] = 0,
     device: Annotated[str, Option(help="cpu or cuda.")] = "cpu",
     mixed_precision: Annotated[
@@ -65,7 +68,7 @@ def train(
     from edgegrasp_training.recipes import recipe
     from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer, TrainingOptions
-    from edgegrasp_training.views import find_views, split_by_scene
+    from edgegrasp_training.views import find_views, part_of, split_by_scene
 
     options = TrainingOptions(
         steps=steps,
@@ -80,6 +83,7 @@ def train(
     )
     try:
         training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
+        training_views = part_of(training_views, training_share, seed)
         metadata = recipe(model)
         taught = run.parent / "taught"
         guide = None if teacher is None else Teacher(teacher, metadata.crop_radius, taught)

@@ -81,6 +81,8 @@ def experiment_figure(results: dict[str, Any]) -> Figure:
             _draw(place, cases, name)
             place.set(xlabel=group, ylabel=f"{label} (%)", ylim=(0, 102))
             place.grid(alpha=0.25)
+            if group == "labels":
+                place.set_xscale("log")
             place.spines[["top", "right"]].set_visible(False)
     axes[0, 0].legend(fontsize=8, loc="best")
     return figure

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from edgegrasp_sim.families import DROPPED, FAMILIES, write_family
@@ -112,6 +113,29 @@ def samples(
     ]
 
 
+def labels(
+    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
+) -> list[Case]:
+    """Success against the labels that weights learned from: what the folder of each file says.
+
+    Raises:
+        ValueError: a model is no file in a folder that is named by a number.
+    """
+    del folder
+    numbers = {model: PurePath(model).parent.name for model in models}
+    for model, number in numbers.items():
+        if not number.isdecimal():
+            raise ValueError(
+                f"model is {model!r}; name files in folders named by their number of labels, "
+                "such as runs/3000/edgegrasp-plus.safetensors"
+            )
+    return [
+        Case("labels", float(number), scene, protocol, {"model": model})
+        for scene in scenes
+        for model, number in numbers.items()
+    ]
+
+
 def families(
     protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
 ) -> list[Case]:
@@ -146,6 +170,7 @@ def baselines(
 EXPERIMENTS: dict[str, Plan] = {
     "robustness": robustness,
     "samples": samples,
+    "labels": labels,
     "families": families,
     "baselines": baselines,
 }

@@ -114,3 +114,20 @@ def split_by_scene(
         [path for path in paths if place[scene_of(path)] >= limit],
         [path for path in paths if place[scene_of(path)] < limit],
     )
+
+
+def part_of(paths: list[Path], share: float, seed: int) -> list[Path]:
+    """The views of a share of the scenes; a larger share has those of a smaller one too.
+
+    Args:
+        paths: View files.
+        share: Of the scenes, about; 1: all.
+        seed: Which ones.
+
+    Raises:
+        ValueError: No view is left.
+    """
+    part = [p for p in paths if zlib.crc32(f"part {seed} {scene_of(p)}".encode()) < share * 2**32]
+    if not part:
+        raise ValueError(f"training_share: {share:g} of {len(paths)} views leaves none. Use more.")
+    return part

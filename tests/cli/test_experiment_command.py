@@ -43,7 +43,7 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("guess",), "robustness, samples, families, baselines"),
+        (("guess",), "robustness, samples, labels, families, baselines"),
         (("samples", "--scene", "shelf"), "shelf"),
         (("samples", "--model", "none.safetensors"), "no such file"),
         (

@@ -23,7 +23,8 @@ PAPER = load_protocol("edgegrasp")
 
 
 def cases(name: str, folder: Path) -> list[Case]:
-    return EXPERIMENTS[name](PAPER, list(SceneKind), ["edgegrasp-plus"], folder)
+    model = "runs/3000/edgegrasp-plus.safetensors" if name == "labels" else "edgegrasp-plus"
+    return EXPERIMENTS[name](PAPER, list(SceneKind), [model], folder)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -64,6 +65,18 @@ def test_samples_are_those_of_the_paper_s_table(tmp_path: Path) -> None:
         for case in cases("samples", tmp_path)
     }
     assert numbers == {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
+
+
+def test_labels_are_what_the_folders_say(tmp_path: Path) -> None:
+    models = ["runs/900/plus.safetensors", "runs/3000/plus.safetensors"]
+    found = EXPERIMENTS["labels"](PAPER, [SceneKind.PILE], models, tmp_path)
+    assert [(case.value, case.planner) for case in found] == [
+        (900.0, {"model": models[0]}),
+        (3000.0, {"model": models[1]}),
+    ]
+    for model in ("edgegrasp-plus", "runs/new/plus.safetensors"):
+        with pytest.raises(ValueError, match=rf"{model}.*runs/3000/"):
+            EXPERIMENTS["labels"](PAPER, [SceneKind.PILE], [model], tmp_path)
 
 
 def test_families_are_what_they_are_called(tmp_path: Path) -> None:
