@@ -64,7 +64,7 @@ async def test_one_request_does_not_spoil_its_batch(
     serve, connect, is_error, cloud, fault, kind
 ) -> None:
     """The pass of both fails, then the first one alone; the second one alone is fine."""
-    running = await serve(batching=True)
+    running = await serve(batching=True, max_batch_wait_microseconds=200_000)
     client = connect(running)
     running.stages.shut("run")
     asked = [asyncio.create_task(client.detect(cloud))]
