@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -68,7 +69,7 @@ class StagePools:
         self._observer = observer
         self._closed = False
         at_a_time = {"decode": threads, "prepare": threads, "finish": 1}
-        self._room = {stage: threading.Semaphore(many) for stage, many in at_a_time.items()}
+        self._room = {stage: Room(many) for stage, many in at_a_time.items()}
         self._pools = {
             stage: ThreadPoolExecutor(many, thread_name_prefix=stage)
             for stage, many in at_a_time.items()
@@ -163,6 +164,35 @@ class StagePools:
                 raise WorkerLost(LOST) from None
             finally:
                 self._observer.stage(call, step.stage, time.perf_counter() - start)
+
+
+class Room:
+    """A context for so many threads at a time, first come, first served.
+
+    A semaphore's thread that leaves and comes again would overtake those that wait, for ever.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._free = threads
+        self._turns: deque[threading.Lock] = deque()
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._free:
+                self._free -= 1
+                return
+            turn = threading.Lock()
+            turn.acquire()
+            self._turns.append(turn)
+        turn.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            if self._turns:
+                self._turns.popleft().release()  # `_free` stays: one leaves, one comes
+            else:
+                self._free += 1
 
 
 class Companion:

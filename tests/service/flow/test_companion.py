@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 from collections.abc import AsyncIterator
 
 import numpy as np
@@ -17,6 +18,7 @@ from edgegrasp_service.network_worker import Job, NetworkWorker
 from edgegrasp_service.observer import Observer
 from edgegrasp_service.sent_cloud import PackedCloud, SentCloud
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.stage_pools import Room
 
 CALL = Call("grpc", "DetectGrasps")
 
@@ -98,6 +100,24 @@ async def test_stages_are_bounded_for_companion_and_pools_together(serve, connec
     assert running.stages.begun["prepare"] == 1
     running.stages.open("prepare")
     assert all(answer.fine for answer in await asyncio.gather(*asked))
+
+
+def test_who_comes_again_waits_behind_who_waited() -> None:
+    room, order = Room(1), []
+
+    def wait() -> None:
+        with room:
+            order.append("waited")
+
+    with room:
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        while not room._turns:
+            time.sleep(0.001)
+    with room:
+        order.append("came again")
+    waiting.join(20)
+    assert order == ["waited", "came again"]
 
 
 def batch() -> DummyBatch:
