@@ -4,14 +4,11 @@
 by the clock and of processors; KIND is "network", or the milliseconds of a dummy.
 """
 
-import json
-import os
-import subprocess
 import sys
 import time
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
+from benchmarks.apart import measure_when_asked
 from benchmarks.senders import cloud
 
 from edgegrasp_service.allocator import keep_freed_memory
@@ -40,43 +37,6 @@ class InProcess:
         return time.perf_counter() - start, time.process_time() - cpu
 
 
-class Apart:
-    """The same in a process that idles between the calls, as a server's does."""
-
-    def __init__(self, kind: str) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.in_process", kind],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )
-        assert self._process.stdout is not None
-        self._process.stdout.readline()
-
-    def seconds(self) -> tuple[float, float]:
-        """As InProcess tells it, measured there."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
-        wall, cpu = json.loads(self._process.stdout.readline())
-        return wall, cpu
-
-    def __enter__(self) -> Self:
-        """Itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """End the process."""
-        self._process.communicate(timeout=30)
-
-
 def _detector(kind: str) -> Any:
     """The dummy network of a service time, or the default weights on one thread."""
     if kind != "network":
@@ -93,7 +53,4 @@ def _detector(kind: str) -> Any:
 
 if __name__ == "__main__":
     keep_freed_memory()  # as the server does
-    measured = InProcess(sys.argv[1])
-    print("ready", flush=True)
-    for _ in sys.stdin:
-        print(json.dumps(measured.seconds()), flush=True)
+    measure_when_asked(InProcess(sys.argv[1]).seconds)

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.in_process import OPTIONS, POINTS, Apart, InProcess
+from benchmarks.apart import Apart
+from benchmarks.in_process import OPTIONS, POINTS, InProcess
 from benchmarks.load_client import Sample, Task
 from benchmarks.load_picture import draw
-from benchmarks.senders import cloud, sender
 from benchmarks.served import Served, served
 
 ROOT = Path(__file__).parents[1]
@@ -99,32 +99,27 @@ def beyond(server: Served, kind: str, pairs: int) -> dict[str, Any]:
     """Milliseconds that an answer over a transport takes beyond the detector.
 
     That is called here, where it finds its code and data still in the processor's cache, and in a
-    process of its own, which has idled as long as the server. The three take turns, so that what
-    else the machine does is in all of them.
+    process of its own, which has idled as long as the server; the client has one of its own too.
+    They take turns, so that what else the machine does is in all of them.
     """
-    points = cloud(POINTS, seed=0)
     found: dict[str, Any] = {}
     here = InProcess(kind)
-    with Apart(kind) as apart:
+    with Apart("benchmarks.in_process", kind) as apart:
         for transport in TRANSPORTS:
             alone: list[float] = []
             alone_cpu: list[float] = []
             idled: list[float] = []
             answers: list[float] = []
-            with sender(transport, server.address(transport), points, OPTIONS) as one:
+            with Apart("benchmarks.one_client", transport, server.address(transport)) as client:
                 for _ in range(5):
-                    one.send(None)
+                    client.seconds()
                     here.seconds()
                     apart.seconds()
                 served_cpu = server.cpu_seconds()
                 for _ in range(pairs):
                     for times, value in zip((alone, alone_cpu), here.seconds(), strict=True):
                         times.append(value)
-                    start = time.perf_counter()
-                    told = one.send(None)
-                    answers.append(time.perf_counter() - start)
-                    if told.code != "OK":
-                        raise RuntimeError(f"{transport}: {told.code}")
+                    answers.append(client.seconds()[0])
                     idled.append(apart.seconds()[0])
             served_cpu = (server.cpu_seconds() - served_cpu) / pairs
             found[transport] = {

@@ -47,6 +47,15 @@ def test_overhead_while_the_machine_does_little_else(module) -> None:
     assert load.quietest_blocks(alone[:5], answers[:5]) is None
 
 
+def test_a_process_apart_measures_when_asked_and_says_when_it_ended(module) -> None:
+    with module("apart").Apart("benchmarks.in_process", "0") as apart:
+        wall, processors = apart.seconds()
+        assert 0.0 < processors < 10.0
+        assert wall > 0.0
+    with pytest.raises(RuntimeError, match="nothing_of_the_kind"):
+        module("apart").Apart("benchmarks.nothing_of_the_kind")
+
+
 def test_percentiles_of_nothing(module) -> None:
     assert module("load").percentiles([]) is None
 
