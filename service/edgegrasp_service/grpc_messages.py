@@ -104,13 +104,14 @@ def detection_message(detection: Detection) -> grasp_pb2.DetectGraspsResponse:
 
 def scoring_message(scoring: Scoring) -> grasp_pb2.ScoreGraspsResponse:
     """Evaluations as a message."""
+    scored = [each.grasp for each in scoring.evaluations if each.grasp is not None]
+    grasps = iter(_grasp_messages(scored))
     return grasp_pb2.ScoreGraspsResponse(
         evaluations=[
             grasp_pb2.Evaluation(
-                grasp=None if evaluation.grasp is None else _grasp_messages([evaluation.grasp])[0],
-                reason=evaluation.reason,
+                grasp=None if each.grasp is None else next(grasps), reason=each.reason
             )
-            for evaluation in scoring.evaluations
+            for each in scoring.evaluations
         ],
         counts=scoring.counts,
         seconds=scoring.seconds,
