@@ -1,16 +1,16 @@
 """Between protobuf messages and the core's requests and answers."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_model.results import DebugInfo, Detection, Scoring
 from edgegrasp_service.core import DetectRequest, ModelInfo, ScoreRequest
 from edgegrasp_service.errors import ErrorReport
 from edgegrasp_service.given_grasps import GivenGrasps
+from edgegrasp_service.grasp_wire import grasp_messages
 from edgegrasp_service.option_messages import (
     options_from_message,
     plain_fields,
@@ -19,9 +19,6 @@ from edgegrasp_service.option_messages import (
 from edgegrasp_service.sent_arrays import PER_POINT, PackedArray
 from edgegrasp_service.sent_cloud import DepthCloud, FileCloud, PackedCloud, RosCloud, SentCloud
 
-_GRASP_ARRAYS = (
-    "T_cloud_hand", "T_cloud_tcp", "approach_point", "contact_point", "approach_direction"
-)  # fmt: skip
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
 
 
@@ -93,7 +90,7 @@ def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, object]:
 def detection_message(detection: Detection) -> grasp_pb2.DetectGraspsResponse:
     """A detection as a message."""
     return grasp_pb2.DetectGraspsResponse(
-        grasps=_grasp_messages(detection.grasps),
+        grasps=grasp_messages(detection.grasps),
         counts=detection.counts,
         seconds=detection.seconds,
         model=detection.model,
@@ -105,7 +102,7 @@ def detection_message(detection: Detection) -> grasp_pb2.DetectGraspsResponse:
 def scoring_message(scoring: Scoring) -> grasp_pb2.ScoreGraspsResponse:
     """Evaluations as a message."""
     scored = [each.grasp for each in scoring.evaluations if each.grasp is not None]
-    grasps = iter(_grasp_messages(scored))
+    grasps = iter(grasp_messages(scored))
     return grasp_pb2.ScoreGraspsResponse(
         evaluations=[
             grasp_pb2.Evaluation(
@@ -155,26 +152,6 @@ def stream_response(
         code=answer.code.value[0], message=answer.detail, detail=error_message(answer)
     )
     return grasp_pb2.DetectGraspsStreamResponse(request_id=request_id, error=error)
-
-
-def _grasp_messages(grasps: Sequence[Grasp]) -> list[grasp_pb2.Grasp]:
-    """Grasps as messages; their arrays become lists together, one by one it takes ten times."""
-    if not grasps:
-        return []
-    arrays = [
-        np.array([getattr(grasp, name) for grasp in grasps]).reshape(len(grasps), -1).tolist()
-        for name in _GRASP_ARRAYS
-    ]
-    return [
-        grasp_pb2.Grasp(
-            score=grasp.score,
-            width=grasp.width,
-            collision_free=bool(grasp.collision_free),
-            clearance=grasp.clearance,
-            **dict(zip(_GRASP_ARRAYS, of_grasp, strict=True)),
-        )
-        for grasp, of_grasp in zip(grasps, zip(*arrays, strict=True), strict=True)
-    ]
 
 
 def _debug_message(debug: DebugInfo) -> grasp_pb2.DebugInfo:
