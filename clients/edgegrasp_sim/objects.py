@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import pybullet_data
 
@@ -41,9 +42,10 @@ class ObjectModel:
 
     @property
     def files(self) -> list[Path]:
-        """Its description and the meshes beside it, sorted by name."""
-        found = sorted(self.urdf.parent.glob(f"{self.urdf.stem}*"))
-        return [path for path in found if path.is_file()]
+        """Its description and the meshes that it names, sorted by name."""
+        meshes = ElementTree.parse(self.urdf).iter("mesh")
+        named = {self.urdf.parent / mesh.get("filename", "") for mesh in meshes}
+        return sorted({self.urdf} | {path for path in named if path.is_file()})
 
     @property
     def digest(self) -> str:

@@ -16,7 +16,6 @@ from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_training.hollow_shapes import write_hollow_shapes
 from edgegrasp_training.labelling import SURE, Choice, Question, detector, label
 from edgegrasp_training.varied_objects import varied_objects
 from edgegrasp_training.views import LabelledView
@@ -25,7 +24,7 @@ SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2
 APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects: shapes of every sort
-VARIED_SHARE = 0.7  # of the scenes of an object folder, made of stretched and hollow objects
+VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and made objects
 WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
 HARD_SHARE = 0.8  # of the scenes, in which a network's surest grasp is looked for that fails
 HARD_LOOKS = 3  # scenes that are looked through for it
@@ -124,7 +123,7 @@ def _drawn_objects(
     plain = ObjectSet.from_folder(objects, source, "train")
     if rng.random() >= VARIED_SHARE:
         return plain
-    return varied_objects(plain, write_hollow_shapes(folder / "hollow"), folder, rng)
+    return varied_objects(plain, folder, rng)
 
 
 def _make_scene(

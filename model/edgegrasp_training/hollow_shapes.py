@@ -1,12 +1,7 @@
 """Rings, tubes, bowls and cups: hollow things, which object sets hold few of."""
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
-
-from edgegrasp_sim.made_objects import write_object
-from edgegrasp_sim.objects import ObjectModel
 
 SEGMENTS = 24  # around the axis
 AXIS = 1e-4  # metres; profiles keep off the axis, where triangles would have no area
@@ -79,15 +74,3 @@ def revolved(profile: Profile) -> str:
             a, b, c, d = this + k, this + beside, following + beside, following + k
             lines += [f"f {a + 1} {b + 1} {c + 1}", f"f {a + 1} {c + 1} {d + 1}"]
     return "\n".join(lines) + "\n"
-
-
-def write_hollow_shapes(folder: Path) -> tuple[ObjectModel, ...]:
-    """Write every shape into a folder and describe it; the engine takes its convex hull.
-
-    Args:
-        folder: Made if need be.
-    """
-    return tuple(
-        ObjectModel(name, write_object(name, revolved(profile), folder))
-        for name, profile in SHAPES.items()
-    )

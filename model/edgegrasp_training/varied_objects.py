@@ -1,4 +1,4 @@
-"""More shapes from the same training objects: stretched along their axes, and hollow ones added."""
+"""More shapes from the same training objects: stretched along their axes, made ones among them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,21 +7,19 @@ from xml.etree import ElementTree
 import numpy as np
 
 from edgegrasp_sim.objects import ObjectModel, ObjectSet
+from edgegrasp_training.made_shapes import any_made_object
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
-HOLLOW_SHARE = 0.2  # of the objects that a scene is drawn from
+MADE_SHARE = 0.6  # of the objects that a scene is drawn from
 DRAWN = 16  # objects that a scene is drawn from
 
 
-def varied_objects(
-    objects: ObjectSet, hollow: tuple[ObjectModel, ...], folder: Path, rng: np.random.Generator
-) -> ObjectSet:
-    """Some objects of a set and some hollow ones, each stretched at random.
+def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
+    """Some objects of a set and some made ones, each stretched at random.
 
     Args:
         objects: To draw from.
-        hollow: To draw `HOLLOW_SHARE` of the objects from.
-        folder: Gets the descriptions; the meshes stay where they are.
+        folder: Gets descriptions and made objects; the meshes of others stay where they are.
         rng: Draws objects and factors.
 
     Returns:
@@ -29,8 +27,8 @@ def varied_objects(
     """
     drawn: dict[str, ObjectModel] = {}
     for _ in range(DRAWN):
-        source = hollow if rng.random() < HOLLOW_SHARE else objects.models
-        model = source[int(rng.integers(len(source)))]
+        made = rng.random() < MADE_SHARE
+        model = any_made_object(folder / "made", rng) if made else objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
         drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
     return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))

@@ -52,4 +52,4 @@ def test_a_grasp_of_zeros_is_an_empty_message() -> None:
     zeros = Grasp(0.0, pose, pose, 0.0, nothing, nothing, nothing, False, 0.0)
     (message,) = grasp_messages([zeros])
     assert message == _by_field(zeros)
-    assert not message.collision_free and message.score == 0.0
+    assert not message.collision_free
