@@ -7,7 +7,7 @@ it does of scanned objects: many have hollows that can be seen but not entered.
 import numpy as np
 from numpy.typing import NDArray
 
-NUM_DRAWN = 240  # different ones, before a scene stretches them
+NUM_DRAWN = 320  # different ones, before a scene stretches them
 ROUND = 20  # corners of a round ring
 LONGEST = 0.045, 0.12  # metres, the range of the greatest extent
 THINNEST = 0.009  # metres, least extent
@@ -129,23 +129,41 @@ def _plate(rng: np.random.Generator) -> list[Rings]:
 
 
 def _bow(rng: np.random.Generator) -> list[Rings]:
-    """A bent rod: bananas, horseshoes, open rings, handles."""
+    """A bent rod: bananas, horseshoes, handles."""
     turn = np.linspace(0.0, rng.uniform(np.pi / 3, 1.8 * np.pi), 16)
-    thick = rng.uniform(0.12, 0.45) * (1.0 - rng.uniform(0.0, 0.7) * np.abs(turn / turn[-1] - 0.5))
-    flat = rng.uniform(0.5, 1.6)
-    ring = _ring(int(rng.choice([4, 8, 12])))
-    out, up = ring[:, 0], flat * ring[:, 1]
-    radius = 1.0 + thick[:, None] * out
-    return [
-        np.stack(
-            [
-                radius * np.cos(turn)[:, None],
-                radius * np.sin(turn)[:, None],
-                thick[:, None] * up,
-            ],
-            axis=2,
-        )
-    ]
+    taper = 1.0 - rng.uniform(0.0, 0.7) * np.abs(turn / turn[-1] - 0.5)
+    ring = _ring(int(rng.choice([4, 8, 12]))) * (1.0, rng.uniform(0.5, 1.6), 1.0)
+    return [_bent(ring, turn, rng.uniform(0.12, 0.45) * taper)]
 
 
-_KINDS = (_bodies, _bottle, _bodies, _plate, _bodies, _bow)
+def _hoop(rng: np.random.Generator) -> list[Rings]:
+    """A bent rod that closes: rings, tapes, nuts, sleeves."""
+    corners = int(rng.choice([4, 8, 12]))
+    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    thick = rng.uniform(0.08, 0.48)
+    height = np.exp(rng.uniform(np.log(0.4), np.log(4.0)))
+    turn = np.linspace(0.0, 2.0 * np.pi, int(rng.choice([7, 9, 25, 25, 25])))
+    return [_bent(ring * (1.0, height, 1.0), turn, np.full(len(turn), thick))]
+
+
+def _pot(rng: np.random.Generator) -> list[Rings]:
+    """Outside up, inside down again: cups, bowls, boxes without a lid."""
+    corners = int(rng.choice([4, 6, ROUND, ROUND]))
+    bottom, wall, floor = rng.uniform(0.5, 1.1), rng.uniform(0.06, 0.3), rng.uniform(0.08, 0.5)
+    ring = _ring(corners) * (1.0, rng.uniform(0.5, 1.0), 1.0)
+    height = rng.uniform(0.5, 2.5)
+    inside = 1.0 - wall, max(bottom - wall, 0.1)
+    heights = [0.0, height, height, floor * height]
+    return [_straight(ring, [bottom, 1.0, *inside], heights)]
+
+
+def _bent(
+    ring: NDArray[np.float64], turn: NDArray[np.float64], thick: NDArray[np.float64]
+) -> Rings:
+    """A ring, so thick, led about the z axis at a distance of one unit."""
+    radius = 1.0 + thick[:, None] * ring[:, 0]
+    across = np.cos(turn)[:, None] * radius, np.sin(turn)[:, None] * radius
+    return np.stack([*across, thick[:, None] * ring[:, 1]], axis=2)
+
+
+_KINDS = (_bodies, _hoop, _bottle, _plate, _bodies, _pot, _bow, _hoop)
