@@ -75,8 +75,7 @@ EXPERIMENTS = {
         "Objects of other families",
         "edgegrasp experiment families --rounds 100 --output DIR",
         "Prisms: regular (30 to 80 mm), thin (at most 14 mm across), flat (8 to 14 mm high) and "
-        "large (60 to 70 mm across, in a hand that opens 80 mm). Sticks are not dropped on heaps: "
-        "the engine lets them through the table.",
+        "large (60 to 70 mm across, in a hand that opens 80 mm).",
     ),
 }
 # Methods whose published figures stand beside an experiment's.

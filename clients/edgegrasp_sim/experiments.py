@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from edgegrasp_sim.families import DROPPED, FAMILIES, write_family
+from edgegrasp_sim.families import FAMILIES, write_family
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 
@@ -147,7 +147,7 @@ def families(
         Case("family", name, scene, changed, {"model": model}, folders[name])
         for scene in scenes
         for model in models
-        for name in (FAMILIES if scene is SceneKind.PACKED else DROPPED)
+        for name in FAMILIES
     ]
 
 

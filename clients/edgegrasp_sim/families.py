@@ -94,9 +94,6 @@ FAMILIES: dict[str, tuple[Prism, ...]] = {
         _can(0.07, 0.08),
     ),
 }
-# Families that can be dropped on a heap; a falling stick goes through the table at 80 steps a
-# second.
-DROPPED = ("regular", "flat", "large")
 
 
 def write_family(name: str, folder: Path) -> Path:

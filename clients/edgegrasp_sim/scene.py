@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
-TABLE_EXTENT = (1.2, 1.2, 0.012)  # metres
+TABLE_EXTENT = (1.2, 1.2, 0.2)  # metres; what is dropped or pressed sinks through a thin one
 TABLE_FRICTION = 0.5
 OBJECT_MASS = 0.5  # kg
 OBJECT_FRICTION = 1.0

@@ -100,7 +100,7 @@ def test_the_manifest_holds_what_decides_the_figures() -> None:
     facts = json.loads(json.dumps(manifest(config, {"name": "top-down"})))
     run = facts["run"]
     assert run["protocol"]["camera"]["polar_degrees"] == [45.0, 60.0]
-    assert run["protocol"]["version"] == 1
+    assert run["protocol"]["version"] == 2
     assert run["constants"]["solver_iterations"] == 100
     assert len(run["objects"]["digest"]) == 64
     assert facts["versions"]["pybullet"]

@@ -66,7 +66,7 @@ def test_the_side_view_is_where_giga_has_it() -> None:
         ("views = 1", "views = 1\nzoom = 2", "camera has unknown zoom"),
         ('table = "known"', 'table = "guess"', "table is 'guess'; choose one of known, ransac"),
         ("workspace_size = 0.30", "workspace_size = 0.5", "workspace_size is 0.5"),
-        ("version = 1", "version = ", "protocol .*toml"),
+        ("version = 2", "version = ", "protocol .*toml"),
     ],
 )
 def test_a_wrong_file_is_told(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -8,14 +8,17 @@ import pybullet_data
 import pytest
 
 from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.families import write_family
 from edgegrasp_sim.grasping import GraspOutcome, retreat_pose
 from edgegrasp_sim.gripper import FINGERTIP
-from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
 from edgegrasp_sim.simulation import (
     WORKSPACE,
     ClutterSimulation,
     ObjectPlacement,
 )
+from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,6 +52,25 @@ def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
     assert not result.start_contact
     assert result.held is not None
     assert result.held.model.name == "cube_small"
+
+
+def test_what_is_pressed_into_the_table_comes_out_on_top() -> None:
+    with World() as world:
+        add_table(world)
+        cube = load_object(world, ObjectModel("cube", CUBE), (0.15, 0.15, 0.035), UPRIGHT, 1.0)
+        for _ in range(400):
+            world.step()
+        assert cube.body.position[2] == pytest.approx(TABLE_HEIGHT + 0.025, abs=0.002)
+
+
+def test_thin_things_that_are_dropped_stay_on_the_table(tmp_path: Path) -> None:
+    sticks = ObjectSet.from_folder(write_family("thin", tmp_path / "thin"), SceneKind.PILE)
+    left = 0
+    with ClutterSimulation({SceneKind.PILE: sticks}) as simulation:
+        for seed in range(4):
+            simulation.reset(SceneKind.PILE, np.random.default_rng(seed), 5)
+            left += simulation.num_objects
+    assert left >= 12  # of 20; some roll away
 
 
 def test_grasp_in_the_air_holds_nothing(simulation: ClutterSimulation) -> None:
