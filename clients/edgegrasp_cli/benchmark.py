@@ -58,6 +58,9 @@ def benchmark(
         int | None, Option(help="Candidates scored at most; else the protocol's.")
     ] = None,
     collision: Annotated[str, Option(help="avoid, penalise or ignore.")] = "penalise",
+    min_score: Annotated[
+        float, Option(min=0.0, max=1.0, help="Least score of a grasp; below it, another view.")
+    ] = 0.0,
     workers: Annotated[
         int | None, Option(help="Processes that simulate; else one for each core. Same results.")
     ] = None,
@@ -100,6 +103,7 @@ def benchmark(
         collision,
         num_approach_points,
         num_candidates,
+        min_score,
     )
     try:
         rules = load_protocol(protocol)

@@ -28,6 +28,7 @@ class PlannerChoice:
         collision: `avoid`, `penalise` or `ignore`.
         num_approach_points: None: the protocol's.
         num_candidates: None: the protocol's.
+        min_score: of a grasp that is executed; without one there is another view.
         voxel_size: metres, in place of the weights' own; `in-process` only.
         flipped_normals: share of the normals turned around at random; `in-process` only.
     """
@@ -40,6 +41,7 @@ class PlannerChoice:
     collision: str = "penalise"
     num_approach_points: int | None = None
     num_candidates: int | None = None
+    min_score: float = 0.0
     voxel_size: float | None = None
     flipped_normals: float = 0.0
 
@@ -50,6 +52,11 @@ class PlannerChoice:
             "num_candidates": self.num_candidates,
         }
         return {name: value for name, value in given.items() if value is not None}
+
+    def options(self) -> dict[str, Any]:
+        """Of each request for grasps."""
+        least = {"min_score": self.min_score} if self.min_score > 0.0 else {}
+        return {"collision": self.collision, **self.overrides(), **least}
 
     def named_weights(self) -> tuple[tuple[Path, ...], str]:
         """The weights to load, and the name to ask for.
@@ -118,7 +125,7 @@ def _in_process(choice: PlannerChoice, rules: PlanningRules) -> MadePlanner:
 
     weights, model = choice.named_weights()
     used = _metadata(weights, model)
-    options = {"collision": choice.collision, **choice.overrides()}
+    options = choice.options()
     changes: dict[str, Any] = {}
     if choice.voxel_size is not None:
         changes["voxel_size"] = choice.voxel_size
@@ -190,7 +197,7 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[MadePlanner
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.named_weights()
-    options = {"collision": choice.collision, **choice.overrides()}
+    options = choice.options()
     flags = [text for path in weights for text in ("--weights", str(path))]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
