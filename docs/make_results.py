@@ -97,9 +97,10 @@ BENCHMARK = (
 AUTHORS_PARAMETERS = {"edgegrasp": 3_048_993, "vn-edgegrasp": 1_702_268}
 NOT_YET = "Not measured yet."
 DIFFERENCES = """\
-- `edgegrasp` at 32-2k: the paper's figures lie within its intervals. At 64-4k, in 40 rounds, too.
-- `vn-edgegrasp` is 4 points of GSR below the paper in packed scenes, and with it in piles. It saw
-  11,200 balls in half an hour of one processor core.
+- `edgegrasp` at 32-2k: the paper's figures lie within its intervals. At 64-4k, in 40
+  rounds of version 1, too.
+- `vn-edgegrasp` is 3 to 4 points of GSR below the paper, and some 2 points of DR below it or 1 above.
+  It saw 11,200 balls in half an hour of one processor core.
 - Random rotations: the paper's network needs them. Here they hold training back: detectors turn
   every cloud upright and toward its camera before a network sees it, so that few rotations are
   left to be learned.
