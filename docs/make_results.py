@@ -42,7 +42,8 @@ papers give them, mean ± standard deviation over seeds where they say so.
 Protocols are in version 2, unless version 1 is named. Until then the simulator's table was 12 mm
 thick: of 1,000 objects dropped on heaps 100 were gone before the first view, where 43 are now, and
 others stuck in it, where no hand could lift them. Now it is 200 mm thick. The grasps that the
-reference simulator judged come out as before ([benchmark.md](benchmark.md#how-hard-the-simulator-is)).
+reference simulator judged come out as before
+([benchmark.md](benchmark.md#how-hard-the-simulator-is)).
 
 This page is written by `python docs/make_results.py RESULTS_DIR` from the folders that the
 commands below leave; what it keeps of them is in `docs/results/`.
@@ -99,8 +100,8 @@ NOT_YET = "Not measured yet."
 DIFFERENCES = """\
 - `edgegrasp` at 32-2k: the paper's figures lie within its intervals. At 64-4k, in 40
   rounds of version 1, too.
-- `vn-edgegrasp` is 3 to 4 points of GSR below the paper, and some 2 points of DR below it or 1 above.
-  It saw 11,200 balls in half an hour of one processor core.
+- `vn-edgegrasp` is 3 to 4 points of GSR below the paper, in DR 2 below it (packed) and 1 above it
+  (piles). It saw 11,200 balls in half an hour of one processor core.
 - Random rotations: the paper's network needs them. Here they hold training back: detectors turn
   every cloud upright and toward its camera before a network sees it, so that few rotations are
   left to be learned.
