@@ -94,7 +94,7 @@ def test_a_result_below_the_gate_fails(oracle: Path, tmp_path: Path) -> None:
 
 
 def test_the_report_shows_tables_plots_pictures_and_a_film(tmp_path: Path, oracle: Path) -> None:
-    benchmark(tmp_path, "edge-sample", "--report", rounds=1)
+    benchmark(tmp_path, "edge-sample", "--report", rounds=2)
     page = (tmp_path / "report.html").read_text()
     failed = sum(bool(row["cause"]) for row in attempts(tmp_path))
     assert page.count("data:image/png") >= 3  # plots

@@ -37,7 +37,7 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(
     assert done.stat().st_mtime_ns == before
     assert second["cases"][0] == first["cases"][0]
     assert [case["value"] for case in second["cases"]] == ["edge-sample", TOP_DOWN]
-    assert second["cases"][0]["protocol"] == {"name": "edgegrasp", "version": 1}
+    assert second["cases"][0]["protocol"] == {"name": "edgegrasp", "version": 2}
 
 
 @pytest.mark.parametrize(
