@@ -35,7 +35,8 @@ from edgegrasp_model.network_config import (
     NetworkConfig,
 )
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.recipes import recipe
 
 RESULTS = Path(__file__).parent / "results"

@@ -24,6 +24,7 @@ class SupportPlane(TypedDict):
     kind: NotRequired[Literal["plane"]]
     normal: Vector  # unit, away from the table
     offset: float  # metres
+    max_depth_error: NotRequired[float]  # share of the depths that what is seen of it may correct
 
 
 class RansacPlane(TypedDict):

@@ -8,19 +8,20 @@ from __future__ import annotations
 import tomllib
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from edgegrasp_sim import scene
 from edgegrasp_sim.camera import ViewRange
 from edgegrasp_sim.noise import DepthNoise
+from edgegrasp_sim.observation import TableView
 
 if TYPE_CHECKING:
     from edgegrasp_sim.objects import SceneKind
 
 FOLDER = Path(__file__).parent / "protocols"
-TABLES = ("known", "ransac")
+TABLES = get_args(TableView)
 SELECTIONS = ("best", "highest", "elsewhere")
 
 Range = tuple[float, float]
@@ -137,7 +138,8 @@ class PlanningRules:
 
     Attributes:
         table: `known`: the cloud is cut off above it and its plane is told; `ransac`: it is in
-            the cloud and has to be found.
+            the cloud and has to be found; `seen`: it is in the cloud and its plane is told, so
+            that depths can be put right.
         voxel_size: metres; network weights carry their own.
         num_approach_points: approach points sampled.
         num_candidates: candidates scored at most.
@@ -146,7 +148,7 @@ class PlanningRules:
         min_score: for `highest`.
     """
 
-    table: str
+    table: TableView
     voxel_size: float
     num_approach_points: int
     num_candidates: int

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Self
 
+    from edgegrasp_sim.observation import Observation
     from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.simulation import Observation
     from edgegrasp_sim.trials import Attempt, Round
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -12,12 +12,12 @@ from edgegrasp_sim.camera import EVALUATION_VIEWS, Camera, ViewRange
 from edgegrasp_sim.grasping import GraspResult, run_grasp
 from edgegrasp_sim.gripper import Gripper
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.observation import CLOUD_BOX, WORKSPACE_BOX, Observation
 from edgegrasp_sim.poses import require_pose
 from edgegrasp_sim.resampling import resample_surfaces
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
-    SIZE,
     TABLE_HEIGHT,
     SceneObject,
     add_table,
@@ -36,43 +36,12 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from edgegrasp_sim.noise import DepthNoise
+    from edgegrasp_sim.observation import TableView
     from edgegrasp_sim.poses import Matrix
     from edgegrasp_sim.world import Body
 
-# Lowest and highest corner of what an observation keeps; the table itself is cut off.
-WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
-# The same with the table left in, for planners that have to find it.
-WORKSPACE_WITH_TABLE = np.array([[0.02, 0.02, TABLE_HEIGHT - 0.01], WORKSPACE[1]])
 NOISE_STD = 0.001  # metres
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What one or several depth images show of the workspace.
-
-    Attributes:
-        cloud: (N, 3) float32, world frame, metres; without the table unless `has_table`; order
-            of the pixels, one image after another.
-        T_world_camera: (4, 4) pose of the first camera (z along the line of sight, y down).
-        camera_position: (3,) float32, that of the first camera, world frame, metres.
-        workspace: (2, 3) float32, lowest and highest corner of the crop.
-        table_height: metres; not to be used where `has_table`.
-        camera_positions: (V, 3) float32, every camera, world frame, metres.
-        view_ids: (N,) int32, which camera saw each point.
-        has_table: whether the cloud holds the table, which then has to be found.
-        failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
-    """
-
-    cloud: NDArray[np.float32]
-    T_world_camera: Matrix
-    camera_position: NDArray[np.float32]
-    workspace: NDArray[np.float32]
-    table_height: float
-    camera_positions: NDArray[np.float32]
-    view_ids: NDArray[np.int32]
-    has_table: bool = False
-    failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +208,7 @@ class ClutterSimulation:
         num_views: int = 1,
         noise_std: float = NOISE_STD,
         depth_noise: DepthNoise | None = None,
-        with_table: bool = False,
+        table: TableView = "known",
         surface_voxel: float = 0.0,
     ) -> Observation:
         """Look at the scene from a random viewpoint, or several around it.
@@ -251,7 +220,7 @@ class ClutterSimulation:
             num_views: images, spread evenly over a full turn from the random one.
             noise_std: standard deviation of the noise in each coordinate of each point, metres.
             depth_noise: noise of the images.
-            with_table: leave the table in the cloud.
+            table: what the cloud holds of the table; see `Observation`.
             surface_voxel: see `observe_from`.
         """
         return self.observe_from(
@@ -259,7 +228,7 @@ class ClutterSimulation:
             rng_noise,
             noise_std=noise_std,
             depth_noise=depth_noise,
-            with_table=with_table,
+            table=table,
             surface_voxel=surface_voxel,
         )
 
@@ -270,7 +239,7 @@ class ClutterSimulation:
         *,
         noise_std: float = NOISE_STD,
         depth_noise: DepthNoise | None = None,
-        with_table: bool = False,
+        table: TableView = "known",
         surface_voxel: float = 0.0,
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each.
@@ -280,11 +249,11 @@ class ClutterSimulation:
             rng_noise: stream of the noise.
             noise_std: see `observe`, as for what follows.
             depth_noise: of the images.
-            with_table: leave the table in the cloud.
+            table: see `observe`.
             surface_voxel: metres between the points of a surface, however aslant it is seen; 0:
                 one point for each pixel.
         """
-        box = WORKSPACE_WITH_TABLE if with_table else WORKSPACE
+        box = CLOUD_BOX[table]
         clouds = []
         for T_world_camera in T_world_cameras:
             depth = self.camera.render_depth(T_world_camera)
@@ -303,11 +272,11 @@ class ClutterSimulation:
             cloud=np.concatenate(clouds),
             T_world_camera=T_world_cameras[0],
             camera_position=positions[0],
-            workspace=box.astype(np.float32),
+            workspace=WORKSPACE_BOX[table].astype(np.float32),
             table_height=TABLE_HEIGHT,
             camera_positions=positions,
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
-            has_table=with_table,
+            table=table,
         )
 
     def save_state(self) -> int:

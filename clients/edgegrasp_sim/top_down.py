@@ -10,7 +10,7 @@ from edgegrasp_sim.gripper import FINGERTIP, MAX_OPENING
 from edgegrasp_sim.trials import PlannedGrasp
 
 if TYPE_CHECKING:
-    from edgegrasp_sim.simulation import Observation
+    from edgegrasp_sim.observation import Observation
 
 REACH = 0.04  # metres around the highest point that count as the thing to grasp
 DEPTH = 0.025  # metres that the fingertips go below its top

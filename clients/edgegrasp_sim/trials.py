@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from edgegrasp_sim.grasping import FailureCause, GraspOutcome
-from edgegrasp_sim.simulation import Observation
+from edgegrasp_sim.observation import Observation
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -222,7 +222,7 @@ class RoundDriver:
             num_views=rules.camera.views,
             noise_std=rules.noise.point_std,
             depth_noise=rules.noise.depth_noise(),
-            with_table=rules.planning.table == "ransac",
+            table=rules.planning.table,
             surface_voxel=rules.camera.surface_voxel,
         )
         failed = [each.T_world_hand for each in self._round.attempts if not each.success]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from edgegrasp_sim.grasping import GraspResult
-    from edgegrasp_sim.simulation import Observation
+    from edgegrasp_sim.observation import Observation
     from edgegrasp_sim.world import World
 
 TARGET = (0.15, 0.15, 0.12)  # metres, what the window's camera looks at

@@ -9,6 +9,7 @@ from edgegrasp_model import cloud as clouds
 from edgegrasp_model.canonical_frame import CanonicalFrame
 from edgegrasp_model.cloud import Cloud, Voxels
 from edgegrasp_model.cloud_input import CheckedCloud
+from edgegrasp_model.depth_scale import depths_corrected
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.obstacles import SolidBoxes
 from edgegrasp_model.options import DetectOptions, Workspace
@@ -52,7 +53,7 @@ def build_scene(
     counts: dict[str, int],
     warnings: list[str],
 ) -> Scene | None:
-    """Crop, take the support away, voxelise, drop outliers, get normals, find the regions.
+    """Correct depths, crop, take the support away, voxelise, get normals, find the regions.
 
     Args:
         sent: N points.
@@ -66,12 +67,13 @@ def build_scene(
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints.
+            views do not suit the viewpoints, or there are none to correct depths from.
     """
     check_region(options.approach_region, sent, "approach_region")
     check_region(options.contact_region, sent, "contact_region")
     viewpoints = check_viewpoints(sent, options)
     counts["points"] = len(sent.points)
+    sent = depths_corrected(sent, options, viewpoints, warnings)
     sent = cut_to_workspace(sent, options)
     counts["in_workspace"] = len(sent.points)
     support, sent = taken_off_support(sent, options, warnings)

@@ -27,6 +27,11 @@ class SupportPlane(Strict):
     kind: Literal["plane"] = "plane"
     normal: UnitVector = Field(description="unit normal, away from the table")
     offset: Finite = Field(description="normal . x of its points, metres")
+    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3)] = Field(
+        default=0.0,
+        description="share by which a camera's depths may be wrong: each view is scaled about its "
+        "viewpoint by up to this until the plane that it sees lies in place; 0: not at all",
+    )
 
     def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
         """Heights (N,) of points (N, 3) over the plane, metres."""

@@ -7,10 +7,12 @@ it does of scanned objects: many have hollows that can be seen but not entered.
 import numpy as np
 from numpy.typing import NDArray
 
-NUM_DRAWN = 320  # different ones, before a scene stretches them
-ROUND = 20  # corners of a round ring
+NUM_FREE, NUM_PLAIN = 320, 160
+NUM_DRAWN = NUM_FREE + NUM_PLAIN  # different ones, before a scene stretches them
+ROUND, FINE = 20, 32  # corners of a round ring
 LONGEST = 0.045, 0.12  # metres, the range of the greatest extent
 THINNEST = 0.009  # metres, least extent
+PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
 Rings = NDArray[np.float64]  # (R, S, 3) corners of each ring along a part, any unit
 
 
@@ -22,7 +24,9 @@ def drawn_shape(index: int) -> str:
     """
     if not 0 <= index < NUM_DRAWN:
         raise IndexError(f"drawn shape {index} of {NUM_DRAWN}")
-    rng = np.random.default_rng([NUM_DRAWN, index])
+    rng = np.random.default_rng([NUM_FREE, index])
+    if index >= NUM_FREE:
+        return as_obj([_plain(rng)])
     parts = _KINDS[index % len(_KINDS)](rng)
     extents = np.ptp(np.concatenate([part.reshape(-1, 3) for part in parts]), axis=0)
     scale = rng.uniform(*LONGEST) / extents.max()
@@ -88,6 +92,17 @@ def _body(rng: np.random.Generator) -> Rings:
         return _straight(ring, list(np.cos(angle)), list(np.sin(angle)))
     taper = rng.uniform(0.4, 1.0) if rng.random() < 0.3 else 1.0
     return _straight(ring, [1.0, taper], [-1.0, 1.0])
+
+
+def _plain(rng: np.random.Generator) -> Rings:
+    """A box, a prism or a can, in metres: what stands on a shelf."""
+    corners = int(rng.choice([4, 4, 6, FINE, FINE, FINE]))
+    width, depth = rng.uniform(*PLAIN_WIDTH, size=2)
+    half_height = rng.uniform(*PLAIN_HEIGHT) / 2.0
+    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    ring = ring * (width / 2.0, (depth if corners == 4 else width) / 2.0, 1.0)
+    top = rng.uniform(0.7, 1.0) if rng.random() < 0.3 else 1.0
+    return _straight(ring, [1.0, top], [-half_height, half_height])
 
 
 def _bodies(rng: np.random.Generator) -> list[Rings]:

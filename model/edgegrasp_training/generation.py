@@ -15,7 +15,7 @@ from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Work
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
-from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_training.labelling import SURE, Choice, Question, detector, label
 from edgegrasp_training.varied_objects import varied_objects
 from edgegrasp_training.views import LabelledView
@@ -28,6 +28,8 @@ VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and 
 WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
 HARD_SHARE = 0.8  # of the scenes, in which a network's surest grasp is looked for that fails
 HARD_LOOKS = 3  # scenes that are looked through for it
+OTHER_NOISE = 0.3  # share of the views that have another noise than the benchmark's
+NOISIEST = 0.003  # metres, the most
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,6 @@ class GenerationOptions:
     scenes: int = 100
     views_per_scene: int = 2
     grasps_per_view: int = 100
-    noise_std: float = 0.001  # metres
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
     kind: SceneKind | None = None  # of all scenes; None: packed where the index is even, else piles
@@ -179,7 +180,7 @@ def _ask(
         streams[CAMERA_STREAM],
         streams[NOISE_STREAM],
         views=TRAINING_VIEWS,
-        noise_std=options.noise_std,
+        noise_std=_noise_std(streams[NOISE_STREAM]),
     )
     low, high = observation.workspace.tolist()
     request = DetectOptions(
@@ -210,6 +211,11 @@ def _views(
             objects=names,
             object_digests=digests,
         )
+
+
+def _noise_std(rng: np.random.Generator) -> float:
+    """Noise of a view, metres: mostly the benchmark's."""
+    return rng.uniform(0.0, NOISIEST) if rng.random() < OTHER_NOISE else NOISE_STD
 
 
 def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:

@@ -14,7 +14,8 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.preparation import Sample, sample_candidates
 from edgegrasp_model.scene import Scene, build_scene
-from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.views import LabelledView
 
 VOXEL_SIZE = 0.0045  # metres

@@ -11,6 +11,7 @@ from edgegrasp_training.made_shapes import any_made_object
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.6  # of the objects that a scene is drawn from
+ROUND_SHARE = 0.5  # of the objects, stretched alike along x and y: what is round stays so
 DRAWN = 16  # objects that a scene is drawn from
 
 
@@ -30,6 +31,8 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
         made = rng.random() < MADE_SHARE
         model = any_made_object(folder / "made", rng) if made else objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
+        if rng.random() < ROUND_SHARE:
+            factors[1] = factors[0]
         drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
     return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))
 

@@ -16,9 +16,10 @@ from edgegrasp_model.catalogue import WEIGHTS_FOLDER
 from edgegrasp_model.cloud import Cloud
 from edgegrasp_sim.gripper import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
 
 PAPER, ROBOT = load_protocol("edgegrasp").planning, load_protocol("robot").planning
@@ -94,6 +95,10 @@ def test_requests_follow_the_protocol() -> None:
     assert options["support"]["offset"] == 0.05
     assert len(options["viewpoint"]) == 3
     assert request_options(seen_under("robot"), 0, ROBOT, {})["support"] == {"kind": "ransac"}
+    giga = request_options(seen_under("giga"), 0, load_protocol("giga").planning, {})
+    assert giga["support"]["offset"] == 0.05
+    assert giga["support"]["max_depth_error"] == 0.12
+    assert giga["workspace"]["min"][2] > 0.05
     six = request_options(seen_under("vgn"), 0, load_protocol("vgn").planning, {})
     assert np.shape(six["viewpoint"]) == (6, 3)
 

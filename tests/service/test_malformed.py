@@ -218,6 +218,10 @@ CASES = {
     "support plane without offset": option(
         "support", {"normal": [0.0, 0.0, 1.0]}, ".offset", "nothing", "required"
     ),
+    "depths wrong by half": option(
+        "support", {"normal": [0.0, 0.0, 1.0], "offset": 0.0, "max_depth_error": 0.5},
+        ".max_depth_error", "0.5", "0.3",
+    ),
     "RANSAC without a distance": option(
         "support", {"kind": "ransac", "distance": 0.0}, ".distance", "0.0", "greater than 0"
     ),

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
-from edgegrasp_client import Detection, GraspClient, UnknownModelError
+from edgegrasp_client import Detection, GraspClient, InvalidRequestError, UnknownModelError
 
 OPTIONS: dict[str, Any] = {"seed": 7, "num_approach_points": 8, "num_candidates": 200}
 
@@ -185,6 +185,30 @@ def test_many_options_give_the_same_grasps_everywhere(
         assert [list(grasp.values()) for grasp in document["grasps"]] == as_lists(expected)
         assert document["counts"] == expected.counts
         assert document["debug"]["outcome"] == expected.debug.outcome
+
+
+def test_wrong_depths_are_put_right_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
+    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.options import parse_options
+
+    camera = np.array([0.3, 0.1, 0.6])
+    points = (camera + 1.05 * (scene["points"] - camera)).astype(np.float32)
+    plane = {"normal": [0.0, 0.0, 1.0], "offset": 0.0, "max_depth_error": 0.1}
+    options: dict[str, Any] = {"seed": 5, "support": plane}
+    seen_from = options | {"viewpoint": camera.tolist()}
+    expected = ModelCatalogue.load().get().detect(points, parse_options(seen_from))
+    assert expected.grasps
+    assert expected.warnings == ["the depths were multiplied by 0.952, as the support plane shows."]
+    contact = np.array([grasp.contact_point for grasp in expected.grasps])
+    assert (np.abs(contact) < np.array([0.02, 0.03, 0.1]) + 0.004).all()  # on the box again
+    with start_server() as server:
+        for address in (server.grpc_address, server.http_url):
+            with GraspClient(address) as client:
+                found = client.detect(points, **seen_from)
+                assert as_lists(found) == as_lists(expected)
+                assert found.warnings == expected.warnings
+                with pytest.raises(InvalidRequestError, match=r"options\.viewpoint: got nothing"):
+                    client.detect(points, **options)
 
 
 def test_scores_are_the_same_everywhere(scene: dict[str, np.ndarray], start_server) -> None:

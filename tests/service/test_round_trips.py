@@ -100,7 +100,8 @@ collision = st.fixed_dictionaries(
     },
 )
 plane = st.fixed_dictionaries(
-    {"normal": unit, "offset": coordinate}, optional={"kind": st.just("plane")}
+    {"normal": unit, "offset": coordinate},
+    optional={"kind": st.just("plane"), "max_depth_error": numbers(0.0, 0.3)},
 )
 ransac = st.fixed_dictionaries(
     {"kind": st.just("ransac")},

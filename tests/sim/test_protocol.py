@@ -33,6 +33,7 @@ def test_the_named_protocols_differ_where_they_should() -> None:
     assert giga.camera.polar_degrees == (60.0, 60.0)
     assert giga.camera.azimuth_degrees == (-90.0, -90.0)
     assert giga.noise.depth_noise() is not None
+    assert (giga.planning.table, giga.version) == ("seen", 3)
     assert vgn.camera.views == 6
     assert [robot.num_objects(index) for index in range(3)] == [8, 10, 8]
     assert (robot.planning.num_approach_points, robot.planning.num_candidates) == (40, 2000)
@@ -64,7 +65,11 @@ def test_the_side_view_is_where_giga_has_it() -> None:
     [
         ("views = 1", "", "camera lacks views"),
         ("views = 1", "views = 1\nzoom = 2", "camera has unknown zoom"),
-        ('table = "known"', 'table = "guess"', "table is 'guess'; choose one of known, ransac"),
+        (
+            'table = "known"',
+            'table = "guess"',
+            "table is 'guess'; choose one of known, ransac, seen",
+        ),
         ("workspace_size = 0.30", "workspace_size = 0.5", "workspace_size is 0.5"),
         ("version = 2", "version = ", "protocol .*toml"),
     ],

@@ -5,8 +5,9 @@ import pytest
 
 from edgegrasp_sim.camera import Camera, look_at
 from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.observation import WORKSPACE
 from edgegrasp_sim.resampling import resample_surfaces
-from edgegrasp_sim.simulation import WORKSPACE, ClutterSimulation
+from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.world import World
 
 CENTRE = np.array([0.15, 0.12, 0.10])

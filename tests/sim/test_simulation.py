@@ -12,12 +12,9 @@ from edgegrasp_sim.families import write_family
 from edgegrasp_sim.grasping import GraspOutcome, retreat_pose
 from edgegrasp_sim.gripper import FINGERTIP
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.observation import WORKSPACE
 from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
-from edgegrasp_sim.simulation import (
-    WORKSPACE,
-    ClutterSimulation,
-    ObjectPlacement,
-)
+from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
@@ -207,6 +204,22 @@ def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimu
     assert seen.camera_position == pytest.approx((0.6, 0.15, 0.6))
     assert seen.table_height == 0.05
     assert seen.workspace.shape == (2, 3)
+
+
+def test_an_observation_holds_the_table_where_it_may(simulation: ClutterSimulation) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
+    known, ransac, seen = (
+        simulation.observe_from(
+            [T_world_camera], np.random.default_rng(0), noise_std=0.0, table=table
+        )
+        for table in ("known", "ransac", "seen")
+    )
+    level = [np.abs(each.cloud[:, 2] - TABLE_HEIGHT) < 1e-3 for each in (known, ransac, seen)]
+    assert [bool(rows.any()) for rows in level] == [False, True, True]
+    np.testing.assert_array_equal(known.workspace, seen.workspace)
+    assert seen.cloud[:, :2].min() < known.workspace[0, 0] - 0.05  # what wrong depths move out
+    assert ransac.cloud[:, :2].min() >= known.workspace[0, 0]
 
 
 def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:

@@ -10,7 +10,7 @@ from edgegrasp_sim import trials
 from edgegrasp_sim.grasping import FailureCause, GraspOutcome
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
-from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trials import (
     PlannedGrasp,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from edgegrasp_sim.grasping import GraspResult
+    from edgegrasp_sim.observation import Observation
 
 IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)

@@ -5,7 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_training.drawn_shapes import LONGEST, NUM_DRAWN, THINNEST, drawn_shape
+from edgegrasp_training.drawn_shapes import (
+    LONGEST,
+    NUM_DRAWN,
+    NUM_FREE,
+    PLAIN_HEIGHT,
+    PLAIN_WIDTH,
+    THINNEST,
+    drawn_shape,
+)
 from edgegrasp_training.hollow_shapes import SHAPES, revolved
 from edgegrasp_training.made_shapes import DRAWN, HOLLOW, any_made_object, made_object
 
@@ -40,7 +48,7 @@ def test_a_torus_has_the_volume_of_a_torus() -> None:
     assert _volume(revolved(SHAPES["made-torus-slim"])) == pytest.approx(volume, rel=0.06)
 
 
-@pytest.mark.parametrize("index", range(0, NUM_DRAWN, 5))
+@pytest.mark.parametrize("index", range(0, NUM_FREE, 5))
 def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
     shape = drawn_shape(index)
     points, _ = _surface(shape)
@@ -48,6 +56,16 @@ def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
     assert 0.0 < _volume(shape) < 4.0 * extents.prod()  # parts overlap
     assert extents.min() > 0.999 * THINNEST - 1e-5
     assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
+
+
+@pytest.mark.parametrize("index", range(NUM_FREE, NUM_DRAWN, 5))
+def test_plain_shapes_are_closed_and_stand_on_a_shelf(index: int) -> None:
+    shape = drawn_shape(index)
+    width, depth, height = np.ptp(_surface(shape)[0], axis=0)
+    assert 0.4 * width * depth * height < _volume(shape) < 1.001 * width * depth * height
+    assert 0.86 * PLAIN_WIDTH[0] < min(width, depth)  # a hexagon is less wide one way
+    assert max(width, depth) < PLAIN_WIDTH[1] + 1e-5
+    assert PLAIN_HEIGHT[0] - 1e-5 < height < PLAIN_HEIGHT[1] + 1e-5
 
 
 def test_drawn_shapes_differ_and_stay_the_same() -> None:

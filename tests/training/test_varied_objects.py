@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -78,6 +79,18 @@ def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(
     ]
     assert 1 / STRETCH <= min(factors) < 0.95
     assert 1.05 < max(factors) <= STRETCH
+
+
+def test_some_are_stretched_alike_along_x_and_y(
+    shapes: tuple[ObjectModel, ...], tmp_path: Path
+) -> None:
+    drawn = varied_objects(ObjectSet("plain", shapes), tmp_path, np.random.default_rng(0))
+    alike = 0
+    for model in drawn.models:
+        found = re.search(r'scale="(\S+) (\S+) \S+"', model.urdf.read_text())
+        assert found is not None
+        alike += found[1] == found[2]
+    assert 0 < alike < len(drawn.models)
 
 
 def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) -> None:

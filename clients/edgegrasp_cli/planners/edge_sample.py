@@ -6,7 +6,7 @@ import numpy as np
 
 from edgegrasp_cli.planners.paper_candidates import PaperCandidates
 from edgegrasp_sim.gripper import MAX_OPENING
-from edgegrasp_sim.simulation import Observation
+from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.trials import PlannedGrasp
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from edgegrasp_cli.planners.paper_candidates import Float32
 from edgegrasp_sim.grasping import GraspResult
 from edgegrasp_sim.gripper import MAX_OPENING
-from edgegrasp_sim.simulation import Observation
+from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.trials import PlannedGrasp
 
 # From what is seen to poses `T_world_hand` in random order, (E, 4, 4); can be pickled.

@@ -6,15 +6,15 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.simulation import Observation
 
 CHOICE = 64  # grasps to choose from where it is not the best one
 NEARBY = 0.05  # metres around a grip that failed: the same object, most likely
 SAME_GRIP = 0.02  # metres around it, closing the same way: the same grip again
 SAME_CLOSING = np.cos(np.radians(30.0))
 NEARBY_WORTH, SAME_GRIP_WORTH = 0.8, 0.6  # factors on the score
-RANSAC = {"kind": "ransac"}
+MAX_DEPTH_ERROR = 0.12  # of views that show the table; more than any protocol's noise
 
 
 class Scored(Protocol):
@@ -45,13 +45,18 @@ def request_options(
         "num_approach_points": rules.num_approach_points,
         "num_candidates": rules.num_candidates,
         "viewpoint": positions[0] if len(positions) == 1 else positions,
-        "support": RANSAC
-        if observation.has_table
-        else {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height},
+        "support": _support(observation),
         "workspace": {"min": low, "max": high},
         "top_k": 1 if rules.selection == "best" else CHOICE,
     }
     return options | dict(extra)
+
+
+def _support(observation: Observation) -> dict[str, Any]:
+    if observation.table == "ransac":
+        return {"kind": "ransac"}
+    plane = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
+    return plane | ({"max_depth_error": MAX_DEPTH_ERROR} if observation.table == "seen" else {})
 
 
 def choose(grasps: Sequence[G], rules: PlanningRules, failed: NDArray[np.floating]) -> G | None:

@@ -13,8 +13,8 @@ from edgegrasp_client import (
     Model,
     ServerUnavailableError,
 )
+from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.simulation import Observation
 from edgegrasp_sim.trials import PlannedGrasp, PlannerUnavailableError
 
 REQUEST_SECONDS = 120.0

@@ -22,12 +22,14 @@ from scipy.spatial import cKDTree
 from edgegrasp_cli.planners.paper_candidates import PaperCandidates, estimate_normals
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
-from edgegrasp_sim.simulation import ClutterSimulation, Observation
+from edgegrasp_sim.simulation import ClutterSimulation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
+
+    from edgegrasp_sim.observation import Observation
 
 # How the labelled views were made: see the data's own description.
 MORE_OBJECTS = 4.0  # than one, on average; Poisson

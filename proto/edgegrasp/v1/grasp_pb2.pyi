@@ -952,9 +952,14 @@ class Support(_message.Message):
 
     NORMAL_FIELD_NUMBER: _builtins.int
     OFFSET_FIELD_NUMBER: _builtins.int
+    MAX_DEPTH_ERROR_FIELD_NUMBER: _builtins.int
     RANSAC_FIELD_NUMBER: _builtins.int
     offset: _builtins.float
     """normal . p of its points, metres."""
+    max_depth_error: _builtins.float
+    """Share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up to
+    this until the plane that it sees lies in place. 0: not at all.
+    """
     @_builtins.property
     def normal(self) -> Global___Vector:
         """Unit normal, away from the table."""
@@ -968,14 +973,20 @@ class Support(_message.Message):
         *,
         normal: Global___Vector | None = ...,
         offset: _builtins.float | None = ...,
+        max_depth_error: _builtins.float | None = ...,
         ransac: Global___RansacPlane | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_depth_error: _TypeAlias = _typing.Literal["max_depth_error"]  # noqa: Y015
+    _WhichOneofArgType__max_depth_error: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error"]  # noqa: Y015
     _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
     _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_depth_error) -> _WhichOneofReturnType__max_depth_error | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
 
 Global___Support: _TypeAlias = Support  # noqa: Y015
