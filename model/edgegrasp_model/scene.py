@@ -69,15 +69,8 @@ def build_scene(
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
             views do not suit the viewpoints, or there are none to correct depths from.
     """
-    check_region(options.approach_region, sent, "approach_region")
-    check_region(options.contact_region, sent, "contact_region")
     viewpoints = check_viewpoints(sent, options)
-    counts["points"] = len(sent.points)
-    sent = depths_corrected(sent, options, viewpoints, warnings)
-    sent = cut_to_workspace(sent, options)
-    counts["in_workspace"] = len(sent.points)
-    support, sent = taken_off_support(sent, options, warnings)
-    counts["above_support"] = len(sent.points)
+    sent, support = cut_out(sent, viewpoints, options, counts, warnings)
     if len(sent.points) == 0:
         counts |= {"voxels": 0, "kept": 0}
         return None
@@ -110,6 +103,30 @@ def build_scene(
         viewpoint=only_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
+
+
+def cut_out(
+    sent: CheckedCloud,
+    viewpoints: NDArray[np.float64] | None,
+    options: DetectOptions,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> tuple[CheckedCloud, SupportPlane | None]:
+    """The cloud, its depths put right, within the workspace and above its support; the support.
+
+    Raises:
+        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
+            are no viewpoints (W, 3) to correct depths from.
+    """
+    check_region(options.approach_region, sent, "approach_region")
+    check_region(options.contact_region, sent, "contact_region")
+    counts["points"] = len(sent.points)
+    sent = depths_corrected(sent, options, viewpoints, warnings)
+    sent = cut_to_workspace(sent, options)
+    counts["in_workspace"] = len(sent.points)
+    support, sent = taken_off_support(sent, options, warnings)
+    counts["above_support"] = len(sent.points)
+    return sent, support
 
 
 def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:

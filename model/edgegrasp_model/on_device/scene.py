@@ -22,17 +22,16 @@ from edgegrasp_model.on_device.cloud import (
 )
 from edgegrasp_model.on_device.constants import constant
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.regions import Region, check_region, inside_region
+from edgegrasp_model.regions import Region, inside_region
 from edgegrasp_model.scene import (
     MIN_NORMAL,
     MIN_POINTS,
     Scene,
     at_workspace_side,
     check_viewpoints,
-    cut_to_workspace,
+    cut_out,
     only_viewpoint,
     plane_in_frame,
-    taken_off_support,
 )
 from edgegrasp_model.support import SupportPlane
 
@@ -87,14 +86,8 @@ def build_scene(
     Raises:
         InvalidRequest: As there.
     """
-    check_region(options.approach_region, sent, "approach_region")
-    check_region(options.contact_region, sent, "contact_region")
     viewpoints = check_viewpoints(sent, options)
-    counts["points"] = len(sent.points)
-    sent = cut_to_workspace(sent, options)
-    counts["in_workspace"] = len(sent.points)
-    support, sent = taken_off_support(sent, options, warnings)
-    counts["above_support"] = len(sent.points)
+    sent, support = cut_out(sent, viewpoints, options, counts, warnings)
     if len(sent.points) == 0:
         counts |= {"voxels": 0, "kept": 0}
         return None

@@ -35,6 +35,7 @@ TILTED = {
 }
 NEAR_TOP = {"kind": "sphere", "center": [0.0, 0.0, 0.08], "radius": 0.03}
 RANSAC = {"kind": "ransac", "distance": 0.003}
+WRONG = {"normal": (0.0, 0.0, 1.0), "offset": 0.004, "max_depth_error": 0.1}
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "as shipped": {},
@@ -43,6 +44,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "uniform": {"sampling": "uniform", "seed": 7},
     "all checked": {"num_candidates": 16000},
     "ransac": {"support": RANSAC},
+    "wrong depths": {"support": WRONG},
     "workspace": {"workspace": {"min": (-0.015, -0.1, 0.01), "max": (0.1, 0.1, 0.2)}},
     "regions": {
         "approach_region": {"include": [NEAR_TOP]},
@@ -108,13 +110,14 @@ def assert_same(there: Detection, here: Detection) -> None:
 def test_the_same_grasps_whatever_is_asked(
     box_on_table: Callable[..., NDArray[np.float32]], options: dict[str, Any]
 ) -> None:
-    cloud = box_on_table(seed=1, count=500, table=options.get("support") == RANSAC)
+    cloud = box_on_table(seed=1, count=500, table=options.get("support") in (RANSAC, WRONG))
     there, here = pair("hand")
     asked = ask(**options)
     found = there.detect(cloud, asked)
     assert_same(found, here.detect(cloud, asked))
     empty = options in (OPTIONS["nobody there"], OPTIONS["no approach point"], OPTIONS["blocked"])
     assert bool(found.grasps) != empty
+    assert ("multiplied" in "".join(found.warnings)) == (options == OPTIONS["wrong depths"])
 
 
 @pytest.mark.parametrize("seed", range(3))
