@@ -39,10 +39,10 @@ Wilson 95 % intervals; [benchmark.md](benchmark.md) says what a round is. `OBJEC
 reference system's test objects, which no weights were trained on. Published figures stand as their
 papers give them, mean ± standard deviation over seeds where they say so.
 
-Protocols are in version 2, unless version 1 is named. Until then the simulator's table was 12 mm
-thick: of 1,000 objects dropped on heaps 100 were gone before the first view, where 43 are now, and
-others stuck in it, where no hand could lift them. Now it is 200 mm thick. The grasps that the
-reference simulator judged come out as before
+Protocols are in version 2 (`giga` in 3), unless version 1 is named. Until then the simulator's
+table was 12 mm thick: of 1,000 objects dropped on heaps 100 were gone before the first view, where
+43 are now, and others stuck in it, where no hand could lift them. Now it is 200 mm thick. The
+grasps that the reference simulator judged come out as before
 ([benchmark.md](benchmark.md#how-hard-the-simulator-is)).
 
 This page is written by `python docs/make_results.py RESULTS_DIR` from the folders that the
@@ -75,8 +75,8 @@ EXPERIMENTS = {
         "edgegrasp experiment robustness --rounds 100 --objects OBJECTS --output DIR",
         "One thing is changed at a time; the protocol has 1 mm noise, a polar angle of 45 to 60 "
         "degrees, the weights have a voxel size of their own. `giga` is a fixed side view with "
-        "noise that also moves a whole image by some 3 % of its depth (19 mm); its camera alone "
-        "has the protocol's noise.",
+        "noise that also moves a whole image by some 3 % of its depth (19 mm), which the table in "
+        "the view betrays: `support.max_depth_error`. Its camera alone has the protocol's noise.",
     ),
     "families": (
         "Objects of other families",
