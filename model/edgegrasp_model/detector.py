@@ -156,8 +156,8 @@ class GraspDetector:
             prepared.warnings.append(NO_APPROACH_POINT)
             return prepared
         with prepared.timed("candidates"):
-            radius = prepared.crop_radius
-            sample = sample_candidates(scene, options, gripper, radius, prepared.counts)
+            radius, counts = prepared.crop_radius, prepared.counts
+            sample = sample_candidates(scene, options, gripper, radius, counts, self.sees_hands)
         prepared.sample = sample
         if len(sample.candidates) == 0:
             prepared.warnings.append(NO_CANDIDATE)
@@ -287,9 +287,14 @@ class GraspDetector:
         probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-scaled))
         return probability
 
+    @property
+    def sees_hands(self) -> bool:
+        """Whether scores are of hands where they are, not of edges wherever their hands are."""
+        return self.metadata.network.architecture == "hand"
+
     def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> Batch:
         candidates, network = sample.candidates, self.metadata.network
-        if network.architecture == "hand":
+        if self.sees_hands:
             return hand_batch(scene, candidates, gripper, network, sample.view)
         return BallBatch.from_cloud(
             scene.cloud.points,

@@ -14,6 +14,7 @@ from edgegrasp_model.candidates import (
     edge_grasps,
     level_grasps,
 )
+from edgegrasp_model.centred import centred_grasps
 from edgegrasp_model.collision import UP, collides
 from edgegrasp_model.directions import allowed_ways
 from edgegrasp_model.gripper import Gripper
@@ -59,6 +60,7 @@ def sample_candidates(
     gripper: Gripper,
     crop_radius: float,
     counts: dict[str, int],
+    centre: bool = False,
 ) -> Sample:
     """Sample approach points and the candidates around them, free of collision where possible.
 
@@ -68,6 +70,7 @@ def sample_candidates(
         gripper: What has to fit.
         crop_radius: Radius of the balls, metres.
         counts: Gets the number of candidates left after each constraint, over all rounds.
+        centre: Whether there are centred hands among them: for networks that see where a hand is.
 
     Returns:
         At most num_candidates candidates. With `collision: avoid` none of them collides.
@@ -87,7 +90,7 @@ def sample_candidates(
         )
         approach_index = approach_rows[chosen]
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, headings, approach_index, crop, options, gripper, counts)
+        this = _constrained(scene, headings, approach_index, crop, options, gripper, counts, centre)
         rounds.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
         row = passed[random_rows(len(passed), limit, rng_candidates)]
@@ -128,6 +131,7 @@ def _constrained(
     options: DetectOptions,
     gripper: Gripper,
     counts: dict[str, int],
+    centre: bool,
 ) -> Round:
     """The edge grasps of some balls, and which satisfy every constraint but collision."""
     add_count(counts, "approach_points", len(approach_index))
@@ -140,6 +144,9 @@ def _constrained(
         level = level_grasps(scene.cloud, *pairs, scene.support, gripper, headings)
         candidates = Candidates.concatenate([candidates, level])
     candidates = replace(candidates, pair=pair[candidates.pair])
+    if centre:
+        centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
+        candidates = Candidates.concatenate([candidates, centred])
     add_count(counts, "candidates", len(candidates))
     outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
     if scene.support is not None:

@@ -110,7 +110,8 @@ class DeviceDetector(GraspDetector):
             prepared.warnings.append(NO_APPROACH_POINT)
             return prepared
         with prepared.timed("candidates"):
-            sample = sample_candidates(scene, options, gripper, prepared.crop_radius, counts)
+            radius, centre = prepared.crop_radius, self.sees_hands
+            sample = sample_candidates(scene, options, gripper, radius, counts, centre)
         prepared.device_sample = sample
         if len(sample.candidates) == 0:
             prepared.warnings.append(NO_CANDIDATE)

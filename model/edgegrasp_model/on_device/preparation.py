@@ -17,6 +17,7 @@ from edgegrasp_model.on_device.candidates import (
     edge_grasps,
     level_grasps,
 )
+from edgegrasp_model.on_device.centred import centred_grasps
 from edgegrasp_model.on_device.collision import collides
 from edgegrasp_model.on_device.sampling import sample_approach_points
 from edgegrasp_model.on_device.scene import DeviceScene
@@ -70,6 +71,7 @@ def sample_candidates(
     gripper: Gripper,
     crop_radius: float,
     counts: dict[str, int],
+    centre: bool = False,
 ) -> DeviceSample:
     """As `edgegrasp_model.preparation.sample_candidates`; the same seed draws the same ones."""
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
@@ -87,7 +89,7 @@ def sample_candidates(
         )
         approach_index = approach_rows[chosen]
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, approach_index, crop, options, gripper, counts)
+        this = _constrained(scene, approach_index, crop, options, gripper, counts, centre)
         rounds.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
         row = passed[random_rows(len(passed), limit, rng_candidates)]
@@ -120,6 +122,7 @@ def _constrained(
     options: DetectOptions,
     gripper: Gripper,
     counts: dict[str, int],
+    centre: bool,
 ) -> DeviceRound:
     """The edge grasps of some balls, and which satisfy every constraint but collision."""
     add_count(counts, "approach_points", len(approach_index))
@@ -133,6 +136,9 @@ def _constrained(
         level = level_grasps(scene.cloud, *pairs, support, gripper)
         candidates = DeviceCandidates.concatenate([candidates, level])
     candidates = replace(candidates, pair=pair[candidates.pair])
+    if centre:
+        centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
+        candidates = DeviceCandidates.concatenate([candidates, centred])
     add_count(counts, "candidates", len(candidates))
     clear = torch.ones(len(candidates), dtype=torch.bool, device=pair.device)
     if support is not None:
