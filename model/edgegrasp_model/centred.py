@@ -47,7 +47,7 @@ def centred_grasps(
             for axis in range(3)
         )  # (P, K) each, hand frame
         between = np.abs(x) < gripper.pad_half_width + BESIDE_PADS
-        between &= (z > gripper.palm_z) & (z < gripper.tip_z)
+        between &= (z > gripper.palm_z) & (z < gripper.foremost_z)
         low[here] = np.where(between, y, np.inf).min(axis=0)
         high[here] = np.where(between, y, -np.inf).max(axis=0)
     middle, width = (low + high) / 2, high - low

@@ -13,6 +13,7 @@ from edgegrasp_model.support import SupportPlane
 Float64 = NDArray[np.float64]
 
 NEAR = 0.01  # metres from the plane within which points are taken for it
+HIGHEST = 10.0  # metres over the plane, the highest camera
 STEP = 0.001  # metres that the plane moves between one factor that is tried and the next
 MIN_SHARE, MIN_POINTS = 0.1, 20  # of the points that the plane must hold
 FLAT = 0.35  # of that distance, median distance of its points; those of a wall have 0.5
@@ -74,11 +75,11 @@ def depth_scale(
         plane: With the greatest depth error that is looked for.
 
     Returns:
-        The factor; None where the camera is not above the plane or too little of it is seen.
+        The factor; None where the camera is not above the plane, or too high, or sees too little.
     """
     height = float(plane.heights(viewpoint))
     falls = height - plane.heights(points.astype(np.float64))
-    if height <= NEAR:
+    if not NEAR < height < HIGHEST:
         return None
     # A point is in the plane once its fall below the camera is the camera's height.
     factors = np.sort(height / falls[falls > 0.5 * height])

@@ -79,6 +79,18 @@ def test_the_candidates_themselves_stay_where_they_are() -> None:
     assert len(centred_grasps(cloud.points, crop, none, HAND)) == 0
 
 
+@pytest.mark.parametrize("name", ["robotiq-2f-85", "robotiq-2f-140", "wsg-50"])
+def test_every_hand_has_the_contact_between_its_fingers(name: str) -> None:
+    hand, cloud = load_gripper(name), can(0.075)
+    rng = np.random.default_rng(2)
+    approach = np.sort(rng.choice(900, 8, replace=False))
+    crop = crop_balls(cloud.points, approach, 0.07)
+    candidates = edge_grasps(cloud, approach[crop.ball_of_point], crop.ball_rows, hand)
+    with np.errstate(all="raise"):
+        further = centred_grasps(cloud.points, crop, candidates, hand)
+    assert np.isfinite(further.T_cloud_hand).all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_device_moves_the_same_hands(seed: int) -> None:
     cloud = can(0.072, seed)

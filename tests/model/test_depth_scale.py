@@ -59,6 +59,9 @@ def test_the_factor_is_found_in_any_frame(seed: int, factor: float, things: int)
         pytest.param(
             scene(np.random.default_rng(0)), np.array([0.0, -0.5, 0.02]), id="camera below it"
         ),
+        pytest.param(
+            scene(np.random.default_rng(0)), np.array([0.0, 0.0, 1e9]), id="camera in millimetres"
+        ),
     ],
 )
 def test_without_its_plane_there_is_no_factor(points: np.ndarray, camera: np.ndarray) -> None:

@@ -27,7 +27,7 @@ def centred_grasps(
         x, y, z = (near @ axes[here]).unbind(dim=2)
         between = squared_distances(approach, points) <= crop.radius**2
         between &= x.abs() < gripper.pad_half_width + BESIDE_PADS
-        between &= (z > gripper.palm_z) & (z < gripper.tip_z)
+        between &= (z > gripper.palm_z) & (z < gripper.foremost_z)
         low[part] = y.masked_fill(~between, torch.inf).amin(dim=1)
         high[part] = y.masked_fill(~between, -torch.inf).amax(dim=1)
     middle, width = (low + high) / 2, high - low
