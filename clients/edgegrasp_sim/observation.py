@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 
@@ -51,3 +51,13 @@ class Observation:
     view_ids: NDArray[np.int32]
     table: TableView = "known"
     failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
+
+
+Float = TypeVar("Float", bound=np.floating)
+
+
+def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:
+    """The points (N, 3) in a box (2, 3), lowest and highest corner, grown by a margin."""
+    inside = (points >= box[0] - margin) & (points <= box[1] + margin)
+    kept: NDArray[Float] = points[inside.all(axis=1)]
+    return kept

@@ -12,7 +12,7 @@ from edgegrasp_sim.camera import EVALUATION_VIEWS, Camera, ViewRange
 from edgegrasp_sim.grasping import GraspResult, run_grasp
 from edgegrasp_sim.gripper import Gripper
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.observation import CLOUD_BOX, WORKSPACE_BOX, Observation
+from edgegrasp_sim.observation import CLOUD_BOX, WORKSPACE_BOX, Observation, crop
 from edgegrasp_sim.poses import require_pose
 from edgegrasp_sim.resampling import resample_surfaces
 from edgegrasp_sim.scene import (
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from edgegrasp_sim.noise import DepthNoise
     from edgegrasp_sim.observation import TableView
@@ -259,14 +259,14 @@ class ClutterSimulation:
             depth = self.camera.render_depth(T_world_camera)
             if depth_noise is not None:
                 depth = depth_noise.apply(depth, rng_noise)
-            points = _crop(self.camera.points(depth, T_world_camera), box, _CROP_MARGIN)
+            points = crop(self.camera.points(depth, T_world_camera), box, _CROP_MARGIN)
             if surface_voxel > 0 and len(points) > 0:
                 around = np.stack((points.min(axis=0), points.max(axis=0)))
                 points = resample_surfaces(
                     depth, T_world_camera, self.camera.intrinsics, around, surface_voxel
                 )
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
-            clouds.append(_crop(points, box, 0.0).astype(np.float32))
+            clouds.append(crop(points, box, 0.0).astype(np.float32))
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
@@ -401,9 +401,3 @@ def _scene_kind(scene: SceneKind | str) -> SceneKind:
     with suppress(ValueError):
         return SceneKind(scene)
     raise ValueError(f"scene is {scene!r}; choose one of {', '.join(SceneKind)}")
-
-
-def _crop(points: NDArray[np.float64], box: Matrix, margin: float) -> NDArray[np.float64]:
-    inside = (points >= box[0] - margin) & (points <= box[1] + margin)
-    kept: NDArray[np.float64] = points[inside.all(axis=1)]
-    return kept

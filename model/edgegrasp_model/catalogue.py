@@ -96,7 +96,7 @@ class ModelCatalogue:
                 "crop_radius": detector.metadata.crop_radius,
                 "voxel_size": detector.metadata.voxel_size,
                 "gripper": detector.metadata.gripper,
-                "hand_description": detector.metadata.network.architecture == "hand",
+                "hand_description": detector.sees_hands,
                 "device": str(detector.device),
             }
             for name, detector in sorted(self._detectors.items())

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from edgegrasp_model.candidates import edge_grasp_poses, measure_edges
 from edgegrasp_model.cloud import Cloud, Voxels
 from edgegrasp_model.sampling import sample_approach_points
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.observation import Observation, crop
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -63,9 +63,7 @@ class PaperCandidates:
 
     def __call__(self, observation: Observation, rng: np.random.Generator) -> Float32:
         """Poses `T_world_hand` of random candidates, in random order: (E, 4, 4)."""
-        low, high = observation.workspace
-        inside = (observation.cloud >= low) & (observation.cloud <= high)
-        cloud = clean_cloud(observation.cloud[inside.all(axis=1)], self.voxel_size)
+        cloud = clean_cloud(crop(observation.cloud, observation.workspace), self.voxel_size)
         if cloud is None:
             return np.empty((0, 4, 4), dtype=np.float32)
         approach = sample_approach_points(cloud.points, self.num_approach_points, "farthest", rng)

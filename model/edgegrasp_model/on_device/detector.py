@@ -122,7 +122,7 @@ class DeviceDetector(GraspDetector):
 
     def _describe(self, prepared: DevicePrepared, scene: DeviceScene, sample: DeviceSample) -> None:
         network, gripper, candidates = self.metadata.network, prepared.gripper, sample.candidates
-        if network.architecture == "hand":
+        if self.sees_hands:
             balls = len(sample.approach_index)
             width, prepared.batch = hand_batch(
                 scene, candidates, balls, gripper, network.hand_points
