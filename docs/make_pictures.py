@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle, Wedge
 from numpy.typing import NDArray
 
-from edgegrasp_model.directions import SIDE_ANGLE, TOP_DOWN_ANGLE
+from edgegrasp_model.candidates.sample import SIDE_ANGLE, TOP_DOWN_ANGLE
 from edgegrasp_model.gripper import Gripper, gripper_names, load_gripper
 
 Float64 = NDArray[np.float64]

@@ -1,5 +1,6 @@
-"""The models a process has loaded, by name."""
+"""The models a process has loaded, by name, and the device they run on."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -8,12 +9,13 @@ import numpy as np
 import torch
 
 from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.errors import InvalidCheckpoint, UnknownModel
+from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
+DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
 class ModelCatalogue:
@@ -114,3 +116,31 @@ class ModelCatalogue:
         )
         for detector in self._detectors.values():
             detector.detect(box, options)
+
+
+def choose_device(name: str = "auto") -> torch.device:
+    """The device of a name, if it is there.
+
+    Args:
+        name: `cpu`; `cuda`, the first GPU; `cuda:1` the second, and so on; `auto`: the first GPU
+            where there is one, else the processor.
+
+    Raises:
+        InvalidDevice: It is no device's name, or there is no such device here.
+    """
+    if not DEVICE_NAMES.fullmatch(name):
+        raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return torch.device("cuda:0" if gpus else "cpu")
+    device = torch.device(name)
+    if device.type == "cpu":
+        return device
+    number = device.index or 0
+    if number < gpus:
+        return torch.device("cuda", number)
+    if gpus:
+        here = "cuda:0" if gpus == 1 else f"cuda:0 to cuda:{gpus - 1}"
+        raise InvalidDevice(name, f"PyTorch sees {here} here: use one of them, auto or cpu.")
+    built = "sees no GPU" if torch.version.cuda else "is built without CUDA"
+    raise InvalidDevice(name, f"PyTorch {torch.__version__} {built} here: use cpu or auto.")

@@ -12,31 +12,38 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edgegrasp_model.assembly import debug_info, grasps_in_cloud
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
-from edgegrasp_model.cloud_input import CheckedCloud, check_cloud
-from edgegrasp_model.collision import clearances, widths_needed
+from edgegrasp_model.candidates.collision import clearances, required_openings
+from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.evaluation import Scorer, evaluate, hand_batch
-from edgegrasp_model.given_grasps import check_edges, check_hand_poses, from_edges, from_hand_poses
-from edgegrasp_model.gripper import Gripper, load_gripper
-from edgegrasp_model.gripper_choice import chosen_gripper
-from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.given import (
+    Scorer,
+    check_edges,
+    check_hand_poses,
+    evaluate,
+    from_edges,
+    from_hand_poses,
+    hand_batch,
+)
+from edgegrasp_model.gripper import Gripper, chosen_gripper, load_gripper
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import CheckpointMetadata, load_checkpoint
+from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.preparation import Sample, sample_candidates
+from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
-from edgegrasp_model.scene import Scene, build_scene
-from edgegrasp_model.selection import select
+from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud
+from edgegrasp_model.scene.scene import Scene, build_scene
 
 Float32 = NDArray[np.float32]
-Batch = BallBatch | HandBatch
 
 NO_APPROACH_POINT = (
     "the approach region holds no point of the processed cloud. Rows hold a voxel by "
     "half of its points: around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
+
+
+Batch = BallBatch | HandBatch
 
 
 @dataclass
@@ -109,8 +116,7 @@ class GraspDetector:
 
         Args:
             path: The file.
-            device: The processor, or a GPU: there the whole pipeline runs, in `on_device`.
-                Weights in int8 stay on the processor.
+            device: Where the network runs; everything else runs on the processor.
             grippers: A user's own that requests may name, beside those that ship.
 
         Raises:
@@ -118,14 +124,7 @@ class GraspDetector:
             InvalidGripper: Its gripper is not known here.
         """
         network, metadata = load_checkpoint(path)
-        if metadata.network.architecture == "edgegrasp-int8":
-            device = "cpu"  # its layers are there for the processor only
-        kind: type[GraspDetector] = cls
-        if torch.device(device).type != "cpu":
-            from edgegrasp_model.on_device.detector import DeviceDetector  # it imports this file
-
-            kind = DeviceDetector
-        return kind(network, metadata, load_gripper(metadata.gripper), device, grippers)
+        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
@@ -163,7 +162,7 @@ class GraspDetector:
             prepared.warnings.append(NO_CANDIDATE)
             return prepared
         with prepared.timed("description"):
-            prepared.width = widths_needed(sample.view, gripper)
+            prepared.width = required_openings(sample.view, gripper)
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 

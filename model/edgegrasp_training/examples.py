@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls
-from edgegrasp_model.candidates import Candidates, edge_grasps
-from edgegrasp_model.canonical_frame import CanonicalFrame
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.approach import crop_balls
+from edgegrasp_model.candidates.edge import Candidates, edge_grasps
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.hand_description import without_support
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.hand_view.description import without_support
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane, Workspace
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.frame import CanonicalFrame
+from edgegrasp_model.scene.scene import at_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, LabelledView
 

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
-from edgegrasp_model.network_config import (
+from edgegrasp_model.networks.checkpoint import CheckpointMetadata
+from edgegrasp_model.networks.config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     HAND,

@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-
-from edgegrasp_model.ball_batch import BallCrop, crop_balls
-from edgegrasp_model.candidates import Candidates, edge_grasps
-from edgegrasp_model.centred import LEAST_SHIFT, MOST_SHIFT, centred_grasps
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.on_device.balls import DeviceCrop
 from edgegrasp_model.on_device.candidates import DeviceCandidates
 from edgegrasp_model.on_device.centred import centred_grasps as on_device
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.approach import BallCrop, crop_balls
+from edgegrasp_model.candidates.centred import LEAST_SHIFT, MOST_SHIFT, centred_grasps
+from edgegrasp_model.candidates.edge import Candidates, edge_grasps
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.scene.cloud import Cloud
 
 HAND = load_gripper("panda")
 RADIUS = 0.045

@@ -3,10 +3,10 @@ import pickle
 import pytest
 import torch
 
-from edgegrasp_model.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.import_checkpoint import import_checkpoint
-from edgegrasp_model.network_config import EDGEGRASP, VN_EDGEGRASP
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import EDGEGRASP, VN_EDGEGRASP
+from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
 PARTS = ("local_emd_model", "global_emd_model", "classifier_model")
 

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_model.scene.cloud import CloudInput
 
 CASES = 500
 ROWS = 1500  # of the cloud

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.directions import ApproachDirection, Cone, allowed_ways
+from edgegrasp_model.candidates.sample import allowed_ways
+from edgegrasp_model.options import ApproachDirection, Cone
 
 DOWN, UP = np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 0.0, 1.0])
 

@@ -5,8 +5,7 @@ import pytest
 
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.gripper import gripper_names, load_gripper
-from edgegrasp_model.gripper_choice import chosen_gripper
+from edgegrasp_model.gripper import chosen_gripper, gripper_names, load_gripper
 from edgegrasp_model.options import DetectOptions
 
 PANDA = load_gripper("panda")

@@ -7,11 +7,17 @@ import torch.nn.functional as F  # noqa: N812
 from torch import nn
 
 from edgegrasp_model import products
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
-from edgegrasp_model.pieces import BallMaximum, ball_pieces, by_pieces, in_pieces
-from edgegrasp_model.products import MlpProducts, Product
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.layers import (
+    BallMaximum,
+    MlpProducts,
+    Product,
+    ball_pieces,
+    by_pieces,
+    in_pieces,
+)
 
 pytestmark = pytest.mark.skipif(
     not hasattr(torch.ops.mkldnn, "_reorder_linear_weight"), reason="PyTorch has no oneDNN here"

@@ -19,9 +19,12 @@ OPTIONS: dict[str, Any] = {"seed": 7, "num_approach_points": 8, "num_candidates"
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import torch
 
-    from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
-    from edgegrasp_model.network import build_network
-    from edgegrasp_model.network_config import EDGEGRASP_SMALL
+    from edgegrasp_model.networks.checkpoint import (
+        CheckpointMetadata,
+        build_network,
+        save_checkpoint,
+    )
+    from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 
     network = build_network(EDGEGRASP_SMALL, torch.Generator().manual_seed(0))
     path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
@@ -146,8 +149,8 @@ def test_many_options_give_the_same_grasps_everywhere(
     scene: dict[str, np.ndarray], start_server, tmp_path: Path
 ) -> None:
     from edgegrasp_model.catalogue import ModelCatalogue
-    from edgegrasp_model.cloud_input import CloudInput
     from edgegrasp_model.options import parse_options
+    from edgegrasp_model.scene.cloud import CloudInput
 
     expected = ModelCatalogue.load().get().detect(CloudInput(**scene), parse_options(MANY))
     assert expected.grasps

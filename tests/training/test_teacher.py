@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates import support_clearance
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
+from edgegrasp_model.candidates.edge import support_clearance
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.networks.checkpoint import (
+    CheckpointMetadata,
+    build_network,
+    load_checkpoint,
+    save_checkpoint,
+)
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.scene import at_workspace_side
 from edgegrasp_training.examples import (
     SUPPORT,
     TRIED_WEIGHT,

@@ -1,0 +1,178 @@
+"""Where the hand would hit something, how near it comes, and how far its fingers must open."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.edge import support_clearance
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_view.view import HandView, Reach, hand_views, reach_of
+from edgegrasp_model.kernels import clearance, meets
+from edgegrasp_model.options import Collision, SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
+from edgegrasp_model.scene.scene import Scene
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
+TOUCH = 1e-6  # metres; hands drawn back onto the support plane end this near to it
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
+
+
+def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+    """Which open hands meet the cloud, the support plane or an obstacle.
+
+    At the grasp, on the straight way to it and on the way out, each box of the hand grown by the
+    margin on every side.
+
+    Args:
+        scene: Cloud, support plane and obstacles, canonical frame.
+        T_cloud_hand: (E, 4, 4), canonical frame.
+        gripper: Its boxes, fingers open to the maximum.
+        request: Margin and ways.
+
+    Returns:
+        (E,)
+    """
+    hit = meets_cloud(scene.cloud, T_cloud_hand, gripper, request)
+    if scene.support is not None:
+        hit |= meets_support(T_cloud_hand, scene.support, gripper, request)
+    if len(scene.obstacles):
+        hit |= meets_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+    return hit
+
+
+def collision_reach(gripper: Gripper, request: Collision) -> Reach:
+    """What of the cloud a hand sees that might meet it."""
+    lift = request.retreat_length if request.retreat_direction == "up" else 0.0
+    return reach_of(gripper, around=request.margin, back=way_back(request), lift=lift)
+
+
+def meets_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+    """Which open hands meet a point of the cloud.  # (E,)."""
+    boxes = grown_boxes(gripper, request)
+    swept = lengthened(boxes, request)
+    hit = meets(cloud.points, T_cloud_hand, swept)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        free = np.flatnonzero(~hit)
+        view = hand_views(cloud, T_cloud_hand[free], collision_reach(gripper, request))
+        lift = request.retreat_length * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
+        for low, high in boxes:
+            hit[free[view.candidate[_passed_over(view.position, lift, low, high)]]] = True
+    return hit
+
+
+def meets_support(
+    T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which hands come nearer to the support plane than the margin.  # (E,)."""
+    normal = np.asarray(support.normal)
+    height = support_clearance(T_cloud_hand, support, gripper)
+    rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
+    lowest = np.minimum(height, height + way_back(request) * rise)
+    if request.retreat_direction == "up":
+        lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
+    return np.asarray(lowest < request.margin - TOUCH)
+
+
+def meets_obstacles(
+    T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which open hands meet a box.  # (E,)."""
+    grown = grown_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, lengthened(grown, request))
+    hit = _meets_any(at_rest, obstacles, None)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        hands = SolidBoxes.of_hands(T_cloud_hand, grown)
+        hit |= _meets_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
+    return np.asarray(hit.reshape(len(T_cloud_hand), len(grown)).any(axis=1))
+
+
+def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Distance of each open hand at the grasp to what is nearest: cloud, support or obstacle.
+
+    Args:
+        scene: Canonical frame.
+        T_cloud_hand: (E, 4, 4), canonical frame.
+        gripper: Its boxes, fingers open to the maximum.
+
+    Returns:
+        (E,) metres. Where something is within the hand: minus how deep the deepest lies under
+        the surface of the box it is in.
+    """
+    boxes = gripper.boxes(gripper.max_opening)
+    nearest = clearance(scene.cloud.points, T_cloud_hand, boxes)
+    if scene.support is not None:
+        nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
+    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
+    for place in range(len(scene.obstacles)):
+        box = scene.obstacles.take(np.full(len(hands), place))
+        # A bound that costs little leaves few boxes to measure exactly.
+        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
+        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
+        distance = np.full(len(hands), np.inf)
+        distance[near] = signed_distance(hands.take(near), box.take(near))
+        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
+    return nearest.astype(np.float32)
+
+
+def way_back(request: Collision) -> float:
+    """Metres of straight way behind the grasp that the hand passes."""
+    out = request.retreat_length if request.retreat_direction == "back" else 0.0
+    return max(request.approach_length, out)
+
+
+def grown_boxes(gripper: Gripper, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) of the open hand with the margin around them."""
+    boxes = gripper.boxes(gripper.max_opening)
+    boxes[:, 0] -= request.margin
+    boxes[:, 1] += request.margin
+    return boxes
+
+
+def lengthened(boxes: Float64, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) that also cover the ways along the hand's z."""
+    swept = boxes.copy()
+    swept[:, 0, 2] -= way_back(request)
+    return swept
+
+
+def _passed_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
+    """Which points (P, 3) a box (3,), (3,) passes over while it moves by `lift` (P, 3)."""
+    step = np.where(np.abs(lift) < 1e-12, 1e-12, lift)
+    one, other = (position - high) / step, (position - low) / step  # shares of the way
+    enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+    return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
+
+
+def _meets_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
+    """Which boxes (M,), moved along `sweep` (3,), meet an obstacle."""
+    hit = np.zeros(len(boxes), dtype=bool)
+    way = np.zeros(3) if sweep is None else sweep
+    for center, half in zip(obstacles.center, obstacles.half, strict=True):
+        apart = np.linalg.norm(center - boxes.center - way / 2, axis=1)
+        bound = boxes.radius + np.linalg.norm(half) + np.linalg.norm(way) / 2
+        near = np.flatnonzero(~hit & (apart < bound))
+        theirs = SolidBoxes(np.tile(center, (len(near), 1)), np.tile(half, (len(near), 1, 1)))
+        moved = None if sweep is None else np.tile(sweep, (len(near), 1))
+        hit[near] = separation(boxes.take(near), theirs, moved) < 0
+    return hit
+
+
+def required_openings(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
+    """Opening that lets the fingers pass what lies between them.
+
+    Returns:
+        (E,) metres, at most the gripper's maximum.
+    """
+    half = gripper.pad_half_width
+    x, y, z = view.columns
+    inner = gripper.max_opening / 2
+    ahead = (z > gripper.palm_z) & (z < gripper.foremost_z)
+    between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
+    reach = np.zeros(view.num_candidates, dtype=np.float32)
+    np.maximum.at(reach, view.candidate[between], np.abs(y[between]))
+    width: NDArray[np.float32] = np.minimum(2 * (reach + FINGER_CLEARANCE), gripper.max_opening)
+    return width

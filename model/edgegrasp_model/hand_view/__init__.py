@@ -1,0 +1,1 @@
+"""What each hand sees of the cloud in its own frame."""

@@ -1,0 +1,173 @@
+"""The cloud as it is seen from some hands."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.kernels import seen_from
+from edgegrasp_model.scene.cloud import Cloud
+
+Float32 = NDArray[np.float32]
+
+NEAR = 0.006  # metres around a finger that count as near it
+APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
+
+
+class Reach(NamedTuple):
+    """The part of the hand frame that is looked at."""
+
+    low: tuple[float, ...]  # x, y, z, metres
+    high: tuple[float, ...]
+
+
+def reach_of(
+    gripper: Gripper, around: float = NEAR, back: float = APPROACH_LENGTH, lift: float = 0.0
+) -> Reach:
+    """What is within reach of a gripper's boxes and of their straight ways.
+
+    Args:
+        gripper: Open to its maximum.
+        around: Metres on every side of a box; never less than NEAR.
+        back: Metres of way along -z; never less than APPROACH_LENGTH.
+        lift: Metres of way in a direction that is not known.
+    """
+    boxes = gripper.boxes(gripper.max_opening)
+    around, back = max(around, NEAR) + lift, max(back, APPROACH_LENGTH)
+    low = boxes[:, 0].min(axis=0) - np.array([around, around, back + around - NEAR])
+    high = boxes[:, 1].max(axis=0) + np.array([around, around, around + NEAR])
+    high[2] += gripper.foremost_z - gripper.tip_z
+    return Reach(tuple(low.tolist()), tuple(high.tolist()))
+
+
+@dataclass(frozen=True)
+class HandView:
+    """Cloud points in the hand frames of some hands, those out of reach left out."""
+
+    candidate: NDArray[np.int64]  # (P,) ascending
+    row: NDArray[np.int64]  # (P,) row of the cloud
+    position: Float32  # (P, 3) in the hand frame
+    num_candidates: int
+    reach: Reach
+
+    @cached_property
+    def columns(self) -> Float32:
+        """The positions with x, y, z in rows (3, P): a row at a time is many times faster."""
+        return np.ascontiguousarray(self.position.T)
+
+    def take(self, rows: NDArray[np.int64]) -> "HandView":
+        """The views of the given hands, which must ascend."""
+        renumbered = np.full(self.num_candidates, -1, dtype=np.int64)
+        renumbered[rows] = np.arange(len(rows))
+        kept = renumbered[self.candidate] >= 0
+        candidate = renumbered[self.candidate[kept]]
+        return HandView(candidate, self.row[kept], self.position[kept], len(rows), self.reach)
+
+    def within(self, reach: Reach) -> "HandView":
+        """The same views, cut down to a smaller reach."""
+        if reach == self.reach:
+            return self
+        low, high = np.asarray(reach, dtype=np.float32)
+        kept = within_box(self.columns, low, high)
+        return HandView(
+            self.candidate[kept],
+            self.row[kept],
+            self.position[kept],
+            self.num_candidates,
+            reach,
+        )
+
+
+def within_box(
+    columns: Float32, low: NDArray[np.floating], high: NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """Which points, given as rows x, y, z (3, P), lie between two corners (3,)."""
+    inside: NDArray[np.bool_] = columns[0] > low[0]
+    inside &= columns[0] < high[0]
+    for axis in (1, 2):
+        inside &= columns[axis] > low[axis]
+        inside &= columns[axis] < high[axis]
+    return inside
+
+
+def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
+    """See the cloud from each hand.
+
+    Args:
+        cloud: N points.
+        T_cloud_hand: (E, 4, 4).
+        reach: What is kept.
+    """
+    low, high = np.asarray(reach, dtype=np.float32)
+    hand, row, position = seen_from(cloud.points, T_cloud_hand, low, high)
+    return HandView(hand, row, position, len(T_cloud_hand), reach)
+
+
+# Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
+BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
+
+
+def mirror_sides(T_cloud_hand: Float32, viewpoint: Float32 | None) -> Float32:
+    """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
+
+    1 for all where the viewpoint is not known.
+    """
+    if viewpoint is None:
+        return np.ones(len(T_cloud_hand), dtype=np.float32)
+    toward = viewpoint - T_cloud_hand[:, :3, 3]
+    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
+
+
+def points_around_fingers(
+    normals: Float32,
+    T_cloud_hand: Float32,
+    gripper: Gripper,
+    viewpoint: Float32 | None,
+    view: HandView,
+    limit: int,
+) -> tuple[Float32, NDArray[np.int64]]:
+    """What each hand sees of the cloud around its fingers.
+
+    Args:
+        normals: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        gripper: Fingers open to its maximum.
+        viewpoint: (3,) the only camera; where it is known, x points to its side.
+        view: `hand_views` of the same hands, reaching at least `hand_view.reach_of` the gripper.
+        limit: Points kept of each hand, spread evenly over the cloud's order.
+
+    Returns:
+        (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
+        zeros behind the last; and their number (E,).
+    """
+    x, y, z = view.columns
+    near = (
+        (np.abs(x) < gripper.pad_half_width + BESIDE)
+        & (np.abs(y) < gripper.max_opening / 2 + OUTSIDE)
+        & (z > gripper.palm_z - BEHIND)
+        & (z < gripper.tip_z + BEYOND)
+    )
+    candidate, row, position = view.candidate[near], view.row[near], view.position[near]
+    found = np.bincount(candidate, minlength=view.num_candidates)
+    rank = np.arange(len(candidate)) - (np.cumsum(found) - found)[candidate]
+    kept_before = _kept(rank, found[candidate], limit)
+    kept = _kept(rank + 1, found[candidate], limit) > kept_before
+    candidate, slot = candidate[kept], kept_before[kept]
+    side = mirror_sides(T_cloud_hand, viewpoint)[candidate, None]  # (Q, 1)
+    turn = T_cloud_hand[candidate, :3, :3]
+    points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
+    points[candidate, slot, :3] = position[kept] - np.array(
+        [0.0, 0.0, gripper.tip_z], dtype=np.float32
+    )
+    points[candidate, slot, 3:] = np.einsum("pd,pdk->pk", normals[row[kept]], turn)
+    points[candidate, slot, 0::3] *= side
+    return points, np.minimum(found, limit)
+
+
+def _kept(rank: NDArray[np.int64], found: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
+    """How many of the first `rank` of `found` points are kept."""
+    return np.where(found > limit, rank * limit // np.maximum(found, 1), rank)

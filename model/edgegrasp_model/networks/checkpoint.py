@@ -1,0 +1,156 @@
+"""Checkpoints: a network's weights and what is needed to use them, in one safetensors file.
+
+The file's metadata holds one JSON text under the key `edgegrasp`; nothing in it is ever executed.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from edgegrasp_model.errors import InvalidCheckpoint
+from edgegrasp_model.networks.config import Architecture, NetworkConfig
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.hand import HandNet
+from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
+
+_METADATA_KEY = "edgegrasp"
+_FORMAT = 1
+NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
+    "edgegrasp": EdgeGraspNet,
+    "vn-edgegrasp": VNEdgeGraspNet,
+    "hand": HandNet,
+}
+
+
+@dataclass(frozen=True)
+class CheckpointMetadata:
+    """What a checkpoint says of itself.
+
+    The digest is the file's SHA-256, in hex; empty until the checkpoint was loaded from a file.
+
+    Raises:
+        ValueError: A field is out of range; names the field, the value and the fix.
+    """
+
+    name: str  # the model's name, such as `edgegrasp-plus`
+    network: NetworkConfig
+    voxel_size: float  # metres; the clouds it was trained on
+    gripper: str  # name of the gripper it was trained for
+    temperature: float = 1.0  # calibration: probability = sigmoid(logit / temperature)
+    training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.voxel_size < 1.0:
+            raise ValueError(f"voxel_size: got {self.voxel_size!r}. Give metres, such as 0.0045.")
+        if not 0.0 < self.temperature < float("inf"):
+            raise ValueError(f"temperature: got {self.temperature!r}. Give a positive number.")
+
+    @property
+    def crop_radius(self) -> float:
+        """Ball radius, metres."""
+        return self.network.crop_radius
+
+    @property
+    def k(self) -> int:
+        """Neighbours of a point, itself included."""
+        return self.network.k
+
+
+def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:
+    """Writes a checkpoint; a reader sees the old file or the new one, never half of it.
+
+    The same weights and metadata make the same bytes.
+
+    Args:
+        path: File to write, usually `<name>.safetensors`.
+        network: Built from `metadata.network`.
+        metadata: What to say of it; its digest is not written.
+    """
+    values = asdict(metadata) | {"format": _FORMAT, "network": metadata.network.to_dict()}
+    del values["digest"]
+    text = json.dumps(values, sort_keys=True)
+    tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
+    partial = path.with_name(path.name + ".partial")
+    save_file(tensors, partial, metadata={_METADATA_KEY: text})
+    partial.replace(path)
+
+
+def load_checkpoint(
+    path: Path, device: torch.device | str = "cpu"
+) -> tuple[nn.Module, CheckpointMetadata]:
+    """Loads a checkpoint; the network comes in evaluation mode.
+
+    Raises:
+        InvalidCheckpoint: The file is missing, truncated, foreign, or its weights do not fit the
+            network that its metadata describes.
+    """
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            text = (file.metadata() or {}).get(_METADATA_KEY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except (OSError, SafetensorError) as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, which cannot be read as safetensors ({error}). "
+            "Give a complete file written by `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+    metadata = replace(_read_metadata(path, text), digest=digest)
+    network = build_network(metadata.network)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose weights do not fit its own metadata ({error}). "
+            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+    return network.to(device).eval(), metadata
+
+
+def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
+    if text is None:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, a safetensors file without edgegrasp metadata. "
+            "Convert foreign weights with `edgegrasp import-checkpoint`."
+        )
+    try:
+        values = json.loads(text)
+        written = values.pop("format")
+        if written != _FORMAT:
+            raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
+        values["network"] = NetworkConfig.from_dict(values["network"])
+        return CheckpointMetadata(**values)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose edgegrasp metadata is unusable ({error!r}). "
+            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+
+
+def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
+    """Builds a network with random weights.
+
+    Args:
+        config: Its architecture and widths.
+        generator: Source of the weights; without one, those of seed 0.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    # The layers first initialise themselves from the global stream: leave it as it was.
+    with torch.random.fork_rng(devices=[]):
+        network = NETWORKS[config.architecture](config)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.
+            bound = module.in_features**-0.5
+            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
+            if module.bias is not None:
+                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
+    return network

@@ -1,0 +1,237 @@
+"""A request's scene: the small clean cloud in the canonical frame, and what else is there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.scene.cloud import (
+    CheckedCloud,
+    Cloud,
+    Voxels,
+    assumed_viewpoint,
+    estimate_normals,
+    orient_normals,
+    statistical_outlier_removal,
+    voxelise,
+)
+from edgegrasp_model.scene.frame import CanonicalFrame
+from edgegrasp_model.scene.obstacles import SolidBoxes
+from edgegrasp_model.scene.regions import check_region, inside_region
+from edgegrasp_model.scene.support import SUPPORT_MARGIN, correct_depth_scale, find_support_plane
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+MIN_POINTS = 4  # fewer make no surface
+MIN_NORMAL = 1e-3  # length of the mean of a voxel's normals below which they say nothing
+SIDE_DEPTH = 0.006  # metres inside a side of the workspace where points may belong to what it cuts
+SUPPORT_STREAM = 2  # random stream of one request
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What grasps are looked for in; canonical frame. V points are left of the cloud."""
+
+    frame: CanonicalFrame
+    cloud: Cloud  # V points
+    points_in_cloud: Float32  # (V, 3) the same in the cloud's frame
+    point_of_row: Int64  # (R,) point that each row of the cloud as sent went into; -1: none
+    approach_allowed: Bools  # (V,) in the approach region
+    contact_allowed: Bools  # (V,) in the contact region
+    support: SupportPlane | None
+    obstacles: SolidBoxes
+    viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
+    at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
+
+
+def build_scene(
+    sent: CheckedCloud,
+    options: DetectOptions,
+    voxel_size: float,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> Scene | None:
+    """Correct depths, crop, take the support away, voxelise, get normals, find the regions.
+
+    Args:
+        sent: N points.
+        options: workspace, support, viewpoint, up, regions and obstacles.
+        voxel_size: Metres.
+        counts: Gets the number of points left after each step.
+        warnings: Gets what the caller should know.
+
+    Returns:
+        The scene, or None where too few points are left to make a surface.
+
+    Raises:
+        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
+            views do not suit the viewpoints, or there are none to correct depths from.
+    """
+    viewpoints = check_viewpoints(sent, options)
+    sent, support = cut_out(sent, viewpoints, options, counts, warnings)
+    if len(sent.points) == 0:
+        counts |= {"voxels": 0, "kept": 0}
+        return None
+    first_viewpoint = None if viewpoints is None else viewpoints[0]
+    frame = CanonicalFrame.of_scene(sent.points, options.up, first_viewpoint)
+    points = frame.points(sent.points)
+    voxels = voxelise(points, voxel_size)
+    middles = voxels.mean(points)
+    counts["voxels"] = len(middles)
+    kept = statistical_outlier_removal(middles)
+    counts["kept"] = int(kept.sum())
+    if counts["kept"] < MIN_POINTS:
+        return None
+    cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
+    in_cloud = frame.points_in_cloud(middles)
+    approach = inside_region(options.approach_region, in_cloud, voxels, sent)[kept]
+    counts["in_approach_region"] = int(approach.sum())
+    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
+    point_of_row[sent.row] = number[voxels.voxel]
+    return Scene(
+        frame=frame,
+        cloud=cloud,
+        points_in_cloud=in_cloud[kept],
+        point_of_row=point_of_row,
+        approach_allowed=approach,
+        contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
+        support=None if support is None else plane_in_frame(support, frame),
+        at_side=at_workspace_side(in_cloud[kept], options.workspace, options.up),
+        viewpoint=only_viewpoint(viewpoints, frame),
+        obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
+    )
+
+
+def cut_out(
+    sent: CheckedCloud,
+    viewpoints: NDArray[np.float64] | None,
+    options: DetectOptions,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> tuple[CheckedCloud, SupportPlane | None]:
+    """The cloud, its depths put right, within the workspace and above its support; the support.
+
+    Raises:
+        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
+            are no viewpoints (W, 3) to correct depths from.
+    """
+    check_region(options.approach_region, sent, "approach_region")
+    check_region(options.contact_region, sent, "contact_region")
+    counts["points"] = len(sent.points)
+    sent = correct_depth_scale(sent, options, viewpoints, warnings)
+    sent = cut_to_workspace(sent, options)
+    counts["in_workspace"] = len(sent.points)
+    support, sent = remove_support_plane(sent, options, warnings)
+    counts["above_support"] = len(sent.points)
+    return sent, support
+
+
+def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
+    """Which points (N, 3), in the cloud's frame, lie where a side of the workspace cuts things off.
+
+    Its floor and ceiling are no sides: the one cuts off what the hand does not grasp, the other
+    what is above all.
+    """
+    if workspace is None:
+        return np.zeros(len(points), dtype=bool)
+    level = np.abs(np.asarray(up)) < np.linalg.norm(up) / 2
+    beyond_low = points < np.asarray(workspace.min) + SIDE_DEPTH
+    beyond_high = points > np.asarray(workspace.max) - SIDE_DEPTH
+    return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
+
+
+def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
+    """The camera positions (W, 3), where any are given."""
+    if options.viewpoint is None:
+        return None
+    viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
+    if len(viewpoints) == 1:
+        return viewpoints
+    if sent.view_ids is None:
+        fix = "Send one number for each point: which of options.viewpoint saw it, from 0."
+        raise InvalidRequest("view_ids", f"nothing, for {len(viewpoints)} viewpoints", fix)
+    low, high = int(sent.view_ids.min()), int(sent.view_ids.max())
+    if low < 0 or high >= len(viewpoints):
+        fix = f"Send numbers from 0 to {len(viewpoints) - 1}, rows of options.viewpoint."
+        raise InvalidRequest("view_ids", f"values from {low} to {high}", fix)
+    return viewpoints
+
+
+def only_viewpoint(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
+    """The camera (3,) in the canonical frame, if there is just one."""
+    if viewpoints is None or len(viewpoints) != 1:
+        return None
+    return frame.points(viewpoints[0]).astype(np.float32)
+
+
+def cut_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
+    """The part of a cloud within the workspace."""
+    if options.workspace is None:
+        return sent
+    box = options.workspace
+    inside = (sent.points >= np.asarray(box.min)) & (sent.points <= np.asarray(box.max))
+    return sent.take(np.asarray(inside.all(axis=1)))
+
+
+def remove_support_plane(
+    sent: CheckedCloud, options: DetectOptions, warnings: list[str]
+) -> tuple[SupportPlane | None, CheckedCloud]:
+    """The support plane, given or found, and the cloud above it."""
+    request = options.support
+    if request is None:
+        return None, sent
+    if isinstance(request, SupportPlane):
+        return request, _above(sent, request, SUPPORT_MARGIN)
+    rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
+    found = find_support_plane(sent.points, request, options.up, rng)
+    if found is None:
+        warnings.append("no support plane was found: the cloud is taken as it is.")
+        return None, sent
+    return found, _above(sent, found, request.distance)
+
+
+def _above(sent: CheckedCloud, plane: SupportPlane, margin: float) -> CheckedCloud:
+    return sent.take(np.asarray(plane.heights(sent.points) > margin))
+
+
+def _normals(
+    sent: CheckedCloud,
+    middles: Float32,
+    kept: Bools,
+    voxels: Voxels,
+    frame: CanonicalFrame,
+    viewpoints: NDArray[np.float64] | None,
+) -> Float32:
+    """Unit normals of the kept voxels: those given, else estimated and turned to the camera."""
+    points = middles[kept]
+    seen_from = assumed_viewpoint(points, np.array([0.0, 0.0, 1.0], dtype=np.float32))
+    if viewpoints is not None:
+        seen_from = frame.points(viewpoints).astype(np.float32)
+        if len(viewpoints) > 1 and sent.view_ids is not None:
+            seen_from = seen_from[voxels.commonest(sent.view_ids, len(viewpoints))[kept]]
+    normals = orient_normals(points, estimate_normals(points), seen_from)
+    if sent.normals is None:
+        return normals
+    given = frame.directions(voxels.mean(_unit(sent.normals))[kept])
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    given = given / np.maximum(length, MIN_NORMAL)
+    return np.where(length >= MIN_NORMAL, given, normals).astype(np.float32)
+
+
+def _unit(vectors: Float32) -> Float32:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(lengths, 1e-12))
+
+
+def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:
+    """A plane of the cloud's frame in the canonical one."""
+    normal = np.asarray(plane.normal)
+    length = float(np.linalg.norm(normal))
+    foot = frame.points(normal * (plane.offset / length**2))
+    x, y, z = (frame.directions(normal) / length).tolist()
+    return SupportPlane(normal=(x, y, z), offset=float(foot @ np.array([x, y, z])))
