@@ -24,7 +24,7 @@ from edgegrasp_model.given import (
     from_hand_poses,
     hand_batch,
 )
-from edgegrasp_model.gripper import Gripper, chosen_gripper, load_gripper
+from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import CheckpointMetadata, load_checkpoint
 from edgegrasp_model.networks.hand import HandBatch
@@ -48,7 +48,7 @@ Batch = BallBatch | HandBatch
 
 @dataclass
 class Prepared:
-    """A request between the stages: what to score, and what to make of the scores."""
+    """A request between the stages: what to score, and what turns scores into grasps."""
 
     options: DetectOptions
     gripper: Gripper
@@ -146,7 +146,7 @@ class GraspDetector:
         return self.finish(prepared, logits)
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
-        """First stage: everything before the network, on the processor."""
+        """First stage: everything before the network."""
         prepared = self._with_scene(check_cloud(cloud, options.num_approach_points), options)
         scene, gripper = prepared.scene, prepared.gripper
         if scene is None:
@@ -202,10 +202,10 @@ class GraspDetector:
     ) -> Scoring:
         """Score edges or hand poses of the caller's (the paper's grasp evaluation function).
 
-        Options say what the scene is, which hand it is and what it must not meet. Regions,
+        Options describe the scene, the hand and what it must not collide with. Regions,
         directions and what concerns sampling and selection have no effect. The hand of an edge
-        that would cut into the support plane is drawn back where that helps, as in `detect`;
-        given hand poses stay.
+        that would cut into the support plane is retracted where that helps, as in `detect`; given
+        hand poses stay as they are.
 
         Args:
             cloud: As for `detect`.
@@ -253,7 +253,7 @@ class GraspDetector:
 
     def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
         """Choose the gripper and build the scene, where enough of the cloud is left."""
-        prepared = self._begun(sent, options)
+        prepared = self._start(sent, options)
         with prepared.timed("cloud"):
             prepared.scene = build_scene(
                 sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
@@ -262,9 +262,9 @@ class GraspDetector:
             prepared.warn_of_few_points()
         return prepared
 
-    def _begun(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
-        """Choose the gripper and the balls, and warn of what is not known."""
-        gripper = chosen_gripper(options, self.gripper, self.grippers)
+    def _start(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
+        """Choose the gripper and the crop radius; warn of what is unknown."""
+        gripper = choose_gripper(options, self.gripper, self.grippers)
         radius = self.metadata.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
             radius = max(radius, gripper.max_opening / 2)

@@ -16,7 +16,7 @@ from edgegrasp_model.scene.scene import Scene
 Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
 
-COLLIDING = 0.5  # a score is worth this share where the hand meets something, as far as one sees
+COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 OUTCOMES = list(Outcome)
 

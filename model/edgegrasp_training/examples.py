@@ -21,7 +21,7 @@ from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.scene.frame import CanonicalFrame
-from edgegrasp_model.scene.scene import at_workspace_side
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, LabelledView
 
@@ -129,7 +129,7 @@ def tried_grasps(
             UP,
             SUPPORT,
             view.camera_position if viewpoint_known else None,
-            at_workspace_side(view.points, WORKSPACE, UP),
+            near_workspace_side(view.points, WORKSPACE, UP),
             SPARE_POINTS * config.hand_points,
         )
         description, points = batch.description.numpy(), batch.points.numpy()

@@ -16,7 +16,7 @@ from edgegrasp_model.networks.checkpoint import (
 )
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
-from edgegrasp_model.scene.scene import at_workspace_side
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (
     SUPPORT,
     TRIED_WEIGHT,
@@ -75,7 +75,7 @@ def test_lessons_hold_what_the_teacher_says_of_candidates_above_the_table(
         UP,
         SUPPORT,
         view.camera_position,
-        at_workspace_side(view.points, WORKSPACE, UP),
+        near_workspace_side(view.points, WORKSPACE, UP),
         HAND.hand_points,
     )
     with torch.inference_mode():

@@ -1,4 +1,4 @@
-"""Hands moved sideways until what is seen between their fingers lies in the middle."""
+"""Candidates for wide objects: hands centred on what they see between their fingers."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ from edgegrasp_model.gripper import Gripper
 
 Float32 = NDArray[np.float32]
 
-WIDE = 0.75  # share of the opening from which on it matters where the middle is
+WIDE = 0.75  # share of the opening from which an object counts as wide
 BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
 
 
-LEAST_SHIFT, MOST_SHIFT = 0.001, 0.008  # metres; further off, another approach point does better
+MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; beyond, another approach point does better
 
 
 def centred_grasps(
@@ -21,9 +21,9 @@ def centred_grasps(
 ) -> Candidates:
     """Candidates for wide objects: hands moved along their closing direction.
 
-    The hand of an edge grasp is centred on its approach point. On an object almost as wide as the
-    hand opens, hardly one of the points that were drawn lies in the middle. What is seen between
-    the fingers is what of it is in the ball; whether the hand fits is left to the collision check.
+    The hand of an edge grasp is centred on its approach point, and few sampled points lie in the
+    middle of an object almost as wide as the hand opens. Its extent is taken from the points of
+    the ball between the fingers; whether the hand fits is left to the collision check.
 
     Args:
         points: (N, 3) the cloud.
@@ -32,11 +32,11 @@ def centred_grasps(
         gripper: Gives the opening and the pads.
 
     Returns:
-        One for each candidate with a wide object between its fingers that is off the middle.
+        One for each candidate with a wide object off centre between its fingers.
     """
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
-    wide = np.flatnonzero(np.abs(outward) > least_outward(gripper))
+    wide = np.flatnonzero(np.abs(outward) > min_contact_offset(gripper))
     ball = crop.ball_of_point[candidates.pair[wide]]
     first = np.searchsorted(crop.ball_of_point, np.arange(ball.max(initial=-1) + 2))
     low, high = np.full((2, len(wide)), np.nan, dtype=np.float32)
@@ -49,17 +49,17 @@ def centred_grasps(
             for axis in range(3)
         )  # (P, K) each, hand frame
         between = np.abs(x) < gripper.pad_half_width + BESIDE_PADS
-        between &= (z > gripper.palm_z) & (z < gripper.foremost_z)
+        between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
         low[here] = np.where(between, y, np.inf).min(axis=0)
         high[here] = np.where(between, y, -np.inf).max(axis=0)
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
-    moved &= (np.abs(middle) > LEAST_SHIFT) & (np.abs(middle) < MOST_SHIFT)
+    moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
     further = candidates.take(wide[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
     return further
 
 
-def least_outward(gripper: Gripper) -> float:
-    """How far from the hand's axis a contact lies at least on an object that is wide, metres."""
-    return WIDE * gripper.max_opening / 2 - MOST_SHIFT
+def min_contact_offset(gripper: Gripper) -> float:
+    """Least distance between the hand's axis and a contact on a wide object, metres."""
+    return WIDE * gripper.max_opening / 2 - MAX_SHIFT

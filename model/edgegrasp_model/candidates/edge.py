@@ -17,7 +17,7 @@ Int64 = NDArray[np.int64]
 MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
 MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
-TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand is drawn back
+TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def edge_grasps(
 
 
 class EdgeMeasures(NamedTuple):
-    """Edges r = p_c - p_a, taken apart by the normal at the contact."""
+    """Edges r = p_c - p_a, decomposed along the normal at the contact."""
 
     normal: Float32  # (M, 3) unit n_c
     along: Float32  # (M,) r . n_c, metres
@@ -143,10 +143,10 @@ def edge_grasp_poses(
 def retract(
     candidates: Candidates, support: SupportPlane, gripper: Gripper, margin: float = 0.0
 ) -> tuple[Candidates, NDArray[np.bool_]]:
-    """Draw hands that would cut into the support plane back along their approach, if that helps.
+    """Retract hands that would cut into the support plane along their approach, where that helps.
 
-    The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: what
-    lies flat on a table is held by the tips.
+    The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: flat
+    objects on a table are held by the tips.
 
     Args:
         candidates: E of them.
@@ -155,8 +155,8 @@ def retract(
         margin: Metres that the hand stays above the plane.
 
     Returns:
-        The candidates, and which of their hands (E,) stay above the plane; the others are as
-        they were.
+        The candidates, and which of their hands (E,) are above the plane now; the others are
+        unchanged.
     """
     clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
@@ -171,7 +171,7 @@ def retract(
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
     """Height of the lowest corner of each hand, fingers open, over the support plane.
 
-    Fingers that swing count as far ahead as they come when they close.
+    Fingers on a linkage count at their most forward position on the way to closed.
 
     Args:
         T_cloud_hand: (E, 4, 4).
@@ -181,7 +181,7 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
     Returns:
         (E,) metres; negative below the plane.
     """
-    boxes = gripper.boxes(gripper.max_opening, gripper.foremost_z - gripper.tip_z)
+    boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
     normal = np.asarray(support.normal)
     normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)

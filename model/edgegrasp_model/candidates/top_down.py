@@ -1,4 +1,4 @@
-"""Candidates for low things: the hand comes from straight above."""
+"""Top-down candidates for low objects, whose sides are hardly seen."""
 
 from typing import Any, NamedTuple
 
@@ -11,16 +11,16 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
-LOW = 0.03  # metres over the support plane up to which contacts get a level grasp too
+LOW = 0.03  # metres over the support plane up to which contacts get a top-down grasp too
 MIN_LEVEL = 0.3  # horizontal part of a normal from which its heading can be trusted
 OUTLINE_RADIUS = 0.012  # metres of surface that say where the outline of a flat top runs
-MIN_OUTWARD = 0.003  # metres that a point on the outline lies further out than their middle
-MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a level grasp
-MIN_DROP = -0.002  # metres a contact may lie above the approach point of a level grasp
+MIN_OUTWARD = 0.003  # metres from a neighbourhood's mean to a point on the outline
+MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a top-down grasp
+MIN_DROP = -0.002  # metres a contact may lie above the approach point of a top-down grasp
 
 
 class Headings(NamedTuple):
-    """Which way, seen from above, a cloud's surface faces at each of its N points."""
+    """The horizontal heading of the surface at each of a cloud's N points."""
 
     direction: Float32  # (N, 3) unit, along the support plane
     certain: NDArray[np.bool_]  # (N,) which can be trusted
@@ -34,12 +34,11 @@ def top_down_grasps(
     gripper: Gripper,
     headings: Headings | None = None,
 ) -> Candidates:
-    """Candidates straight down onto low contacts, the closing direction level.
+    """Candidates that come straight down onto low contacts and close horizontally.
 
-    The normals at the sides of a flat object are bent upward by its top, so that a hand which
-    closes along them would cut into the table: here they count by their heading only. Of a very
-    flat one only the top is seen, and the normals say nothing: there the heading is that of its
-    outline, as seen from above.
+    Near a flat object's top edge the estimated normals tilt upward, and a hand that closes along
+    them would cut into the table: here only their horizontal heading counts. Of a very flat
+    object only the top is seen; there the heading is that of the outline seen from above.
 
     Args:
         cloud: The cloud with its normals.
@@ -78,7 +77,7 @@ def top_down_grasps(
 
 
 def closing_headings(cloud: Cloud, support: SupportPlane) -> Headings:
-    """Which way, seen from above, the cloud's surface faces at each point low over the support.
+    """The horizontal heading of the surface at each point low over the support.
 
     Args:
         cloud: N points.

@@ -1,8 +1,8 @@
 """Describe each candidate by what the cloud looks like from its own hand.
 
-Invariant under rotations, translations and reflections of the whole scene by construction, and
-quick to learn from: how many points the hand would hit, what lies between its fingers, from where
-it was seen, how it stands to gravity and support.
+Invariant under rotations, translations and reflections of the whole scene by construction: how
+many points the hand would hit, what lies between its fingers, from where it was seen, and how the
+hand stands to gravity and support.
 """
 
 from typing import NamedTuple
@@ -208,7 +208,7 @@ def _between_fingers(
 ) -> list[Float32]:
     """Extent, middle and normals of what the closing fingers would meet."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
-    length = gripper.foremost_z - gripper.palm_z
+    length = gripper.max_tip_z - gripper.palm_z
     above = seen.z - gripper.palm_z
     around = (np.abs(seen.y) < inner) & (above > 0) & (above < length)
     points = seen.where(around & (np.abs(seen.x) < 3 * half))

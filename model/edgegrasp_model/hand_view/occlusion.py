@@ -18,11 +18,11 @@ Float32 = NDArray[np.float32]
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers: as far as the next point of the cloud
 BEHIND = 0.004  # metres behind a surface that may still be the surface
-DEEP = 0.02  # metres further on from which space is wholly unknown
+DEEP = 0.02  # metres further behind at which space counts as wholly unknown
 NOTHING = np.float32(np.inf)
 STEEP = 1e-3  # sine of the angle to up below which up says nothing about the map
-HALF = 256  # cells from the middle of the map that it reaches to at most: some 0.5 m
-FARTHEST = 10 * HALF  # stands for all that are farther
+HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
+FARTHEST = 10 * HALF  # stands for everything farther away
 
 
 def occlusion_fractions(
@@ -32,7 +32,7 @@ def occlusion_fractions(
     up: Float32,
     gripper: Gripper,
 ) -> list[Float32]:
-    """How much of each part of a hand, and of the space around it, the camera did not see.
+    """The fraction of each part of a hand, and of the space around it, that the camera did not see.
 
     Args:
         points: (N, 3) of the cloud.
@@ -93,7 +93,7 @@ def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
     return grid.astype(np.float32)
 
 
-class MapFrame(NamedTuple):
+class CameraFrame(NamedTuple):
     """How a camera looks at a cloud: what directions the cells of its depth map stand for."""
 
     viewpoint: Float32  # (3,)
@@ -125,7 +125,7 @@ class MapFrame(NamedTuple):
 class DepthMap:
     """Distance of the first surface in each direction from a camera."""
 
-    frame: MapFrame
+    frame: CameraFrame
     distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
 
     @classmethod
@@ -137,7 +137,7 @@ class DepthMap:
             viewpoint: (3,) in the same frame.
             up: (3,) turns the map, so that it turns with the scene.
         """
-        frame = MapFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
+        frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
         cell, distance = frame.seen(points)
         half = min(int(np.abs(cell).max()) + SPLAT, HALF)
         depth = np.full((2 * half + 1, 2 * half + 1), NOTHING)

@@ -14,19 +14,19 @@ MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 
 @dataclass(frozen=True)
 class CanonicalFrame:
-    """z along up, x horizontally toward the camera, the origin amid the points."""
+    """z along up, x horizontally toward the camera, the origin at the points' mean."""
 
     T_canonical_cloud: Float64  # (4, 4)
 
     @classmethod
     def of_scene(cls, points: Float32, up: ArrayLike, viewpoint: ArrayLike | None) -> Self:
-        """Fix the frame to a scene, so that a turned scene has the frame turned with it.
+        """Fix the frame to the scene: it turns and moves with the scene.
 
         Args:
             points: (N, 3) metres.
             up: (3,) of any length but zero.
             viewpoint: (3,) the camera. Where there is none, or it is straight above, x points to
-                the point furthest out instead.
+                the furthest point instead.
         """
         origin = points.mean(axis=0, dtype=np.float64)
         z = np.asarray(up, dtype=np.float64)

@@ -27,8 +27,8 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MIN_POINTS = 4  # fewer make no surface
-MIN_NORMAL = 1e-3  # length of the mean of a voxel's normals below which they say nothing
-SIDE_DEPTH = 0.006  # metres inside a side of the workspace where points may belong to what it cuts
+MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
+SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
 SUPPORT_STREAM = 2  # random stream of one request
 
 
@@ -55,7 +55,7 @@ def build_scene(
     counts: dict[str, int],
     warnings: list[str],
 ) -> Scene | None:
-    """Correct depths, crop, take the support away, voxelise, get normals, find the regions.
+    """Correct depths, crop, remove the support, voxelise, estimate normals, find the regions.
 
     Args:
         sent: N points.
@@ -71,8 +71,8 @@ def build_scene(
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
             views do not suit the viewpoints, or there are none to correct depths from.
     """
-    viewpoints = check_viewpoints(sent, options)
-    sent, support = cut_out(sent, viewpoints, options, counts, warnings)
+    viewpoints = camera_positions(sent, options)
+    sent, support = crop_cloud(sent, viewpoints, options, counts, warnings)
     if len(sent.points) == 0:
         counts |= {"voxels": 0, "kept": 0}
         return None
@@ -101,20 +101,20 @@ def build_scene(
         approach_allowed=approach,
         contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
         support=None if support is None else plane_in_frame(support, frame),
-        at_side=at_workspace_side(in_cloud[kept], options.workspace, options.up),
-        viewpoint=only_viewpoint(viewpoints, frame),
+        at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
+        viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
 
 
-def cut_out(
+def crop_cloud(
     sent: CheckedCloud,
     viewpoints: NDArray[np.float64] | None,
     options: DetectOptions,
     counts: dict[str, int],
     warnings: list[str],
 ) -> tuple[CheckedCloud, SupportPlane | None]:
-    """The cloud, its depths put right, within the workspace and above its support; the support.
+    """Correct the depths, crop to the workspace and remove the support plane, which is returned too.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
@@ -124,18 +124,17 @@ def cut_out(
     check_region(options.contact_region, sent, "contact_region")
     counts["points"] = len(sent.points)
     sent = correct_depth_scale(sent, options, viewpoints, warnings)
-    sent = cut_to_workspace(sent, options)
+    sent = crop_to_workspace(sent, options)
     counts["in_workspace"] = len(sent.points)
     support, sent = remove_support_plane(sent, options, warnings)
     counts["above_support"] = len(sent.points)
     return sent, support
 
 
-def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
-    """Which points (N, 3), in the cloud's frame, lie where a side of the workspace cuts things off.
+def near_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
+    """Which points (N, 3), in the cloud's frame, lie at a side of the workspace.
 
-    Its floor and ceiling are no sides: the one cuts off what the hand does not grasp, the other
-    what is above all.
+    An object there may be cut off, and wider than it seems. Floor and ceiling do not count.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)
@@ -145,8 +144,8 @@ def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLik
     return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
 
 
-def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
-    """The camera positions (W, 3), where any are given."""
+def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
+    """The camera positions (W, 3) that the request gives, if any."""
     if options.viewpoint is None:
         return None
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
@@ -162,14 +161,16 @@ def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.f
     return viewpoints
 
 
-def only_viewpoint(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
-    """The camera (3,) in the canonical frame, if there is just one."""
+def single_viewpoint(
+    viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame
+) -> Float32 | None:
+    """The camera (3,) in the canonical frame, if there is exactly one."""
     if viewpoints is None or len(viewpoints) != 1:
         return None
     return frame.points(viewpoints[0]).astype(np.float32)
 
 
-def cut_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
+def crop_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
     """The part of a cloud within the workspace."""
     if options.workspace is None:
         return sent
