@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CloudInput
 
 from .clouds import CASES, Case, points_of
 

@@ -114,7 +114,7 @@ def crop_cloud(
     counts: dict[str, int],
     warnings: list[str],
 ) -> tuple[CheckedCloud, SupportPlane | None]:
-    """Correct the depths, crop to the workspace and remove the support plane, which is returned too.
+    """Correct the depths, crop to the workspace and remove the support plane; returns both.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
