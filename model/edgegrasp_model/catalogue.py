@@ -12,6 +12,7 @@ from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, UnknownModel
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.scene.scene import MAX_VOXELS
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
@@ -46,6 +47,7 @@ class ModelCatalogue:
         default: str = "",
         device: torch.device | str = "cpu",
         grippers: Sequence[Path] = (),
+        max_voxels: int = MAX_VOXELS,
     ) -> Self:
         """Load the weights that ship with the package, then a user's own, which win by name.
 
@@ -54,6 +56,7 @@ class ModelCatalogue:
             default: As for the constructor.
             device: Where the networks run.
             grippers: Gripper files that requests may name by their stem.
+            max_voxels: Most voxels that a request's cloud may have.
 
         Raises:
             InvalidCheckpoint: A file cannot be used, or there is none.
@@ -67,9 +70,10 @@ class ModelCatalogue:
             files |= {
                 file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
             }
-        return cls(
-            {name: GraspDetector.load(file, device, own) for name, file in files.items()}, default
-        )
+        detectors = {
+            name: GraspDetector.load(file, device, own, max_voxels) for name, file in files.items()
+        }
+        return cls(detectors, default)
 
     def names(self) -> list[str]:
         """Names of the models, sorted."""

@@ -32,7 +32,7 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
 from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud
-from edgegrasp_model.scene.scene import Scene, build_scene
+from edgegrasp_model.scene.scene import MAX_VOXELS, Scene, build_scene
 
 Float32 = NDArray[np.float32]
 
@@ -89,6 +89,7 @@ class GraspDetector:
         gripper: Gripper,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
+        max_voxels: int = MAX_VOXELS,
     ) -> None:
         """Wrap a network.
 
@@ -98,7 +99,9 @@ class GraspDetector:
             gripper: The one it was trained for, used where a request names none.
             device: Where it runs.
             grippers: A user's own that requests may name, beside those that ship.
+            max_voxels: Most voxels that a request's cloud may have.
         """
+        self.max_voxels = max_voxels
         self.network = network.to(device).eval()
         self.metadata = metadata
         self.gripper = gripper
@@ -111,6 +114,7 @@ class GraspDetector:
         path: Path,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
+        max_voxels: int = MAX_VOXELS,
     ) -> "GraspDetector":
         """Load a checkpoint and the gripper it was trained for.
 
@@ -118,13 +122,14 @@ class GraspDetector:
             path: The file.
             device: Where the network runs; everything else runs on the processor.
             grippers: A user's own that requests may name, beside those that ship.
+            max_voxels: As for the constructor.
 
         Raises:
             InvalidCheckpoint: The file cannot be used.
             InvalidGripper: Its gripper is not known here.
         """
         network, metadata = load_checkpoint(path)
-        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers)
+        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers, max_voxels)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
@@ -256,7 +261,12 @@ class GraspDetector:
         prepared = self._start(sent, options)
         with prepared.timed("cloud"):
             prepared.scene = build_scene(
-                sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
+                sent,
+                options,
+                self.metadata.voxel_size,
+                prepared.counts,
+                prepared.warnings,
+                self.max_voxels,
             )
         if prepared.scene is None:
             prepared.warn_of_few_points()

@@ -11,6 +11,7 @@ from edgegrasp_model.errors import InvalidRequest
 Float32 = NDArray[np.float32]
 
 MAX_EXTENT = 20.0  # metres; a wider cloud is millimetres taken for metres
+MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
@@ -146,7 +147,7 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
 
     Raises:
         InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity, an extent that
-            suggests millimetres, or fewer points than approach points.
+            suggests millimetres, too far from the origin, or fewer points than approach points.
     """
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
@@ -171,6 +172,14 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
             "cloud",
             f"an extent of {extent:.4g} m, which suggests millimetres",
             "Send metres: divide by 1000.",
+        )
+    furthest = float(np.abs(cloud).max())
+    if furthest > MAX_DISTANCE:
+        raise InvalidRequest(
+            "cloud",
+            f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres",
+            "Subtract an origin near the cloud from it and from every position of the request, and "
+            "add it to the grasps.",
         )
     if len(cloud) < num_approach_points:
         raise InvalidRequest(

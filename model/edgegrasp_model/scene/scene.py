@@ -29,6 +29,7 @@ Bools = NDArray[np.bool_]
 MIN_POINTS = 4  # fewer make no surface
 MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
 SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
+MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 
 
@@ -54,6 +55,7 @@ def build_scene(
     voxel_size: float,
     counts: dict[str, int],
     warnings: list[str],
+    max_voxels: int = MAX_VOXELS,
 ) -> Scene | None:
     """Correct depths, crop, remove the support, voxelise, estimate normals, find the regions.
 
@@ -63,13 +65,15 @@ def build_scene(
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
         warnings: Gets what the caller should know.
+        max_voxels: Most voxels that the cloud may have where grasps are looked for.
 
     Returns:
         The scene, or None where too few points are left to make a surface.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints, or there are none to correct depths from.
+            views do not suit the viewpoints, or there are none to correct depths from, or the
+            cloud has too many voxels.
     """
     viewpoints = camera_positions(sent, options)
     sent, support = crop_cloud(sent, viewpoints, options, counts, warnings)
@@ -80,8 +84,10 @@ def build_scene(
     frame = CanonicalFrame.of_scene(sent.points, options.up, first_viewpoint)
     points = frame.points(sent.points)
     voxels = voxelise(points, voxel_size)
+    counts["voxels"] = len(voxels.size)
+    if counts["voxels"] > max_voxels:
+        raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(points)
-    counts["voxels"] = len(middles)
     kept = statistical_outlier_removal(middles)
     counts["kept"] = int(kept.sum())
     if counts["kept"] < MIN_POINTS:
@@ -104,6 +110,18 @@ def build_scene(
         at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
         viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
+    )
+
+
+def _too_many_voxels(
+    count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
+) -> InvalidRequest:
+    size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
+    cropped = "no workspace" if options.workspace is None else "the workspace"
+    return InvalidRequest(
+        "options.workspace",
+        f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
+        f"Send a workspace around the objects, or a support plane: at most {most} are accepted.",
     )
 
 
