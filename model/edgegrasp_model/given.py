@@ -6,20 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.approach import BallCrop, crop_balls
 from edgegrasp_model.candidates.collision import UP, clearances, collides, required_openings
-from edgegrasp_model.candidates.edge import (
+from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
     MIN_EDGE,
+    BallCrop,
     Candidates,
+    crop_balls,
     edge_grasps,
     measure_edges,
     retract,
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch

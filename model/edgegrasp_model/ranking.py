@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.collision import UP, clearances
-from edgegrasp_model.candidates.edge import Candidates
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import DetectOptions, Suppression

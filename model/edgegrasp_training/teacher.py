@@ -7,9 +7,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.approach import crop_balls
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps, retract
-from edgegrasp_model.candidates.top_down import top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    Candidates,
+    crop_balls,
+    edge_grasps,
+    retract,
+    top_down_grasps,
+)
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.hand import HandBatch

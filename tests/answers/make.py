@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 

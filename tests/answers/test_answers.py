@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_client import GraspClient
-from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.detector import ModelCatalogue
 
 from .clouds import CASES, OVER_THE_WIRE
 from .make import GRASP_FIELDS, Record, answer, load, record

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.candidates.approach import crop_balls
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
 
 

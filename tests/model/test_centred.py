@@ -6,9 +6,15 @@ from edgegrasp_model.on_device.candidates import DeviceCandidates
 from edgegrasp_model.on_device.centred import centred_grasps as on_device
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.approach import BallCrop, crop_balls
-from edgegrasp_model.candidates.centred import MAX_SHIFT, MIN_SHIFT, centred_grasps
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    MAX_SHIFT,
+    MIN_SHIFT,
+    BallCrop,
+    Candidates,
+    centred_grasps,
+    crop_balls,
+    edge_grasps,
+)
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.scene.cloud import Cloud
 

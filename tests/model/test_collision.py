@@ -3,7 +3,7 @@ import pytest
 
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, hits_cloud, required_openings
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.view import APPROACH_LENGTH, hand_views, reach_of
+from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import Cloud
 

@@ -8,12 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp_model.candidates.collision import hits_cloud, required_openings
-from edgegrasp_model.candidates.edge import EDGE_MARGIN, edge_grasps, support_clearance
-from edgegrasp_model.candidates.top_down import top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    EDGE_MARGIN,
+    edge_grasps,
+    support_clearance,
+    top_down_grasps,
+)
 from edgegrasp_model.errors import InvalidGripper
 from edgegrasp_model.gripper import GRIPPER_FOLDER, gripper_from_fields, gripper_names, load_gripper
-from edgegrasp_model.hand_view.description import describe_hands
-from edgegrasp_model.hand_view.view import hand_views, reach_of
+from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.options import Collision, GripperGeometry, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 

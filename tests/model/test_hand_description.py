@@ -3,13 +3,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge import edge_grasps
+from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.description import (
-    HAND_DESCRIPTION_SIZE,
-    describe_hands,
-    without_support,
-)
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands, without_support
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.occlusion import BEHIND, DEEP, DepthMap, occlusion_fractions, probes
+from edgegrasp_model.hand_description import BEHIND, DEEP, DepthMap, occlusion_fractions, probes
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 CAMERA = np.array([0.0, 0.0, 0.6], dtype=np.float32)

@@ -6,10 +6,10 @@ from edgegrasp_model.collision import _cloud_clearance
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model import compiled
-from edgegrasp_model.candidates.approach import crop_balls
 from edgegrasp_model.candidates.collision import hits_cloud
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.view import hand_views, reach_of
+from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.networks.balls import nearest_in_ball
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import Cloud

@@ -6,15 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates.edge import support_clearance
+from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.checkpoint import (
-    CheckpointMetadata,
-    build_network,
-    load_checkpoint,
-    save_checkpoint,
-)
-from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.networks.checkpoint import CheckpointMetadata, load_checkpoint
-from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT

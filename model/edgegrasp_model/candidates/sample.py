@@ -7,13 +7,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_model.candidates.approach import BallCrop, crop_balls, sample_approach_points
-from edgegrasp_model.candidates.centred import centred_grasps
 from edgegrasp_model.candidates.collision import UP, collides
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps, retract
-from edgegrasp_model.candidates.top_down import Headings, closing_headings, top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    BallCrop,
+    Candidates,
+    Headings,
+    centred_grasps,
+    closing_headings,
+    crop_balls,
+    edge_grasps,
+    retract,
+    sample_approach_points,
+    top_down_grasps,
+)
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.scene import Scene

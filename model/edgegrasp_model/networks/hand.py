@@ -14,10 +14,10 @@ import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from edgegrasp_model.candidates.edge import Candidates
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.description import HAND_DESCRIPTION_SIZE, describe_hands
-from edgegrasp_model.hand_view.view import HandView, hand_views, points_around_fingers, reach_of
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
+from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,

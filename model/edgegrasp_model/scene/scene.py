@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.options import DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import (
+    CanonicalFrame,
     CheckedCloud,
     Cloud,
     Voxels,
@@ -17,7 +18,6 @@ from edgegrasp_model.scene.cloud import (
     statistical_outlier_removal,
     voxelise,
 )
-from edgegrasp_model.scene.frame import CanonicalFrame
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, inside_region
 from edgegrasp_model.scene.support import SUPPORT_MARGIN, correct_depth_scale, find_support_plane
@@ -94,7 +94,13 @@ def build_scene(
         return None
     cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
     in_cloud = frame.points_in_cloud(middles)
-    approach = inside_region(options.approach_region, in_cloud, voxels, sent)[kept]
+
+    def allowed(region: Region | None) -> Bools:
+        if region is None:
+            return np.ones(counts["kept"], dtype=bool)
+        return inside_region(region, in_cloud, voxels, sent)[kept]
+
+    approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
@@ -105,7 +111,7 @@ def build_scene(
         points_in_cloud=in_cloud[kept],
         point_of_row=point_of_row,
         approach_allowed=approach,
-        contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
+        contact_allowed=allowed(options.contact_region),
         support=None if support is None else plane_in_frame(support, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
         viewpoint=single_viewpoint(viewpoints, frame),
@@ -138,10 +144,13 @@ def crop_cloud(
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
             are no viewpoints (W, 3) to correct depths from.
     """
-    check_region(options.approach_region, sent, "approach_region")
-    check_region(options.contact_region, sent, "contact_region")
+    for field in ("approach_region", "contact_region"):
+        if (region := getattr(options, field)) is not None:
+            check_region(region, sent, field)
     counts["points"] = len(sent.points)
-    sent = correct_depth_scale(sent, options, viewpoints, warnings)
+    support = options.support
+    if isinstance(support, SupportPlane) and support.max_depth_error > 0.0:
+        sent = correct_depth_scale(sent, support, viewpoints, warnings)
     sent = crop_to_workspace(sent, options)
     counts["in_workspace"] = len(sent.points)
     support, sent = remove_support_plane(sent, options, warnings)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
+from edgegrasp_model.options import RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import CheckedCloud
 
 Float32 = NDArray[np.float32]
@@ -94,7 +94,7 @@ MIN_SHARE, MIN_POINTS = 0.1, 20  # of the points that the plane must hold
 
 def correct_depth_scale(
     sent: CheckedCloud,
-    options: DetectOptions,
+    plane: SupportPlane,
     viewpoints: Float64 | None,
     warnings: list[str],
 ) -> CheckedCloud:
@@ -102,16 +102,13 @@ def correct_depth_scale(
 
     Args:
         sent: N points, in which the plane is seen.
-        options: Whose support may name a greatest depth error.
+        plane: Where the support is, and how wrong depths may be (max_depth_error).
         viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
         warnings: Gets what was done, or why nothing was.
 
     Raises:
         InvalidRequest: There is no viewpoint to scale about.
     """
-    plane = options.support
-    if not isinstance(plane, SupportPlane) or plane.max_depth_error == 0.0:
-        return sent
     if viewpoints is None:
         fix = "Send the camera's position: depths are corrected along its rays."
         raise InvalidRequest("options.viewpoint", "nothing", fix)
