@@ -23,13 +23,12 @@ from edgegrasp_model.given import (
     evaluate,
     from_edges,
     from_hand_poses,
-    hand_batch,
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring

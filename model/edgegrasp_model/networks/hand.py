@@ -28,13 +28,14 @@ from edgegrasp_model.networks.layers import (
     mlp,
 )
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.scene import Scene
 
 Float32 = NDArray[np.float32]
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
-PIECE = 32  # hands at a time, so that the work stays in cache
+CHUNK = 32  # hands at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,23 @@ class HandBatch:
         )
 
 
+def hand_batch(
+    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
+) -> HandBatch:
+    """What the hand network is told of some candidates of a scene."""
+    return HandBatch.from_cloud(
+        scene.cloud,
+        candidates,
+        gripper,
+        UP,
+        scene.support,
+        scene.viewpoint,
+        scene.at_side,
+        network.hand_points,
+        view,
+    )
+
+
 class HandNet(nn.Module):
     """E edge grasps, P points around the fingers of each."""
 
@@ -119,11 +137,11 @@ class HandNet(nn.Module):
         """
         description = (batch.description - self.mean) / self.std  # (E, F)
         encoder = PackedMlp(self.point_encoder)
-        pieces = [
+        chunks = [
             _around(encoder, points, count)
-            for points, count in in_chunks(PIECE, batch.points, batch.point_count)
+            for points, count in in_chunks(CHUNK, batch.points, batch.point_count)
         ]
-        around = torch.cat(pieces)[: len(description)]  # (E, 2 C)
+        around = torch.cat(chunks)[: len(description)]  # (E, 2 C)
         seen = torch.cat((description, around), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
