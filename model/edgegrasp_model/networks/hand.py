@@ -82,6 +82,19 @@ class HandBatch:
         )
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
 
+    @classmethod
+    def made_up(cls, config: NetworkConfig) -> Self:
+        """A fixed batch of 32 hands, to see whether a network computes as it did before."""
+        rng = np.random.default_rng(0)
+        description = rng.normal(size=(32, HAND_DESCRIPTION_SIZE))
+        points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
+        count = rng.integers(0, config.hand_points + 1, 32)
+        return cls(
+            torch.from_numpy(description.astype(np.float32)),
+            torch.from_numpy(points.astype(np.float32)),
+            torch.from_numpy(count),
+        )
+
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
         return HandBatch(
