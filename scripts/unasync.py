@@ -33,8 +33,10 @@ def synchronous(source: str) -> str:
     for pattern, replacement in SUBSTITUTIONS:
         source = re.sub(pattern, replacement, source)
     for command in (["check", "--fix-only", "--select", "F401,F811,I"], ["format"]):
-        ruff = [sys.executable, "-m", "ruff", *command, "--quiet", f"--stdin-filename={TARGET}", "-"]
-        done = subprocess.run(ruff, input=source, stdout=subprocess.PIPE, text=True, check=True)
+        ruff = [sys.executable, "-m", "ruff", *command, "--quiet", f"--stdin-filename={TARGET}"]
+        done = subprocess.run(
+            [*ruff, "-"], input=source, stdout=subprocess.PIPE, text=True, check=True
+        )
         source = done.stdout
     return source
 
