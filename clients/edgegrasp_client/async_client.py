@@ -4,8 +4,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar, Unpack
+from typing import Any, Self, TypeVar, Unpack
 
 import grpc.aio
 import httpx
@@ -78,7 +77,7 @@ class AsyncGraspClient:
     ) -> None:
         self._timeout = timeout
         self._retry = retry
-        self._transport: _Transport
+        self._transport: _GrpcTransport | _RestTransport
         if is_rest(address):
             self._transport = _RestTransport(address, token, tls, http_transport)
         else:
@@ -214,12 +213,7 @@ class AsyncGraspClient:
         """Itself."""
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the connection."""
         await self.close()
 
@@ -245,26 +239,8 @@ class AsyncGraspClient:
             attempt += 1
 
 
-class _Transport(Protocol):
-    """What a client needs of gRPC or REST; raises GraspClientErrors."""
-
-    async def detect(self, request: Request, timeout: float) -> Detection: ...
-
-    async def score(self, request: ScoreRequest, timeout: float) -> Scoring: ...
-
-    def detect_stream(
-        self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
-    ) -> AsyncIterator[StreamAnswer]: ...
-
-    async def models(self, timeout: float) -> list[Model]: ...
-
-    async def ready(self, timeout: float) -> bool: ...
-
-    async def close(self) -> None: ...
-
-
 class _GrpcTransport:
-    """A channel."""
+    """Calls over one channel; raises GraspClientErrors."""
 
     def __init__(
         self, address: str, token: str | None, tls: Tls | None, channel: grpc.aio.Channel | None
@@ -331,7 +307,7 @@ class _GrpcTransport:
 
 
 class _RestTransport:
-    """Connections that are kept open."""
+    """Posts over connections that are kept open; raises GraspClientErrors."""
 
     def __init__(
         self,
@@ -348,38 +324,34 @@ class _RestTransport:
         )
 
     async def detect(self, request: Request, timeout: float) -> Detection:
-        post = rest_wire.detect_post(request)
-        return rest_wire.parsed(await self._post(rest_wire.GRASPS, post, timeout), detection_from)
+        return await self._answer(rest_wire.detect_call(request), timeout, detection_from)
 
     async def score(self, request: ScoreRequest, timeout: float) -> Scoring:
-        post = rest_wire.score_post(request)
-        return rest_wire.parsed(await self._post(rest_wire.SCORE, post, timeout), scoring_from)
+        return await self._answer(rest_wire.score_call(request), timeout, scoring_from)
+
+    async def models(self, timeout: float) -> list[Model]:
+        return await self._answer(rest_wire.models_call(), timeout, models_from)
+
+    async def _answer(
+        self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            response = await self._http.request(**rest_wire.with_deadline(call, timeout))
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.parsed(response, parse)
 
     async def detect_stream(
         self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
     ) -> AsyncIterator[StreamAnswer]:
         async for number, request in requests:
-            post = rest_wire.detect_post(request.request)
+            call = rest_wire.detect_call(request.request)
             seconds = timeout if request.timeout is None else request.timeout
             try:
-                response = await self._post(rest_wire.GRASPS, post, seconds)
-                detection = rest_wire.parsed(response, detection_from)
+                detection = await self._answer(call, seconds, detection_from)
                 yield StreamAnswer(request.name(number), detection)
             except GraspClientError as error:
                 yield StreamAnswer(request.name(number), error=error)
-
-    async def models(self, timeout: float) -> list[Model]:
-        try:
-            response = await self._http.get(rest_wire.MODELS, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-        return rest_wire.parsed(response, models_from)
-
-    async def _post(self, path: str, post: dict[str, Any], timeout: float) -> httpx.Response:
-        try:
-            return await self._http.post(path, **rest_wire.with_deadline(post, timeout))
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
 
     async def ready(self, timeout: float) -> bool:
         try:

@@ -3,8 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar, Unpack
+from typing import Any, Self, TypeVar, Unpack
 
 import grpc
 import httpx
@@ -76,7 +75,7 @@ class GraspClient:
     ) -> None:
         self._timeout = timeout
         self._retry = retry
-        self._transport: _Transport
+        self._transport: _GrpcTransport | _RestTransport
         if is_rest(address):
             self._transport = _RestTransport(address, token, tls, http_transport)
         else:
@@ -212,12 +211,7 @@ class GraspClient:
         """Itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the connection."""
         self.close()
 
@@ -241,26 +235,8 @@ class GraspClient:
             attempt += 1
 
 
-class _Transport(Protocol):
-    """What a client needs of gRPC or REST; raises GraspClientErrors."""
-
-    def detect(self, request: Request, timeout: float) -> Detection: ...
-
-    def score(self, request: ScoreRequest, timeout: float) -> Scoring: ...
-
-    def detect_stream(
-        self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
-    ) -> Iterator[StreamAnswer]: ...
-
-    def models(self, timeout: float) -> list[Model]: ...
-
-    def ready(self, timeout: float) -> bool: ...
-
-    def close(self) -> None: ...
-
-
 class _GrpcTransport:
-    """A channel."""
+    """Calls over one channel; raises GraspClientErrors."""
 
     def __init__(
         self, address: str, token: str | None, tls: Tls | None, channel: grpc.Channel | None
@@ -327,7 +303,7 @@ class _GrpcTransport:
 
 
 class _RestTransport:
-    """Connections that are kept open."""
+    """Posts over connections that are kept open; raises GraspClientErrors."""
 
     def __init__(
         self,
@@ -344,38 +320,34 @@ class _RestTransport:
         )
 
     def detect(self, request: Request, timeout: float) -> Detection:
-        post = rest_wire.detect_post(request)
-        return rest_wire.parsed(self._post(rest_wire.GRASPS, post, timeout), detection_from)
+        return self._answer(rest_wire.detect_call(request), timeout, detection_from)
 
     def score(self, request: ScoreRequest, timeout: float) -> Scoring:
-        post = rest_wire.score_post(request)
-        return rest_wire.parsed(self._post(rest_wire.SCORE, post, timeout), scoring_from)
+        return self._answer(rest_wire.score_call(request), timeout, scoring_from)
+
+    def models(self, timeout: float) -> list[Model]:
+        return self._answer(rest_wire.models_call(), timeout, models_from)
+
+    def _answer(
+        self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            response = self._http.request(**rest_wire.with_deadline(call, timeout))
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.parsed(response, parse)
 
     def detect_stream(
         self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
     ) -> Iterator[StreamAnswer]:
         for number, request in requests:
-            post = rest_wire.detect_post(request.request)
+            call = rest_wire.detect_call(request.request)
             seconds = timeout if request.timeout is None else request.timeout
             try:
-                response = self._post(rest_wire.GRASPS, post, seconds)
-                detection = rest_wire.parsed(response, detection_from)
+                detection = self._answer(call, seconds, detection_from)
                 yield StreamAnswer(request.name(number), detection)
             except GraspClientError as error:
                 yield StreamAnswer(request.name(number), error=error)
-
-    def models(self, timeout: float) -> list[Model]:
-        try:
-            response = self._http.get(rest_wire.MODELS, timeout=timeout)
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-        return rest_wire.parsed(response, models_from)
-
-    def _post(self, path: str, post: dict[str, Any], timeout: float) -> httpx.Response:
-        try:
-            return self._http.post(path, **rest_wire.with_deadline(post, timeout))
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
 
     def ready(self, timeout: float) -> bool:
         try:

@@ -28,21 +28,18 @@ from edgegrasp_client.errors import (
 from edgegrasp_client.requests import Array, Request, ScoreRequest
 from edgegrasp_client.results import Read
 
-GRASPS = "/v1/grasps"
-SCORE = "/v1/grasps:score"
-MODELS = "/v1/models"
 READY = "/health/ready"
 
 MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
 
-Post = dict[str, Any]  # arguments of an httpx post
+Call = dict[str, Any]  # arguments of httpx's `request`
 Part = tuple[str | None, bytes, str]  # of a form: file name, content, media type
 Answer = TypeVar("Answer")
 
 _KIND_PREFIX = "urn:edgegrasp:error:"
 
 
-def detect_post(request: Request) -> Post:
+def detect_call(request: Request) -> Call:
     """A request for grasps; raises InvalidRequestError for what HTTP cannot carry.
 
     A point cloud file as body and options as query parameters, or a form where there is more.
@@ -51,22 +48,29 @@ def detect_post(request: Request) -> Post:
     query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
     short = sum(map(len, query.values())) < MAX_QUERY
     if cloud is None or is_point_cloud2(cloud) or request.row_arrays() or not short:
-        return _form(request, {})
+        return _form("/v1/grasps", request, {})
     file = cloud_file(cloud)
     headers = {"content-type": f"application/x-{file.format}"}
-    return {"content": file.data, "headers": headers, "params": query}
+    post = {"method": "POST", "url": "/v1/grasps", "headers": headers}
+    return {**post, "params": query, "content": file.data}
 
 
-def score_post(request: ScoreRequest) -> Post:
+def score_call(request: ScoreRequest) -> Call:
     """A request to score; raises InvalidRequestError for what HTTP cannot carry."""
     arrays = {"edges": request.edges, "hand_poses": request.hand_poses}
-    return _form(request, {name: array for name, array in arrays.items() if array is not None})
+    given = {name: array for name, array in arrays.items() if array is not None}
+    return _form("/v1/grasps:score", request, given)
 
 
-def with_deadline(post: Post, timeout: float) -> Post:
-    """The arguments, and until when the server need not answer any more."""
-    headers = {**post.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
-    return post | {"headers": headers, "timeout": timeout}
+def models_call() -> Call:
+    """A request for the list of models."""
+    return {"method": "GET", "url": "/v1/models"}
+
+
+def with_deadline(call: Call, timeout: float) -> Call:
+    """The call, given up after `timeout` seconds by both sides."""
+    headers = {**call.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
+    return call | {"headers": headers, "timeout": timeout}
 
 
 def parsed(response: httpx.Response, parse: Callable[[Any, Read], Answer]) -> Answer:
@@ -96,7 +100,7 @@ def error_from_transport(error: httpx.HTTPError) -> GraspClientError:
     return ServerUnavailableError(f"No connection: {error or type(error).__name__}")
 
 
-def _form(request: Request, arrays: Mapping[str, Array]) -> Post:
+def _form(path: str, request: Request, arrays: Mapping[str, Array]) -> Call:
     parts: dict[str, Part] = {"options": _json_part("options", request.options)}
     cloud = request.cloud
     if cloud is None:
@@ -110,7 +114,7 @@ def _form(request: Request, arrays: Mapping[str, Array]) -> Post:
         parts["cloud"] = (f"cloud.{file.format}", file.data, f"application/x-{file.format}")
     for name, array in {**request.row_arrays(), **arrays}.items():
         parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
-    return {"files": parts}
+    return {"method": "POST", "url": path, "files": parts}
 
 
 def _json_part(name: str, value: object) -> Part:
