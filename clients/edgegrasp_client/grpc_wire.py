@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import grpc
+import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2
@@ -119,9 +120,7 @@ def _set_cloud_and_options(message: Any, request: Request) -> None:
     if cloud is None:
         for which, image in enumerate(request.depth_images or ()):
             fields = depth_image_fields(image, which)
-            fields["T_cloud_camera"] = [
-                number for row in fields["T_cloud_camera"] for number in row
-            ]
+            fields["T_cloud_camera"] = np.ravel(fields["T_cloud_camera"]).tolist()
             fill(message.depth_images.add(), fields, f"depth_images.{which}")
     elif is_point_cloud2(cloud):
         fill(message.point_cloud2, point_cloud2_fields(cloud), "point_cloud2")
