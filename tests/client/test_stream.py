@@ -36,7 +36,7 @@ def test_errors_are_answers(either_client, cloud) -> None:
     assert [answer.request_id for answer in answers] == ["fine", "few", "model", "fine again"]
     kinds = [None if answer.error is None else type(answer.error) for answer in answers]
     assert kinds == [None, InvalidRequestError, UnknownModelError, None]
-    assert answers[1].error.field == "cloud"
+    assert (answers[1].error.field, answers[2].error.field) == ("cloud", "options.model")
     with pytest.raises(UnknownModelError, match="'none of mine'"):
         answers[2].result()
 
