@@ -3,7 +3,7 @@
 from edgegrasp_client import GraspClient
 
 with GraspClient("127.0.0.1:50051") as client:  # or "http://127.0.0.1:8000"
-detection = client.detect(points, seed=7, top_k=5)
+    detection = client.detect(points, seed=7, top_k=5)
 best = detection.grasps[0]
 """
 

@@ -53,8 +53,8 @@ class GraspClient:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
         timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
             for each of connecting, sending and waiting.
-        retry: Whether to ask again, after a short random delay, a server that is away or busy;
-            a request of a stream is sent once.
+        retry: Whether to try again, after short random delays, where the server is away or busy
+            or lost the worker of the request. Requests of a stream are sent once.
         token: For a server that asks for one; over TLS, or everyone on the way can read it.
         tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx knows.

@@ -157,4 +157,4 @@ def _foreign(response: httpx.Response) -> GraspClientError:
         return OverloadedError(f"{what}.", float(retry_after) if retry_after.isdecimal() else 1.0)
     if status in (502, 503, 504):
         return ServerUnavailableError(f"{what}.")
-    return ProtocolError(f"{what}, which is no answer of a grasp service.")
+    return ProtocolError(f"{what}, which is not the answer of a grasp service.")

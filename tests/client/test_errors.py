@@ -168,7 +168,7 @@ def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, 
 def test_json_of_another_server(body: Any, make_client, cloud) -> None:
     transport = httpx.MockTransport(lambda request: httpx.Response(200, json=body))
     client = make_client("http://elsewhere", http_transport=transport)
-    with pytest.raises(ProtocolError, match="no answer of a grasp service"):
+    with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
         client.detect(cloud)
 
 
