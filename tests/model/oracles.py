@@ -1,5 +1,7 @@
 """Straightforward NumPy versions of the compiled loops, which the kernels are tested against."""
 
+import itertools
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -41,7 +43,7 @@ def signed_distance_to_boxes(
 def nearest_in_groups(points: np.ndarray, bounds: np.ndarray, k: int) -> np.ndarray:
     """The k nearest (P, k) of the same group; the own row where there are fewer."""
     nearest = np.repeat(np.arange(len(points))[:, None], k, axis=1)
-    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for start, stop in itertools.pairwise(bounds.tolist()):
         if stop > start:
             _, rows = cKDTree(points[start:stop]).query(points[start:stop], k=range(1, k + 1))
             known = rows < stop - start

@@ -26,9 +26,7 @@ TINY = {
     "vn-edgegrasp": NetworkConfig(
         "vn-edgegrasp", (8, 12, 16), (16, 20, 24), (28, 32), (24, 16), crop_radius=0.04
     ),
-    "hand": NetworkConfig(
-        "hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04
-    ),
+    "hand": NetworkConfig("hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04),
 }
 
 

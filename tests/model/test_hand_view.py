@@ -98,8 +98,10 @@ def plate(spacing: float = 0.004) -> np.ndarray:
     return np.stack([x, y, np.full_like(x, 0.1)], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
-def test_only_what_is_behind_the_plate_is_hidden() -> None:
-    seen = DepthMap.of_cloud(plate(), CAMERA, UP)
+@pytest.mark.parametrize("exactly_above", [False, True])
+def test_only_what_is_behind_the_plate_is_hidden(exactly_above: bool) -> None:
+    camera = plate().mean(axis=0) + UP / 2 if exactly_above else CAMERA
+    seen = DepthMap.of_cloud(plate(), camera, UP)
     places = np.array(
         [[0, 0, 0.15], [0, 0, 0.1], [0.02, -0.03, 0.0], [0.09, 0, 0.0], [0, 0, -3.0], [3, 0, 0.1]]
     )
@@ -153,4 +155,3 @@ def test_probes_lie_where_they_are_said_to(name: str) -> None:
     assert (tips_right[:, 1] > gripper.max_opening / 2).all()
     np.testing.assert_allclose(tips_left * (1, -1, 1), tips_right, atol=1e-7)
     assert (hand[:, 2] < gripper.tip_z).all()
-
