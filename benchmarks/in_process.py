@@ -45,7 +45,7 @@ def _detector(kind: str) -> Any:
         return DummyDetector(float(kind) / 1000)
     import torch
 
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
 
     torch.set_num_threads(1)
     return ModelCatalogue.load((), default="", grippers=()).get("")

@@ -6,20 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.approach import BallCrop, crop_balls
 from edgegrasp_model.candidates.collision import UP, clearances, collides, required_openings
-from edgegrasp_model.candidates.edge import (
+from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
     MIN_EDGE,
+    BallCrop,
     Candidates,
+    crop_balls,
     edge_grasps,
     measure_edges,
     retract,
 )
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
@@ -194,7 +195,7 @@ def from_edges(
         edges: (M, 2) rows of the cloud as sent: approach and contact point.
         gripper: What has to fit.
         crop_radius: Metres around the approach point within which the contact has to be.
-        margin: Metres that hands are drawn back above the support plane, where that helps.
+        margin: Metres that hands are retracted to above the support plane, where that helps.
     """
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
@@ -238,7 +239,7 @@ def from_hand_poses(
         (np.abs(x) < gripper.pad_half_width)
         & (np.abs(y) < gripper.max_opening / 2)
         & (z > gripper.palm_z)
-        & (z < gripper.foremost_z)
+        & (z < gripper.max_tip_z)
     )
     hand = view.candidate[between]
     off_contact = x[between] ** 2 + (z[between] - gripper.contact_z_at(2 * np.abs(y[between]))) ** 2

@@ -45,7 +45,7 @@ class Gripper:
         return self.contact_z - self.palm_z
 
     @cached_property
-    def foremost_z(self) -> float:
+    def max_tip_z(self) -> float:
         """The furthest the fingertips come as they close, metres along z."""
         if self.linkage is None:
             return self.tip_z
@@ -188,7 +188,7 @@ def _first_fault(error: ValidationError) -> str:
     return f"{path}: got {repr(first['input'])[:80]}. {message}"
 
 
-def chosen_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
+def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
     """The gripper a request asks for, opened as far as it asks for.
 
     Args:

@@ -20,7 +20,7 @@ ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many tim
 BLOCK = 512  # points at a time, so that their positions stay in the first cache
 
 
-def seen_from(
+def points_in_hand_boxes(
     points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
 ) -> tuple[Int64, Int64, Float32]:
     """Points between two corners of hand frames.
@@ -44,7 +44,7 @@ def seen_from(
     return hand, row, position
 
 
-def meets(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
+def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
     """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
     turn, shift = _to_hand(T_cloud_hand)
     hit = np.zeros(len(turn), dtype=np.bool_)
@@ -52,7 +52,7 @@ def meets(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
     return hit
 
 
-def clearance(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
+def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
     """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
     turn, shift = _to_hand(T_cloud_hand)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.collision import UP, clearances
-from edgegrasp_model.candidates.edge import Candidates
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import DetectOptions, Suppression
@@ -16,7 +16,7 @@ from edgegrasp_model.scene.scene import Scene
 Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
 
-COLLIDING = 0.5  # a score is worth this share where the hand meets something, as far as one sees
+COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 OUTCOMES = list(Outcome)
 

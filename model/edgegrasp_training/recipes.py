@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from edgegrasp_model.networks.checkpoint import CheckpointMetadata
 from edgegrasp_model.networks.config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     HAND,
     VN_EDGEGRASP,
+    CheckpointMetadata,
     NetworkConfig,
 )
 

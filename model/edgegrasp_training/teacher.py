@@ -7,14 +7,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.approach import crop_balls
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps, retract
-from edgegrasp_model.candidates.top_down import top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    Candidates,
+    crop_balls,
+    edge_grasps,
+    retract,
+    top_down_grasps,
+)
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.scene.scene import at_workspace_side
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import SUPPORT, UP, WORKSPACE, Lessons
 from edgegrasp_training.views import LabelledView, load_view
 
@@ -83,7 +87,7 @@ class Teacher:
             UP,
             SUPPORT,
             view.camera_position,
-            at_workspace_side(view.points, WORKSPACE, UP),
+            near_workspace_side(view.points, WORKSPACE, UP),
             self.metadata.network.hand_points,
         )
         with torch.inference_mode():

@@ -18,12 +18,8 @@ from torch import Tensor, nn
 
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.checkpoint import (
-    CheckpointMetadata,
-    build_network,
-    load_checkpoint,
-    save_checkpoint,
-)
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, HandNet
 from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
 from edgegrasp_training.examples import (

@@ -90,7 +90,7 @@ def load_backend(settings: Settings) -> Catalogue:
 
         return DummyCatalogue(settings.dummy_seconds)
     # Torch takes seconds to import, and the ports should answer meanwhile.
-    from edgegrasp_model.catalogue import ModelCatalogue, choose_device
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     return ModelCatalogue.load(
         settings.weights,

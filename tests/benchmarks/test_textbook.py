@@ -10,7 +10,7 @@ from benchmarks.textbook.edge_grasp import edge_grasp_logits
 from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
 from benchmarks.timing import interleaved, summary
 
-from edgegrasp_model.candidates.approach import crop_balls
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import NetworkConfig

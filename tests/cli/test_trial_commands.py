@@ -9,13 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli.main import app
-from edgegrasp_model.networks.checkpoint import (
-    CheckpointMetadata,
-    build_network,
-    load_checkpoint,
-    save_checkpoint,
-)
-from edgegrasp_model.networks.config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL, CheckpointMetadata
 from edgegrasp_training.recipes import recipe
 
 

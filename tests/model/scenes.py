@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.approach import crop_balls
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
-from edgegrasp_model.networks.checkpoint import CheckpointMetadata, build_network
-from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 
 SEED = 2**32 - 1  # the greatest
 PANDA = load_gripper("panda")

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.candidates.collision import clearances, collides
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.options import Collision, OrientedBox, SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.scene.frame import CanonicalFrame
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.scene import Scene
 

@@ -2,7 +2,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.candidates.edge import TIP_MARGIN, edge_grasps, retract, support_clearance
+from edgegrasp_model.candidates.edge_grasps import (
+    TIP_MARGIN,
+    edge_grasps,
+    retract,
+    support_clearance,
+)
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud

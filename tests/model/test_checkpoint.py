@@ -9,14 +9,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.hand_view.description import HAND_DESCRIPTION_SIZE as SIZE
-from edgegrasp_model.networks.checkpoint import (
-    CheckpointMetadata,
-    build_network,
-    load_checkpoint,
-    save_checkpoint,
-)
-from edgegrasp_model.networks.config import HAND
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import HAND, CheckpointMetadata
 
 
 @pytest.fixture

@@ -36,7 +36,11 @@ def test_radius_voxel_and_gripper_are_noted(shared_dir):
         gripper="other",
     )
     assert metadata.network.conv_widths == EDGEGRASP.conv_widths
-    assert (metadata.voxel_size, metadata.crop_radius, metadata.gripper) == (0.004, 0.04, "other")
+    assert (metadata.voxel_size, metadata.network.crop_radius, metadata.gripper) == (
+        0.004,
+        0.04,
+        "other",
+    )
 
 
 def test_an_empty_directory_is_refused(tmp_path):

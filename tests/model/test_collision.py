@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, meets_cloud, required_openings
+from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, hits_cloud, required_openings
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.view import APPROACH_LENGTH, hand_views, reach_of
+from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
 from edgegrasp_model.options import Collision
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -35,7 +35,7 @@ def seen(*points: tuple[float, float, float]):
     ],
 )
 def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hits: bool) -> None:
-    assert meets_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
+    assert hits_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
 
 
 def test_the_width_is_what_lies_between_the_fingers_and_clearance() -> None:

@@ -264,7 +264,7 @@ def check_pose(fields: dict, grasp: Grasp, gripper: Gripper) -> None:
     )
     assert abs(c[1] - a[1]) < gripper.max_opening / 2
     assert a[2] > gripper.palm_z - 0.006  # drawn back at most to the tips
-    assert gripper.palm_z < c[2] < gripper.foremost_z
+    assert gripper.palm_z < c[2] < gripper.max_tip_z
 
 
 def ways(fields: dict, grasp: Grasp) -> list[np.ndarray]:

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps
-from edgegrasp_model.hand_view.description import HAND_DESCRIPTION_SIZE as SIZE
+from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch

@@ -6,15 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.edge import edge_grasps
+from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import gripper_names, load_gripper
-from edgegrasp_model.hand_view.description import (
+from edgegrasp_model.hand_description import (
+    BEHIND,
+    DEEP,
     HAND_DESCRIPTION_SIZE,
+    DepthMap,
     describe_hands,
+    occlusion_fractions,
+    probes,
     without_support,
 )
-from edgegrasp_model.hand_view.occlusion import BEHIND, DEEP, DepthMap, occlusion_fractions, probes
-from edgegrasp_model.hand_view.view import hand_views, reach_of
+from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 

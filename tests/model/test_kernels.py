@@ -6,11 +6,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.candidates.approach import crop_balls
-from edgegrasp_model.candidates.collision import meets_cloud
+from edgegrasp_model.candidates.collision import hits_cloud
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view.view import hand_views, reach_of
-from edgegrasp_model.kernels import clearance, meets, nearest_in_groups, seen_from
+from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.kernels import (
+    any_point_in_boxes,
+    nearest_in_groups,
+    points_in_hand_boxes,
+    signed_distance_to_boxes,
+)
 from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.options import Collision
@@ -30,7 +35,7 @@ def cloud(seed: int, count: int = 700) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_hands_see_the_points_within_reach(seed: int) -> None:
     points, (low, high) = cloud(seed), np.asarray(reach_of(PANDA), dtype=np.float32)
-    found = seen_from(points, HANDS, low, high)
+    found = points_in_hand_boxes(points, HANDS, low, high)
     expected = oracles.points_in_hand_boxes(points, HANDS, low, high)
     assert len(found[0]) == pytest.approx(len(expected[0]), abs=2)  # float32 beside float64
     pairs = [{(h, r): p for h, r, p in zip(*seen, strict=True)} for seen in (found, expected)]
@@ -49,11 +54,11 @@ def test_hands_hit_the_points_in_their_boxes_and_are_as_far_from_them(
     gripper, points = load_gripper(name), cloud(1, count)
     boxes = gripper.boxes(gripper.max_opening)
     distance = oracles.signed_distance_to_boxes(points, HANDS, boxes)
-    found = clearance(points, HANDS, boxes)
+    found = signed_distance_to_boxes(points, HANDS, boxes)
     np.testing.assert_allclose(found, distance, rtol=0, atol=1e-6)
     sure = np.abs(distance) > 1e-6
     hit = oracles.any_point_in_boxes(points, HANDS, boxes)
-    np.testing.assert_array_equal(meets(points, HANDS, boxes)[sure], hit[sure])
+    np.testing.assert_array_equal(any_point_in_boxes(points, HANDS, boxes)[sure], hit[sure])
     assert hit.any()
     assert not hit.all()
 
@@ -63,7 +68,7 @@ def test_points_beyond_the_first_block_are_hit_too() -> None:
     far[-1] = 0.0
     boxes = PANDA.boxes(PANDA.max_opening)
     hit = oracles.any_point_in_boxes(far, HANDS, boxes)
-    np.testing.assert_array_equal(meets(far, HANDS, boxes), hit)
+    np.testing.assert_array_equal(any_point_in_boxes(far, HANDS, boxes), hit)
     assert hit.any()
 
 
@@ -85,8 +90,8 @@ def test_no_point_and_no_hand() -> None:
     nothing, some = (Cloud(points, points) for points in (cloud(0, 0), cloud(0)))
     for here, hands in ((nothing, HANDS), (some, HANDS[:0])):
         assert len(hand_views(here, hands, reach_of(PANDA)).row) == 0
-        assert not meets_cloud(here, hands, PANDA, Collision()).any()
-        assert len(meets_cloud(here, hands, PANDA, Collision())) == len(hands)
+        assert not hits_cloud(here, hands, PANDA, Collision()).any()
+        assert len(hits_cloud(here, hands, PANDA, Collision())) == len(hands)
     none = np.empty(0, dtype=np.int64)
     crop = crop_balls(cloud(1), none, 0.05)
     assert (len(crop.ball_rows), len(crop.ball_of_point)) == (0, 0)

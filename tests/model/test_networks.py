@@ -21,7 +21,7 @@ from edgegrasp_model.networks.config import (
     NetworkConfig,
 )
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
-from edgegrasp_model.networks.layers import Product, ball_pieces, by_pieces
+from edgegrasp_model.networks.layers import PackedLinear, ball_chunks, by_chunks
 
 from .scenes import SEED, TINY, RandomScene
 
@@ -183,7 +183,7 @@ def test_a_product_is_the_linear_layer_whatever_the_library(monkeypatch, onednn,
     expected = F.linear(values[:, 3:30], own, bias)
     for rectified in (False, True):
         with torch.inference_mode():
-            found = Product(own, bias, rectified=rectified)(values[:, 3:30])
+            found = PackedLinear(own, bias, rectified=rectified)(values[:, 3:30])
         torch.testing.assert_close(found, expected.relu() if rectified else expected)
 
 
@@ -198,7 +198,7 @@ def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, thre
         for inputs, outputs in ((3, 32), (138, 512), (512, 1024)):
             values = random(3, 256, inputs)
             with torch.inference_mode():
-                product = Product(random(1, outputs, inputs), random(2, outputs))
+                product = PackedLinear(random(1, outputs, inputs), random(2, outputs))
                 whole = product(values)
                 for shift in (1, 7, 100):
                     moved = product(torch.roll(values, shift, dims=0))
@@ -211,7 +211,7 @@ def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, thre
 def test_a_layer_by_pieces_is_the_layer(gradients):
     mlp, values = layers.mlp((6, 16, 16, 3)), random(1, 75, 6)
     with torch.set_grad_enabled(gradients):
-        found = by_pieces(mlp, values, rows=32)
+        found = by_chunks(mlp, values, rows=32)
     torch.testing.assert_close(found, mlp(values))
     assert found.requires_grad == gradients
 
@@ -222,7 +222,7 @@ def test_pieces_hold_every_row_and_the_maxima_are_those_of_the_balls(rows):
     values = random(1, len(batch.points), 5)
     expected = torch.stack([ball.amax(0) for ball in torch.split(values, batch.ball_sizes)])
     with torch.no_grad():
-        pieces, found = ball_pieces(values, batch, rows), layers.BallMaximum(batch.num_balls)
+        pieces, found = ball_chunks(values, batch, rows), layers.BallMaximum(batch.num_balls)
         for piece in pieces:
             assert len(piece.values) == len(piece.ball_of_point) == sum(piece.sizes) == rows
             found.add(piece.values, piece)

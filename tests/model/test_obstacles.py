@@ -6,7 +6,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import Box, OrientedBox
-from edgegrasp_model.scene.frame import CanonicalFrame
+from edgegrasp_model.scene.cloud import CanonicalFrame
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 
 

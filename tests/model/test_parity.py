@@ -8,7 +8,7 @@ import torch
 from edgegrasp_model.on_device.scoring import ScoringNetwork
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.approach import crop_balls
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.edge import support_clearance
+from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.view import HandView, Reach, hand_views, reach_of
-from edgegrasp_model.kernels import clearance, meets
+from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
+from edgegrasp_model.kernels import any_point_in_boxes, signed_distance_to_boxes
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
@@ -17,15 +17,15 @@ Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
-TOUCH = 1e-6  # metres; hands drawn back onto the support plane end this near to it
+TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands meet the cloud, the support plane or an obstacle.
 
-    At the grasp, on the straight way to it and on the way out, each box of the hand grown by the
-    margin on every side.
+    Checked at the grasp, on the straight way in and on the way out, with each box of the hand
+    grown by the margin on every side.
 
     Args:
         scene: Cloud, support plane and obstacles, canonical frame.
@@ -36,57 +36,57 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     Returns:
         (E,)
     """
-    hit = meets_cloud(scene.cloud, T_cloud_hand, gripper, request)
+    hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
     if scene.support is not None:
-        hit |= meets_support(T_cloud_hand, scene.support, gripper, request)
+        hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
     if len(scene.obstacles):
-        hit |= meets_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+        hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
     return hit
 
 
-def collision_reach(gripper: Gripper, request: Collision) -> Reach:
-    """What of the cloud a hand sees that might meet it."""
+def reach_of_motion(gripper: Gripper, request: Collision) -> Reach:
+    """The part of the hand frame that the hand sweeps on its way in and out."""
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0
-    return reach_of(gripper, around=request.margin, back=way_back(request), lift=lift)
+    return reach_of(gripper, around=request.margin, back=approach_sweep_length(request), lift=lift)
 
 
-def meets_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands meet a point of the cloud.  # (E,)."""
-    boxes = grown_boxes(gripper, request)
-    swept = lengthened(boxes, request)
-    hit = meets(cloud.points, T_cloud_hand, swept)
+    boxes = inflated_boxes(gripper, request)
+    swept = swept_boxes(boxes, request)
+    hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         free = np.flatnonzero(~hit)
-        view = hand_views(cloud, T_cloud_hand[free], collision_reach(gripper, request))
+        view = hand_views(cloud, T_cloud_hand[free], reach_of_motion(gripper, request))
         lift = request.retreat_length * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
         for low, high in boxes:
-            hit[free[view.candidate[_passed_over(view.position, lift, low, high)]]] = True
+            hit[free[view.candidate[_swept_over(view.position, lift, low, high)]]] = True
     return hit
 
 
-def meets_support(
+def hits_support(
     T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper, request: Collision
 ) -> Bools:
-    """Which hands come nearer to the support plane than the margin.  # (E,)."""
+    """Which hands come closer to the support plane than the margin.  # (E,)."""
     normal = np.asarray(support.normal)
     height = support_clearance(T_cloud_hand, support, gripper)
     rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
-    lowest = np.minimum(height, height + way_back(request) * rise)
+    lowest = np.minimum(height, height + approach_sweep_length(request) * rise)
     if request.retreat_direction == "up":
         lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
     return np.asarray(lowest < request.margin - TOUCH)
 
 
-def meets_obstacles(
+def hits_obstacles(
     T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
 ) -> Bools:
     """Which open hands meet a box.  # (E,)."""
-    grown = grown_boxes(gripper, request)
-    at_rest = SolidBoxes.of_hands(T_cloud_hand, lengthened(grown, request))
-    hit = _meets_any(at_rest, obstacles, None)
+    grown = inflated_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, swept_boxes(grown, request))
+    hit = _hits_any(at_rest, obstacles, None)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         hands = SolidBoxes.of_hands(T_cloud_hand, grown)
-        hit |= _meets_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
+        hit |= _hits_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
     return np.asarray(hit.reshape(len(T_cloud_hand), len(grown)).any(axis=1))
 
 
@@ -99,11 +99,11 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
         gripper: Its boxes, fingers open to the maximum.
 
     Returns:
-        (E,) metres. Where something is within the hand: minus how deep the deepest lies under
-        the surface of the box it is in.
+        (E,) metres. Negative where something lies within a box of the hand: its depth below the
+        box's surface, the deepest.
     """
     boxes = gripper.boxes(gripper.max_opening)
-    nearest = clearance(scene.cloud.points, T_cloud_hand, boxes)
+    nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
     if scene.support is not None:
         nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
     hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
@@ -118,13 +118,13 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     return nearest.astype(np.float32)
 
 
-def way_back(request: Collision) -> float:
-    """Metres of straight way behind the grasp that the hand passes."""
+def approach_sweep_length(request: Collision) -> float:
+    """Metres behind the grasp that the straight way in or out sweeps."""
     out = request.retreat_length if request.retreat_direction == "back" else 0.0
     return max(request.approach_length, out)
 
 
-def grown_boxes(gripper: Gripper, request: Collision) -> Float64:
+def inflated_boxes(gripper: Gripper, request: Collision) -> Float64:
     """Boxes (B, 2, 3) of the open hand with the margin around them."""
     boxes = gripper.boxes(gripper.max_opening)
     boxes[:, 0] -= request.margin
@@ -132,14 +132,14 @@ def grown_boxes(gripper: Gripper, request: Collision) -> Float64:
     return boxes
 
 
-def lengthened(boxes: Float64, request: Collision) -> Float64:
-    """Boxes (B, 2, 3) that also cover the ways along the hand's z."""
+def swept_boxes(boxes: Float64, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) that also cover the straight ways along the hand's z."""
     swept = boxes.copy()
-    swept[:, 0, 2] -= way_back(request)
+    swept[:, 0, 2] -= approach_sweep_length(request)
     return swept
 
 
-def _passed_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
+def _swept_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
     """Which points (P, 3) a box (3,), (3,) passes over while it moves by `lift` (P, 3)."""
     step = np.where(np.abs(lift) < 1e-12, 1e-12, lift)
     one, other = (position - high) / step, (position - low) / step  # shares of the way
@@ -147,7 +147,7 @@ def _passed_over(position: Float32, lift: Float32, low: Float64, high: Float64) 
     return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
 
 
-def _meets_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
+def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
     """Which boxes (M,), moved along `sweep` (3,), meet an obstacle."""
     hit = np.zeros(len(boxes), dtype=bool)
     way = np.zeros(3) if sweep is None else sweep
@@ -162,7 +162,7 @@ def _meets_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) 
 
 
 def required_openings(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
-    """Opening that lets the fingers pass what lies between them.
+    """Opening that clears what lies between the fingers, with FINGER_CLEARANCE on each side.
 
     Returns:
         (E,) metres, at most the gripper's maximum.
@@ -170,7 +170,7 @@ def required_openings(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
     half = gripper.pad_half_width
     x, y, z = view.columns
     inner = gripper.max_opening / 2
-    ahead = (z > gripper.palm_z) & (z < gripper.foremost_z)
+    ahead = (z > gripper.palm_z) & (z < gripper.max_tip_z)
     between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
     reach = np.zeros(view.num_candidates, dtype=np.float32)
     np.maximum.at(reach, view.candidate[between], np.abs(y[between]))

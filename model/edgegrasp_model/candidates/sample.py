@@ -7,13 +7,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_model.candidates.approach import BallCrop, crop_balls, sample_approach_points
-from edgegrasp_model.candidates.centred import centred_grasps
 from edgegrasp_model.candidates.collision import UP, collides
-from edgegrasp_model.candidates.edge import Candidates, edge_grasps, retract
-from edgegrasp_model.candidates.top_down import Headings, closing_headings, top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import (
+    BallCrop,
+    Candidates,
+    Headings,
+    centred_grasps,
+    closing_headings,
+    crop_balls,
+    edge_grasps,
+    retract,
+    sample_approach_points,
+    top_down_grasps,
+)
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.view import HandView, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.scene import Scene
@@ -21,11 +29,11 @@ from edgegrasp_model.scene.scene import Scene
 Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-SAMPLING_ATTEMPTS = 4  # further approach points are tried where no hand is free of collision
+SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
 OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
-TOP_DOWN_ANGLE = math.radians(30)  # between the hand's way and straight down
-SIDE_ANGLE = math.radians(30)  # between the hand's way and the horizontal
+TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
+SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
 MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
 
 
@@ -34,7 +42,7 @@ APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 @dataclass(frozen=True)
 class Attempt:
-    """Every candidate around one set of approach points, and what has become of it so far."""
+    """Every candidate around one set of approach points, and what became of it so far."""
 
     candidates: Candidates  # E of them
     outcome: NDArray[np.int8]  # (E,) CODE of its Outcome; RETURNED: still in
@@ -61,7 +69,7 @@ def sample_candidates(
     counts: dict[str, int],
     centre: bool = False,
 ) -> Sample:
-    """Sample approach points and the candidates around them, free of collision where possible.
+    """Sample approach points and the candidates around them, collision-free where possible.
 
     Args:
         scene: With at least one point in the approach region.
@@ -103,11 +111,11 @@ def sample_candidates(
         add_count(counts, "checked", len(row))
         add_count(counts, "collision_free", int(free.sum()))
         found = len(row) > 0 if ignored else free.any()
-        # The same approach points would come up again, and the same candidates around them.
+        # A further attempt would draw the same approach points and candidates.
         exhausted = len(approach_rows) <= len(chosen) and len(passed) <= limit
         if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
             break
-    scored = preferred_rows(free, options, rng_candidates)
+    scored = rows_to_score(free, options, rng_candidates)
     this.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
     candidates = candidates.take(scored)
@@ -132,7 +140,7 @@ def _constrained(
     counts: dict[str, int],
     centre: bool,
 ) -> Attempt:
-    """The edge grasps of some balls, and which satisfy every constraint but collision."""
+    """The edge grasps of some balls, and which satisfy every constraint but collision avoidance."""
     add_count(counts, "approach_points", len(approach_index))
     add_count(counts, "pairs", len(crop.ball_rows))
     pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
@@ -152,15 +160,15 @@ def _constrained(
         margin = options.collision.margin
         candidates, clear = retract(candidates, scene.support, gripper, margin)
         outcome[~clear] = CODE[Outcome.SUPPORT]
-    way = -candidates.approach
-    allowed = allowed_ways(way, options.approach_direction, UP, scene.frame.directions)
+    direction = -candidates.approach
+    allowed = allowed_directions(direction, options.approach_direction, UP, scene.frame.directions)
     outcome[~allowed] = CODE[Outcome.DIRECTION]
     add_count(counts, "in_direction", int(allowed.sum()))
     add_count(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
     return Attempt(candidates, outcome)
 
 
-def preferred_rows(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
+def rows_to_score(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
     """Ascending rows of at most num_candidates candidates, those free of collision first."""
     if options.collision.mode == "ignore":
         return random_rows(len(free), options.num_candidates, rng)
@@ -184,30 +192,30 @@ def add_count(counts: dict[str, int], name: str, number: int) -> None:
     counts[name] = counts.get(name, 0) + number
 
 
-def allowed_ways(
-    way: NDArray[np.floating],
+def allowed_directions(
+    direction: NDArray[np.floating],
     constraint: ApproachDirection | None,
     up: ArrayLike,
     in_frame: Callable[[ArrayLike], NDArray[np.floating]] = np.asarray,
 ) -> NDArray[np.bool_]:
-    """Which ways the hand may move.
+    """Which directions the hand may move in.
 
     Args:
-        way: (E, 3) unit, the directions in which hands move; their +z.
+        direction: (E, 3) unit, the directions in which hands move; their +z.
         constraint: What was asked for.
-        up: (3,) unit, in the frame of `way`.
-        in_frame: Takes the constraint's directions to the frame of `way`.
+        up: (3,) unit, in the frame of `direction`.
+        in_frame: Maps the constraint's directions to the frame of `direction`.
 
     Returns:
         (E,)
     """
-    rise = way @ np.asarray(up)
+    rise = direction @ np.asarray(up)
     if constraint is None:
         return np.asarray(-rise > MIN_APPROACH_UP)
-    allowed = np.zeros(len(way), dtype=bool)
+    allowed = np.zeros(len(direction), dtype=bool)
     for cone in constraint.cones:
         axis = in_frame(cone.direction)
-        allowed |= way @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
+        allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
     if constraint.preset == "top-down":
         allowed |= -rise >= math.cos(TOP_DOWN_ANGLE)
     if constraint.preset == "side":

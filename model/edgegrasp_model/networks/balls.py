@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgegrasp_model.candidates.approach import BallCrop
+from edgegrasp_model.candidates.edge_grasps import BallCrop
 from edgegrasp_model.kernels import nearest_in_groups
 
 

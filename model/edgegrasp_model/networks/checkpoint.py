@@ -6,9 +6,8 @@ The file's metadata holds one JSON text under the key `edgegrasp`; nothing in it
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,7 +15,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.networks.config import Architecture, NetworkConfig
+from edgegrasp_model.networks.config import Architecture, CheckpointMetadata, NetworkConfig
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
@@ -28,41 +27,6 @@ NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
     "vn-edgegrasp": VNEdgeGraspNet,
     "hand": HandNet,
 }
-
-
-@dataclass(frozen=True)
-class CheckpointMetadata:
-    """What a checkpoint says of itself.
-
-    The digest is the file's SHA-256, in hex; empty until the checkpoint was loaded from a file.
-
-    Raises:
-        ValueError: A field is out of range; names the field, the value and the fix.
-    """
-
-    name: str  # the model's name, such as `edgegrasp-plus`
-    network: NetworkConfig
-    voxel_size: float  # metres; the clouds it was trained on
-    gripper: str  # name of the gripper it was trained for
-    temperature: float = 1.0  # calibration: probability = sigmoid(logit / temperature)
-    training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
-    digest: str = ""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.voxel_size < 1.0:
-            raise ValueError(f"voxel_size: got {self.voxel_size!r}. Give metres, such as 0.0045.")
-        if not 0.0 < self.temperature < float("inf"):
-            raise ValueError(f"temperature: got {self.temperature!r}. Give a positive number.")
-
-    @property
-    def crop_radius(self) -> float:
-        """Ball radius, metres."""
-        return self.network.crop_radius
-
-    @property
-    def k(self) -> int:
-        """Neighbours of a point, itself included."""
-        return self.network.k
 
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:

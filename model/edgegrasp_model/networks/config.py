@@ -1,7 +1,7 @@
-"""Network configuration: which architecture, how wide, over which balls."""
+"""What a network is: its architecture and widths, and what its checkpoint says of it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, Self, get_args
 
 Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
@@ -121,3 +121,28 @@ HAND = NetworkConfig(
     hand_widths=(32, 64, 128),
     classifier_widths=(256, 128),
 )
+
+
+@dataclass(frozen=True)
+class CheckpointMetadata:
+    """What a checkpoint says of itself.
+
+    The digest is the file's SHA-256, in hex; empty until the checkpoint was loaded from a file.
+
+    Raises:
+        ValueError: A field is out of range; names the field, the value and the fix.
+    """
+
+    name: str  # the model's name, such as `edgegrasp-plus`
+    network: NetworkConfig
+    voxel_size: float  # metres; the clouds it was trained on
+    gripper: str  # name of the gripper it was trained for
+    temperature: float = 1.0  # calibration: probability = sigmoid(logit / temperature)
+    training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.voxel_size < 1.0:
+            raise ValueError(f"voxel_size: got {self.voxel_size!r}. Give metres, such as 0.0045.")
+        if not 0.0 < self.temperature < float("inf"):
+            raise ValueError(f"temperature: got {self.temperature!r}. Give a positive number.")

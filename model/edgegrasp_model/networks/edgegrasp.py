@@ -17,14 +17,14 @@ from edgegrasp_model.networks.layers import (
     CONVOLVED,
     EDGE_ROWS,
     BallMaximum,
-    MlpProducts,
-    Product,
+    PackedLinear,
+    PackedMlp,
     SharedLinear,
-    ball_pieces,
-    by_pieces,
+    ball_chunks,
+    by_chunks,
     float32_inference,
     gather_rows,
-    in_pieces,
+    in_chunks,
     maximum,
     mlp,
     row_linear,
@@ -52,8 +52,8 @@ class PointNetConv(nn.Module):
         feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
         v = row_linear(batch.points, point_weight)  # (P, width)
         u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
-        output, pooled = Product(self.output.weight), []
-        for neighbors, v_here in in_pieces(CONVOLVED, batch.neighbors, v):
+        output, pooled = PackedLinear(self.output.weight), []
+        for neighbors, v_here in in_chunks(CONVOLVED, batch.neighbors, v):
             hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
             pooled.append(maximum(output(hidden), dim=1))  # (p, width)
         # The bias is the same for all neighbours: added once, after the maximum.
@@ -71,12 +71,12 @@ class GlobalFeature(nn.Module):
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 224) to ball features (B, 1024)."""
-        pieces = ball_pieces(local, batch)
-        mlp_1, maximum_1 = MlpProducts(self.mlp_1), BallMaximum(batch.num_balls)
+        pieces = ball_chunks(local, batch)
+        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
         for piece in pieces:
             maximum_1.add(mlp_1(piece.values), piece)
         join = self.join.on(maximum_1.result())  # of (B, 512)
-        mlp_2, maximum_2 = MlpProducts(self.mlp_2), BallMaximum(batch.num_balls)
+        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
         for piece in pieces:
             joined = join(piece.values, piece.ball_of_point).relu_()  # (p, 1024)
             maximum_2.add(mlp_2(joined), piece)
@@ -109,8 +109,8 @@ class EdgeGraspNet(nn.Module):
         f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
         grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
-        join, classifier, logits = self.join.on(ball), MlpProducts(self.classifier), []
-        for own, ball_of_edge in in_pieces(EDGE_ROWS, grasp, batch.ball_of_edge):
+        join, classifier, logits = self.join.on(ball), PackedMlp(self.classifier), []
+        for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
             logits.append(classifier(join(own, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
 
@@ -129,8 +129,10 @@ class EdgeGraspNet(nn.Module):
 def fused_convolution(layer: "PointNetConv", features: Tensor, batch: BallBatch) -> Tensor:
     """`PointNetConv.forward`: maps point features (P, inputs) to (P, width)."""
     # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
-    weight, output = layer.hidden.weight, Product(layer.output.weight)
-    u = by_pieces(Product(weight, layer.hidden.bias), torch.cat((features, batch.points), dim=1))
+    weight, output = layer.hidden.weight, PackedLinear(layer.output.weight)
+    u = by_chunks(
+        PackedLinear(weight, layer.hidden.bias), torch.cat((features, batch.points), dim=1)
+    )
     offset = weight[:, -3:].t().contiguous().numpy()  # V, (3, width)
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
     (count, k), width = neighbors.shape, len(weight)

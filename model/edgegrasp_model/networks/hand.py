@@ -14,16 +14,16 @@ import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from edgegrasp_model.candidates.edge import Candidates
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view.description import HAND_DESCRIPTION_SIZE, describe_hands
-from edgegrasp_model.hand_view.view import HandView, hand_views, points_around_fingers, reach_of
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
+from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,
-    MlpProducts,
-    by_pieces,
-    in_pieces,
+    PackedMlp,
+    by_chunks,
+    in_chunks,
     maximum,
     mlp,
 )
@@ -118,21 +118,21 @@ class HandNet(nn.Module):
             left_out: In training, draws what the classifier is not told; None: it is told all.
         """
         description = (batch.description - self.mean) / self.std  # (E, F)
-        encoder = MlpProducts(self.point_encoder)
+        encoder = PackedMlp(self.point_encoder)
         pieces = [
             _around(encoder, points, count)
-            for points, count in in_pieces(PIECE, batch.points, batch.point_count)
+            for points, count in in_chunks(PIECE, batch.points, batch.point_count)
         ]
         around = torch.cat(pieces)[: len(description)]  # (E, 2 C)
         seen = torch.cat((description, around), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
             seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
-        logits = by_pieces(MlpProducts(self.classifier), seen, EDGE_ROWS)
+        logits = by_chunks(PackedMlp(self.classifier), seen, EDGE_ROWS)
         return logits.squeeze(1)  # (E,)
 
 
-def _around(encoder: MlpProducts, points: Tensor, count: Tensor) -> Tensor:
+def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
     """Maximum and mean over the points (E, P, 6) that there are of their features: (E, 2 C)."""
     positions, normals = torch.split(points, 3, dim=2)
     unit = torch.cat((positions / POINT_UNIT, normals), dim=2)  # (E, P, 6)

@@ -13,8 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.networks.checkpoint import CheckpointMetadata, build_network
-from edgegrasp_model.networks.config import EDGEGRASP, VN_EDGEGRASP, NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import (
+    EDGEGRASP,
+    VN_EDGEGRASP,
+    CheckpointMetadata,
+    NetworkConfig,
+)
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
 
 # Each file's prefix here, and then the parts of theirs under the names of ours.

@@ -58,7 +58,7 @@ class SharedProduct:
         """
         widths = [weight.shape[1] - shared.shape[-1], shared.shape[-1]]
         own_weight, shared_weight = torch.split(weight, widths, dim=1)
-        self._own = Product(own_weight, bias)
+        self._own = PackedLinear(own_weight, bias)
         self._shared = row_linear(shared, shared_weight)  # (B, ..., outputs)
 
     def __call__(self, own: Tensor, shared_of_row: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
     return F.linear(values, weight, bias)
 
 
-class Product:
+class PackedLinear:
     """A linear layer on many pieces of rows, one after another, by the faster of two libraries.
 
     For as long as the weights stay as they are: one forward pass.
@@ -130,13 +130,14 @@ class Product:
         return result
 
 
-class MlpProducts:
-    """The linear layers of an MLP as `Product`s, with their ReLUs."""
+class PackedMlp:
+    """The linear layers of an MLP as `PackedLinear`s, with their ReLUs."""
 
     def __init__(self, mlp: nn.Sequential) -> None:
         layers = linear_layers(mlp)
         self._products = [
-            Product(layer.weight, layer.bias, rectified=layer is not layers[-1]) for layer in layers
+            PackedLinear(layer.weight, layer.bias, rectified=layer is not layers[-1])
+            for layer in layers
         ]
 
     def __call__(self, values: Tensor) -> Tensor:
@@ -186,7 +187,7 @@ def _packed(weight: Tensor) -> Tensor | None:
     return packed
 
 
-class BallPiece(NamedTuple):
+class BallChunk(NamedTuple):
     """p points of a few balls, one of which may go on in the next piece."""
 
     values: Tensor  # (p, ...)
@@ -195,18 +196,18 @@ class BallPiece(NamedTuple):
     sizes: list[int]  # rows of each of these balls, in order, then of what fills the piece up
 
 
-def ball_pieces(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallPiece]:
+def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
     """Splits values (P, ...) of a batch's points into pieces of `rows`, the last one filled up.
 
     To record gradients, which keeps all of them anyway, and off the processor: one piece.
     """
     ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
     if torch.is_grad_enabled() or values.device.type != "cpu":
-        return [BallPiece(values, ball_of_point, list(range(len(sizes))), sizes)]
+        return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
     ends = torch.tensor(sizes).cumsum(0).tolist()
     pieces = []
     ball, start = 0, 0
-    for number, (part, ball_of_row) in enumerate(in_pieces(rows, values, ball_of_point)):
+    for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, ball_of_point)):
         end = (number + 1) * rows
         balls, sizes = [], []
         while ball < len(ends) and start < end:
@@ -215,11 +216,11 @@ def ball_pieces(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
             sizes.append(stop - start)
             start = stop
             ball += stop == ends[ball]
-        pieces.append(BallPiece(part, ball_of_row, balls, [*sizes, end - start]))
+        pieces.append(BallChunk(part, ball_of_row, balls, [*sizes, end - start]))
     return pieces
 
 
-def in_pieces(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
+def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     """Splits values (M, ...) of equal length into pieces of `rows`.
 
     In inference the last one is filled up with zeros. Off the processor it is one piece.
@@ -235,9 +236,9 @@ def in_pieces(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     return pieces
 
 
-def by_pieces(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROWS) -> Tensor:
+def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROWS) -> Tensor:
     """A layer that maps the rows of values (M, ...) one by one."""
-    parts = [layer(part) for (part,) in in_pieces(rows, values)]
+    parts = [layer(part) for (part,) in in_chunks(rows, values)]
     return torch.cat(parts)[: len(values)]
 
 
@@ -247,7 +248,7 @@ class BallMaximum:
     def __init__(self, num_balls: int) -> None:
         self._parts: list[list[Tensor]] = [[] for _ in range(num_balls)]
 
-    def add(self, values: Tensor, piece: BallPiece) -> None:
+    def add(self, values: Tensor, piece: BallChunk) -> None:
         """Take in the values (p, C) of a piece's points."""
         for ball, part in zip(piece.balls, torch.split(values, piece.sizes), strict=False):
             self._parts[ball].append(maximum(part, dim=0))

@@ -15,17 +15,17 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     CONVOLVED,
     EDGE_ROWS,
-    BallPiece,
-    MlpProducts,
-    Product,
+    BallChunk,
+    PackedLinear,
+    PackedMlp,
     RowLinear,
     SharedLinear,
     SharedProduct,
-    ball_pieces,
-    by_pieces,
+    ball_chunks,
+    by_chunks,
     float32_inference,
     gather_rows,
-    in_pieces,
+    in_chunks,
     mlp,
     row_linear,
 )
@@ -59,7 +59,7 @@ class VNPointNetConv(nn.Module):
         u = row_linear(features, feature_weight) + v  # (P, 3, width)
         u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
         pooled = []
-        for neighbors, v_here, v_direction_here in in_pieces(
+        for neighbors, v_here, v_direction_here in in_chunks(
             CONVOLVED, batch.neighbors, v, v_direction
         ):
             hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
@@ -218,9 +218,9 @@ def fused_convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatc
     """`VNPointNetConv.forward`: maps point features (P, 3, inputs) to (P, 3, width)."""
     # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
     weight = _beside(layer.hidden.weight, layer.hidden_relu.direction.weight)
-    output = Product(_beside(layer.output.weight, layer.reach.weight))
-    u = by_pieces(
-        Product(weight), torch.cat((features, batch.points.unsqueeze(2)), dim=2), FUSED_ROWS
+    output = PackedLinear(_beside(layer.output.weight, layer.reach.weight))
+    u = by_chunks(
+        PackedLinear(weight), torch.cat((features, batch.points.unsqueeze(2)), dim=2), FUSED_ROWS
     )
     (count, k), width = batch.neighbors.shape, len(layer.output.weight)
     offset = weight[:, -1].contiguous().numpy()
@@ -240,10 +240,10 @@ def fused_convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatc
 
 def fused_ball_feature(layer: "VNGlobalFeature", local: Tensor, batch: BallBatch) -> Tensor:
     """`VNGlobalFeature.forward`: maps point features (P, 3, C) to ball features (B, 3, width)."""
-    first, second = Product(_weights(layer.vn_1)), Product(_weights(layer.vn_2))
-    third = Product(_beside(layer.vn_3.weight, layer.maximum_1.reach.weight))
-    last = Product(_beside(layer.vn_5.weight, layer.maximum_2.reach.weight))
-    pieces = ball_pieces(local, batch, FUSED_ROWS)
+    first, second = PackedLinear(_weights(layer.vn_1)), PackedLinear(_weights(layer.vn_2))
+    third = PackedLinear(_beside(layer.vn_3.weight, layer.maximum_1.reach.weight))
+    last = PackedLinear(_beside(layer.vn_5.weight, layer.maximum_2.reach.weight))
+    pieces = ball_chunks(local, batch, FUSED_ROWS)
     maximum = _BallMaximum(batch.num_balls, len(layer.vn_3.weight))
     for piece in pieces:
         maximum.add(third(_relu(second(_relu(first(piece.values))))), piece)
@@ -260,9 +260,9 @@ def fused_logits(
 ) -> Tensor:
     """The end of `VNEdgeGraspNet.forward`: logits (E,) of grasps (E, 3, C) in balls (B, 3, D)."""
     join = SharedProduct(_weights(network.frame_1), None, ball)
-    frame_2, frame_3 = Product(_weights(network.frame_2)), Product(network.frame_3.weight)
-    classifier, result = MlpProducts(network.classifier), []
-    for own, of_ball in in_pieces(EDGE_ROWS, grasp, ball_of_edge):
+    frame_2, frame_3 = PackedLinear(_weights(network.frame_2)), PackedLinear(network.frame_3.weight)
+    classifier, result = PackedMlp(network.classifier), []
+    for own, of_ball in in_chunks(EDGE_ROWS, grasp, ball_of_edge):
         frame = frame_3(_relu(frame_2(_relu(join(own, of_ball)))))  # (e, 3, 3)
         vectors = torch.cat((own, ball[of_ball]), dim=2)
         result.append(classifier((vectors.transpose(1, 2) @ frame).flatten(1)))  # (e, 1)
@@ -275,8 +275,8 @@ def _beside(weight: Tensor, direction: Tensor) -> Tensor:
 
 
 def _own_relu(vectors: Tensor, direction: nn.Linear) -> Tensor:
-    directions = Product(direction.weight)
-    return by_pieces(lambda v: _relu(torch.cat((v, directions(v)), dim=2)), vectors, FUSED_ROWS)
+    directions = PackedLinear(direction.weight)
+    return by_chunks(lambda v: _relu(torch.cat((v, directions(v)), dim=2)), vectors, FUSED_ROWS)
 
 
 def _weights(layer: "VNLinearReLU | VNSharedLinearReLU") -> Tensor:
@@ -291,7 +291,7 @@ class _BallMaximum:
         self._best = torch.full((num_balls, width), -torch.inf)
         self._vectors = torch.zeros(num_balls, 3, width)
 
-    def add(self, both: Tensor, piece: BallPiece) -> None:
+    def add(self, both: Tensor, piece: BallChunk) -> None:
         """Take in the vectors and directions (p, 3, 2 width) of a piece's points."""
         bounds = np.cumsum([0, *piece.sizes[: len(piece.balls)]])
         balls = slice(piece.balls[0], piece.balls[-1] + 1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import Box, OrientedBox
-from edgegrasp_model.scene.frame import CanonicalFrame
+from edgegrasp_model.scene.cloud import CanonicalFrame
 
 Float64 = NDArray[np.float64]
 

@@ -24,18 +24,18 @@ Bools = NDArray[np.bool_]
 HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
 
 
-def check_region(region: Region | None, cloud: CheckedCloud, field: str) -> None:
+def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
     """Check that the rows a region speaks of exist.
 
     Args:
-        region: None: nothing to check.
+        region: Its shapes, some of which may name rows.
         cloud: The cloud as sent.
         field: Name of the region in the request, for the error.
 
     Raises:
         InvalidRequest: An index or a mask does not suit the cloud, or it came without segments.
     """
-    for part in ("include", "exclude") if region is not None else ():
+    for part in ("include", "exclude"):
         for place, shape in enumerate(getattr(region, part)):
             here, rows = f"options.{field}.{part}.{place}", cloud.rows_sent
             if isinstance(shape, Indices) and max(shape.indices, default=0) >= rows:
@@ -49,13 +49,11 @@ def check_region(region: Region | None, cloud: CheckedCloud, field: str) -> None
                 raise InvalidRequest("segment_ids", "nothing", fix)
 
 
-def inside_region(
-    region: Region | None, points: Float32, voxels: Voxels, cloud: CheckedCloud
-) -> Bools:
+def inside_region(region: Region, points: Float32, voxels: Voxels, cloud: CheckedCloud) -> Bools:
     """Which voxels of the processed cloud a region holds.
 
     Args:
-        region: None: everywhere.
+        region: Unions of shapes.
         points: (V, 3) the voxels' mean points, cloud frame.
         voxels: Which of the cloud's points are in each.
         cloud: The points in `voxels`, of the cloud as sent.
@@ -63,8 +61,6 @@ def inside_region(
     Returns:
         (V,)
     """
-    if region is None:
-        return np.ones(len(points), dtype=bool)
 
     def in_any(shapes: tuple[Shape, ...]) -> Bools:
         found = np.zeros(len(points), dtype=bool)

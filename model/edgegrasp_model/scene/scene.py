@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.options import DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import (
+    CanonicalFrame,
     CheckedCloud,
     Cloud,
     Voxels,
@@ -17,7 +18,6 @@ from edgegrasp_model.scene.cloud import (
     statistical_outlier_removal,
     voxelise,
 )
-from edgegrasp_model.scene.frame import CanonicalFrame
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, inside_region
 from edgegrasp_model.scene.support import SUPPORT_MARGIN, correct_depth_scale, find_support_plane
@@ -27,8 +27,9 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MIN_POINTS = 4  # fewer make no surface
-MIN_NORMAL = 1e-3  # length of the mean of a voxel's normals below which they say nothing
-SIDE_DEPTH = 0.006  # metres inside a side of the workspace where points may belong to what it cuts
+MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
+SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
+MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 
 
@@ -54,8 +55,9 @@ def build_scene(
     voxel_size: float,
     counts: dict[str, int],
     warnings: list[str],
+    max_voxels: int = MAX_VOXELS,
 ) -> Scene | None:
-    """Correct depths, crop, take the support away, voxelise, get normals, find the regions.
+    """Correct depths, crop, remove the support, voxelise, estimate normals, find the regions.
 
     Args:
         sent: N points.
@@ -63,16 +65,18 @@ def build_scene(
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
         warnings: Gets what the caller should know.
+        max_voxels: Most voxels that the cloud may have where grasps are looked for.
 
     Returns:
         The scene, or None where too few points are left to make a surface.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints, or there are none to correct depths from.
+            views do not suit the viewpoints, or there are none to correct depths from, or the
+            cloud has too many voxels.
     """
-    viewpoints = check_viewpoints(sent, options)
-    sent, support = cut_out(sent, viewpoints, options, counts, warnings)
+    viewpoints = camera_positions(sent, options)
+    sent, support = crop_cloud(sent, viewpoints, options, counts, warnings)
     if len(sent.points) == 0:
         counts |= {"voxels": 0, "kept": 0}
         return None
@@ -80,15 +84,23 @@ def build_scene(
     frame = CanonicalFrame.of_scene(sent.points, options.up, first_viewpoint)
     points = frame.points(sent.points)
     voxels = voxelise(points, voxel_size)
+    counts["voxels"] = len(voxels.size)
+    if counts["voxels"] > max_voxels:
+        raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(points)
-    counts["voxels"] = len(middles)
     kept = statistical_outlier_removal(middles)
     counts["kept"] = int(kept.sum())
     if counts["kept"] < MIN_POINTS:
         return None
     cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
     in_cloud = frame.points_in_cloud(middles)
-    approach = inside_region(options.approach_region, in_cloud, voxels, sent)[kept]
+
+    def allowed(region: Region | None) -> Bools:
+        if region is None:
+            return np.ones(counts["kept"], dtype=bool)
+        return inside_region(region, in_cloud, voxels, sent)[kept]
+
+    approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
@@ -99,43 +111,57 @@ def build_scene(
         points_in_cloud=in_cloud[kept],
         point_of_row=point_of_row,
         approach_allowed=approach,
-        contact_allowed=inside_region(options.contact_region, in_cloud, voxels, sent)[kept],
+        contact_allowed=allowed(options.contact_region),
         support=None if support is None else plane_in_frame(support, frame),
-        at_side=at_workspace_side(in_cloud[kept], options.workspace, options.up),
-        viewpoint=only_viewpoint(viewpoints, frame),
+        at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
+        viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
     )
 
 
-def cut_out(
+def _too_many_voxels(
+    count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
+) -> InvalidRequest:
+    size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
+    cropped = "no workspace" if options.workspace is None else "the workspace"
+    return InvalidRequest(
+        "options.workspace",
+        f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
+        f"Send a workspace around the objects, or a support plane: at most {most} are accepted.",
+    )
+
+
+def crop_cloud(
     sent: CheckedCloud,
     viewpoints: NDArray[np.float64] | None,
     options: DetectOptions,
     counts: dict[str, int],
     warnings: list[str],
 ) -> tuple[CheckedCloud, SupportPlane | None]:
-    """The cloud, its depths put right, within the workspace and above its support; the support.
+    """Correct the depths, crop to the workspace and remove the support plane; returns both.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
             are no viewpoints (W, 3) to correct depths from.
     """
-    check_region(options.approach_region, sent, "approach_region")
-    check_region(options.contact_region, sent, "contact_region")
+    for field in ("approach_region", "contact_region"):
+        if (region := getattr(options, field)) is not None:
+            check_region(region, sent, field)
     counts["points"] = len(sent.points)
-    sent = correct_depth_scale(sent, options, viewpoints, warnings)
-    sent = cut_to_workspace(sent, options)
+    support = options.support
+    if isinstance(support, SupportPlane) and support.max_depth_error > 0.0:
+        sent = correct_depth_scale(sent, support, viewpoints, warnings)
+    sent = crop_to_workspace(sent, options)
     counts["in_workspace"] = len(sent.points)
     support, sent = remove_support_plane(sent, options, warnings)
     counts["above_support"] = len(sent.points)
     return sent, support
 
 
-def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
-    """Which points (N, 3), in the cloud's frame, lie where a side of the workspace cuts things off.
+def near_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
+    """Which points (N, 3), in the cloud's frame, lie at a side of the workspace.
 
-    Its floor and ceiling are no sides: the one cuts off what the hand does not grasp, the other
-    what is above all.
+    An object there may be cut off, and wider than it seems. Floor and ceiling do not count.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)
@@ -145,8 +171,8 @@ def at_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLik
     return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
 
 
-def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
-    """The camera positions (W, 3), where any are given."""
+def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
+    """The camera positions (W, 3) that the request gives, if any."""
     if options.viewpoint is None:
         return None
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
@@ -162,14 +188,16 @@ def check_viewpoints(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.f
     return viewpoints
 
 
-def only_viewpoint(viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame) -> Float32 | None:
-    """The camera (3,) in the canonical frame, if there is just one."""
+def single_viewpoint(
+    viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame
+) -> Float32 | None:
+    """The camera (3,) in the canonical frame, if there is exactly one."""
     if viewpoints is None or len(viewpoints) != 1:
         return None
     return frame.points(viewpoints[0]).astype(np.float32)
 
 
-def cut_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
+def crop_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
     """The part of a cloud within the workspace."""
     if options.workspace is None:
         return sent

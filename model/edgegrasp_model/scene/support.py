@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
+from edgegrasp_model.options import RansacPlane, SupportPlane
 from edgegrasp_model.scene.cloud import CheckedCloud
 
 Float32 = NDArray[np.float32]
@@ -20,12 +20,12 @@ JUDGED = 1000  # planes of the right tilt that are judged at most
 SAMPLE = 2000  # points that planes are judged by
 CROWD_RADIUS = 0.02  # metres around a point in which others share its surface
 REFINEMENTS = 3  # least squares over the plane's points
-NEAR = 0.01  # metres from the plane within which points are taken for it
+NEAR = 0.01  # metres from the plane within which points belong to it
 HIGHEST = 10.0  # metres over the plane, the highest camera
 STEP = 0.001  # metres that the plane moves between one factor that is tried and the next
-FLAT = 0.35  # of that distance, median distance of its points; those of a wall have 0.5
+FLAT = 0.35  # of that distance: largest median distance of a plane's points (a wall's is 0.5)
 SCALE_REFINEMENTS = 20
-LEAST = 5e-4  # factors nearer to one are none
+LEAST = 5e-4  # smaller corrections are left out
 
 
 def find_support_plane(
@@ -58,7 +58,7 @@ def find_support_plane(
         return None
     offsets = np.einsum("td,td->t", normals, corners[:, 0])
     held = np.abs(judged @ normals.T - offsets) < request.distance  # (S, T)
-    # What is near the camera has more points: each counts for the surface it stands for.
+    # Surfaces near the camera have more points: weigh each point by the surface it stands for.
     crowd = cKDTree(judged).query_ball_point(judged, CROWD_RADIUS, return_length=True)
     share = (1.0 / crowd) @ held / (1.0 / crowd).sum()  # (T,)
     best = int(share.argmax())
@@ -94,24 +94,21 @@ MIN_SHARE, MIN_POINTS = 0.1, 20  # of the points that the plane must hold
 
 def correct_depth_scale(
     sent: CheckedCloud,
-    options: DetectOptions,
+    plane: SupportPlane,
     viewpoints: Float64 | None,
     warnings: list[str],
 ) -> CheckedCloud:
-    """The cloud with every view scaled about its camera, so that the support plane is in its place.
+    """Scale every view about its camera so that the support plane it sees lies where it should.
 
     Args:
         sent: N points, in which the plane is seen.
-        options: Whose support may name a greatest depth error.
+        plane: Where the support is, and how wrong depths may be (max_depth_error).
         viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
         warnings: Gets what was done, or why nothing was.
 
     Raises:
         InvalidRequest: There is no viewpoint to scale about.
     """
-    plane = options.support
-    if not isinstance(plane, SupportPlane) or plane.max_depth_error == 0.0:
-        return sent
     if viewpoints is None:
         fix = "Send the camera's position: depths are corrected along its rays."
         raise InvalidRequest("options.viewpoint", "nothing", fix)
@@ -135,10 +132,10 @@ def correct_depth_scale(
 def depth_scale(
     points: NDArray[np.floating], viewpoint: Float64, plane: SupportPlane
 ) -> float | None:
-    """The factor on all depths of a view that brings what it saw of a plane into the plane.
+    """The factor on all depths of a view that brings its points of the plane into the plane.
 
-    Where several factors bring a level of points there, the table's or that of a lid, the least
-    counts: nothing is seen below the table.
+    Where several factors fit (the table, or the flat top of an object), the smallest counts:
+    nothing is seen below the table.
 
     Args:
         points: (N, 3) metres.
@@ -152,7 +149,7 @@ def depth_scale(
     falls = height - plane.heights(points.astype(np.float64))
     if not NEAR < height < HIGHEST:
         return None
-    # A point is in the plane once its fall below the camera is the camera's height.
+    # A point lies in the plane once it is as far below the camera as the plane is.
     factors = np.sort(height / falls[falls > 0.5 * height])
     step, reach = STEP / height, NEAR / height
     tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error + step / 2, step)

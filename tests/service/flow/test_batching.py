@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 
-from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import seen_from
+from edgegrasp_model.kernels import points_in_hand_boxes
 from edgegrasp_model.scene.cloud import Cloud
 
 Float32 = NDArray[np.float32]
@@ -39,7 +39,7 @@ def reach_of(
     around, back = max(around, NEAR) + lift, max(back, APPROACH_LENGTH)
     low = boxes[:, 0].min(axis=0) - np.array([around, around, back + around - NEAR])
     high = boxes[:, 1].max(axis=0) + np.array([around, around, around + NEAR])
-    high[2] += gripper.foremost_z - gripper.tip_z
+    high[2] += gripper.max_tip_z - gripper.tip_z
     return Reach(tuple(low.tolist()), tuple(high.tolist()))
 
 
@@ -102,7 +102,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
         reach: What is kept.
     """
     low, high = np.asarray(reach, dtype=np.float32)
-    hand, row, position = seen_from(cloud.points, T_cloud_hand, low, high)
+    hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, low, high)
     return HandView(hand, row, position, len(T_cloud_hand), reach)
 
 

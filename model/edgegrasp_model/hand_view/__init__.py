@@ -1,1 +1,0 @@
-"""What each hand sees of the cloud in its own frame."""
