@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from edgegrasp_model.detector import GraspDetector, ModelCatalogue
-from edgegrasp_model.errors import InvalidCheckpoint, InvalidRequest, UnknownModel
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
+from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Outcome
@@ -221,3 +222,28 @@ def test_a_catalogue_finds_weights_by_their_file_name(tmp_path: Path) -> None:
         ModelCatalogue({"mine": catalogue.get()}, default="other")
     with pytest.raises(InvalidCheckpoint):
         ModelCatalogue({})
+
+
+@pytest.mark.parametrize(
+    ("gpus", "name", "device"),
+    [
+        (2, "auto", "cuda:0"),
+        (2, "cuda", "cuda:0"),
+        (2, "cuda:1", "cuda:1"),
+        (2, "cpu", "cpu"),
+        (2, "cuda:2", None),
+        (0, "auto", "cpu"),
+        (0, "cuda", None),
+        *((2, name, None) for name in ("gpu", "cuda:", "cuda:-1", "CPU", "", "mps")),
+    ],
+)
+def test_a_device_is_chosen_only_where_it_is(
+    monkeypatch: pytest.MonkeyPatch, gpus: int, name: str, device: str | None
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    if device is not None:
+        assert str(choose_device(name)) == device
+    else:
+        with pytest.raises(InvalidDevice, match=f"device: got '{name}'"):
+            choose_device(name)
