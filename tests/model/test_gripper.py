@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from edgegrasp_model.candidates.collision import hits_cloud, required_openings
+from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import (
-    EDGE_MARGIN,
     edge_grasps,
     support_clearance,
     top_down_grasps,
@@ -26,7 +23,6 @@ from edgegrasp_model.gripper import (
     load_gripper,
 )
 from edgegrasp_model.hand_description import describe_hands
-from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.options import Collision, DetectOptions, GripperGeometry, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -109,27 +105,6 @@ def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gri
     assert clearance == pytest.approx(lowest, abs=1e-5)
 
 
-@by_name
-@settings(max_examples=30, deadline=None)
-@given(along=st.floats(0.004, 0.06), depth=st.floats(0.002, 0.05))
-def test_an_edge_grasp_puts_its_contact_inside_the_fingertips(
-    gripper: Gripper, along: float, depth: float
-) -> None:
-    cloud = edge_cloud(along, depth)
-    grasps = edge_grasps(cloud, np.array([0]), np.array([1]), gripper)
-    fits = np.hypot(along, depth) < gripper.max_opening / 2 - EDGE_MARGIN
-    assert len(grasps) == int(fits and depth < gripper.finger_depth)
-    for pose in grasps.T_cloud_hand:
-        p_a, p_c = (cloud.points - pose[:3, 3]) @ pose[:3, :3]
-        np.testing.assert_allclose(p_c[[0, 1]], [0, along], atol=1e-6)
-        np.testing.assert_allclose(p_a[[0, 1]], [0, 0], atol=1e-6)
-        np.testing.assert_allclose(p_c[2], gripper.contact_z_at(2 * along), atol=1e-6)
-        tips = gripper.boxes(2 * along)[:, 1, 2].max()
-        np.testing.assert_allclose(tips - p_c[2], gripper.tip_z - gripper.contact_z, atol=1e-6)
-        assert abs(p_c[1]) < gripper.max_opening / 2
-        assert p_a[2] > gripper.palm_z
-
-
 def test_a_wider_gripper_takes_edges_that_a_narrow_one_cannot() -> None:
     cloud, pair = edge_cloud(0.045, 0.01), (np.array([0]), np.array([1]))
     found = {g.name: len(edge_grasps(cloud, *pair, g)) for g in GRIPPERS}
@@ -165,13 +140,6 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> No
     # Centres of overlapping boxes lie in one region or the other, never in none.
     assert np.expm1(described[:2]).round().tolist() == [fingers, fingers]
     assert np.expm1(described[2]).round() >= hands
-
-
-@by_name
-def test_the_width_needed_reaches_past_what_stands_between_the_fingers(gripper: Gripper) -> None:
-    point = np.array([[0.0, 0.01, gripper.contact_z]], np.float32)
-    view = hand_views(Cloud(point, point), HAND, reach_of(gripper))
-    assert 0.02 < required_openings(view, gripper)[0] <= gripper.max_opening
 
 
 def test_a_bracket_beside_the_fingers_is_no_palm() -> None:
