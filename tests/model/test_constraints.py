@@ -17,6 +17,7 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Grasp
 from edgegrasp_model.scene.cloud import CloudInput
 
+from .oracles import any_point_in_boxes, signed_distance_to_boxes
 from .scenes import box_on_table, detector
 
 CASES = 100  # for each seed
@@ -60,12 +61,8 @@ class Draw:
 
     def oriented(self) -> dict:
         half, turn = self.rng.uniform(0.01, 0.08, 3).tolist(), self.direction(4)
-        return {
-            "kind": "oriented_box",
-            "center": self.point(),
-            "half_extents": half,
-            "quaternion": turn,
-        }
+        box = {"kind": "oriented_box", "center": self.point()}
+        return box | {"half_extents": half, "quaternion": turn}
 
     def obstacle(self) -> dict:
         """A box beside the object."""
@@ -85,12 +82,11 @@ class Draw:
         return {"kind": "half_space", "normal": normal, "offset": offset}
 
     def rows(self) -> dict:
-        start = self.whole(0, ROWS // 2)
-        indices = list(range(start, start + self.whole(1, ROWS // 2)))
+        start, end = self.whole(0, ROWS // 2), self.whole(ROWS // 2, ROWS)
         mask = (np.arange(ROWS) % self.whole(2, 6) > 0).tolist()
         segments = self.rng.integers(0, 4, self.whole(1, 2)).tolist()
         return self.one_of(
-            {"kind": "indices", "indices": indices},
+            {"kind": "indices", "indices": list(range(start, end))},
             {"kind": "mask", "mask": mask},
             {"kind": "segments", "ids": segments},
         )
@@ -193,11 +189,8 @@ def check(fields: dict, sent: CloudInput, found: Detection, gripper: Gripper) ->
 
 
 def check_regions(fields: dict, sent: CloudInput, grasp: Grasp) -> None:
-    for name, point in (
-        ("approach_region", grasp.approach_point),
-        ("contact_region", grasp.contact_point),
-    ):
-        region = fields[name]
+    for name in ("approach", "contact"):
+        region, point = fields[f"{name}_region"], getattr(grasp, f"{name}_point")
         if region is not None:
             include, exclude = region["include"], region["exclude"]
             assert not include or any(holds(shape, sent, point, True) for shape in include)
@@ -220,14 +213,12 @@ def holds(shape: dict, sent: CloudInput, point: np.ndarray, at_least_partly: boo
             return math.dist(x, shape["center"]) <= shape["radius"]
         case "half_space":
             return float(np.dot(x, shape["normal"])) >= shape["offset"]
-    rows = np.zeros(len(sent.points), dtype=bool)
-    match shape["kind"]:
         case "indices":
-            rows[list(shape["indices"])] = True
+            rows = np.isin(np.arange(ROWS), shape["indices"])
         case "mask":
-            rows[:] = shape["mask"]
-        case "segments":
-            rows[:] = [segment in shape["ids"] for segment in sent.segment_ids]
+            rows = np.array(shape["mask"])
+        case _:
+            rows = np.isin(sent.segment_ids, shape["ids"])
     if at_least_partly:
         return rows.any() and cKDTree(sent.points[rows]).query(x)[0] <= VOXEL_DIAGONAL
     return bool(rows[cKDTree(sent.points).query_ball_point(x, VOXEL_DIAGONAL)].all())
@@ -267,50 +258,37 @@ def check_pose(fields: dict, grasp: Grasp, gripper: Gripper) -> None:
     assert gripper.palm_z < c[2] < gripper.max_tip_z
 
 
-def ways(fields: dict, grasp: Grasp) -> list[np.ndarray]:
-    """Offsets (3,) of the hand from the grasp along the way in and out."""
-    request = fields["collision"]
+def ways(fields: dict, grasp: Grasp) -> np.ndarray:
+    """Offsets (W, 3) of the hand from the grasp along the way in and out."""
+    request, steps = fields["collision"], np.linspace(0, 1, STEPS)[:, None]
     up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     back = -grasp.T_cloud_hand[:3, 2].astype(np.float64)
     out = up if request["retreat_direction"] == "up" else back
-    return [back * request["approach_length"] * t for t in np.linspace(0, 1, STEPS)] + [
-        out * request["retreat_length"] * t for t in np.linspace(0, 1, STEPS)
-    ]
+    approach, retreat = request["approach_length"] * back, request["retreat_length"] * out
+    return np.concatenate([steps * approach, steps * retreat])
 
 
 def check_support(fields: dict, found: Detection, grasp: Grasp, gripper: Gripper) -> None:
-    assert found.debug is not None
-    plane = found.debug.support_plane
+    plane, margin = found.debug.support_plane, fields["collision"]["margin"]
     if plane is None:
         return
     for point in (grasp.approach_point, grasp.contact_point):
         assert point @ plane[:3] > plane[3]
-    boxes = gripper.boxes(gripper.max_opening)
-    corners = np.array(
-        [
-            [box[i][0], box[j][1], box[k][2]]
-            for box in boxes
-            for i, j, k in itertools.product((0, 1), repeat=3)
-        ]
-    )
+    ends = gripper.boxes(gripper.max_opening).transpose(0, 2, 1)  # (B, 3, 2)
+    corners = np.concatenate([list(itertools.product(*box)) for box in ends])
     heights = (corners @ grasp.T_cloud_hand[:3, :3].T + grasp.T_cloud_hand[:3, 3]) @ plane[:3]
     lowest = heights.min() - plane[3]
-    margin = fields["collision"]["margin"]
     assert lowest >= margin - TOLERANCE
     assert grasp.clearance <= lowest + TOLERANCE
     if grasp.collision_free:
-        for offset in ways(fields, grasp):
-            assert lowest + offset @ plane[:3] >= margin - TOLERANCE
+        assert (lowest + ways(fields, grasp) @ plane[:3] >= margin - TOLERANCE).all()
 
 
 def check_collision(fields: dict, found: Detection, grasp: Grasp, gripper: Gripper) -> None:
-    assert found.debug is not None
-    request = fields["collision"]
-    solid = [found.debug.points.astype(np.float64)]
-    solid += [lattice(box) for box in request["obstacles"]]
-    points = (np.concatenate(solid) - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
-    boxes = gripper.boxes(gripper.max_opening)
-    distance = min(box_distance(points, low, high).min() for low, high in boxes)
+    request, boxes = fields["collision"], gripper.boxes(gripper.max_opening)
+    points = np.concatenate([found.debug.points, *map(lattice, request["obstacles"])])
+    hand = grasp.T_cloud_hand[None].astype(np.float64)
+    (distance,) = signed_distance_to_boxes(points, hand, boxes)
     assert grasp.clearance <= distance + TOLERANCE
     if not request["obstacles"] and found.debug.support_plane is None:
         np.testing.assert_allclose(grasp.clearance, distance, atol=TOLERANCE)
@@ -318,43 +296,30 @@ def check_collision(fields: dict, found: Detection, grasp: Grasp, gripper: Gripp
         assert request["mode"] != "avoid"
         return
     assert grasp.clearance >= request["margin"] - TOLERANCE
+    offsets = ways(fields, grasp)
+    hands = np.repeat(hand, len(offsets), axis=0)
+    hands[:, :3, 3] += offsets
     grown = request["margin"] - TOLERANCE
-    for offset in ways(fields, grasp):
-        moved = (points - offset @ grasp.T_cloud_hand[:3, :3])[:, None]  # (N, 1, 3)
-        inside = (moved > boxes[:, 0] - grown) & (moved < boxes[:, 1] + grown)
-        assert not inside.all(axis=2).any()
+    boxes += np.array([[-grown], [grown]])
+    assert not any_point_in_boxes(points, hands, boxes).any()
 
 
 def lattice(box: dict) -> np.ndarray:
     """Points (343, 3) in a box of a request."""
     steps = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 3), -1).reshape(-1, 3)
     if box["kind"] == "oriented_box":
-        return (
-            Rotation.from_quat(box["quaternion"]).apply(steps * box["half_extents"]) + box["center"]
-        )
+        turn = Rotation.from_quat(box["quaternion"])
+        return turn.apply(steps * box["half_extents"]) + box["center"]
     low, high = np.array(box["min"]), np.array(box["max"])
     return low + (steps + 1) / 2 * (high - low)
-
-
-def box_distance(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Signed distances of points (N, 3) to a box."""
-    beyond = np.maximum(low - points, points - high)
-    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-    return np.where(outside > 0, outside, beyond.max(axis=1))
 
 
 def check_order(fields: dict, grasps: list[Grasp]) -> None:
     up = np.array(fields["up"]) / np.linalg.norm(fields["up"])
     free = [grasp.collision_free or fields["collision"]["mode"] == "ignore" for grasp in grasps]
     if fields["order"] == "clearance":
-        assert free == sorted(free, reverse=True)
-        for half in (True, False):
-            wide = [
-                grasp.clearance
-                for grasp, is_free in zip(grasps, free, strict=True)
-                if is_free is half
-            ]
-            assert all(a >= b - 1e-6 for a, b in itertools.pairwise(wide))
+        keys = [(is_free, g.clearance) for g, is_free in zip(grasps, free, strict=True)]
+        assert keys == sorted(keys, reverse=True)
         return
     worth = [g.score if is_free else g.score / 2 for g, is_free in zip(grasps, free, strict=True)]
     sure = sum(value >= 0.9 for value in worth) if fields["order"] == "highest" else 0
