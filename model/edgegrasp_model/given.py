@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.collision import UP, clearances, collides, required_openings
+from edgegrasp_model.candidates.collision import clearances, collides, required_openings
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
@@ -23,7 +23,7 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
-from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import Collision
 from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import Evaluation, NoGrasp
@@ -90,23 +90,6 @@ def evaluate(
     for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
         evaluations[number] = Evaluation(grasp, None)
     return evaluations
-
-
-def hand_batch(
-    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
-) -> HandBatch:
-    """What the hand network is told of some candidates of a scene."""
-    return HandBatch.from_cloud(
-        scene.cloud,
-        candidates,
-        gripper,
-        UP,
-        scene.support,
-        scene.viewpoint,
-        scene.at_side,
-        network.hand_points,
-        view,
-    )
 
 
 def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> NDArray[np.floating]:

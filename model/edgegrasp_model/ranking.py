@@ -5,12 +5,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.collision import UP, clearances
+from edgegrasp_model.candidates.collision import clearances
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import DetectOptions, Suppression
 from edgegrasp_model.results import DebugInfo, Grasp, Outcome
+from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 Int64 = NDArray[np.int64]

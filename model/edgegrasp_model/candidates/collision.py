@@ -8,7 +8,7 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
 from edgegrasp_model.kernels import any_point_in_boxes, signed_distance_to_boxes
 from edgegrasp_model.options import Collision, SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 
@@ -18,7 +18,6 @@ Bools = NDArray[np.bool_]
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
-UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:

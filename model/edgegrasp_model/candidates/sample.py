@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_model.candidates.collision import UP, collides
+from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
     BallCrop,
     Candidates,
@@ -24,6 +24,7 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
+from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 Int64 = NDArray[np.int64]

@@ -8,8 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from edgegrasp_model.candidates.edge_grasps import BallCrop
+from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
 from edgegrasp_model.kernels import nearest_in_groups
+from edgegrasp_model.networks.config import NetworkConfig
 
 
 def nearest_in_ball(
@@ -90,6 +91,27 @@ class BallBatch:
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=_float_tensor(approach),
             depth=_float_tensor(depth),
+        )
+
+    @classmethod
+    def made_up(cls, config: NetworkConfig) -> Self:
+        """A fixed batch of 32 edge grasps, to see whether a network computes as it did before."""
+        rng = np.random.default_rng(0)
+        points = rng.uniform(-0.06, 0.06, (200, 3)).astype(np.float32)
+        normals = rng.normal(size=(200, 3))
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        balls = np.array([0, 1])
+        crop = crop_balls(points, balls, config.crop_radius)
+        contact = rng.choice(len(crop.ball_rows), 32)
+        return cls.from_cloud(
+            points,
+            normals.astype(np.float32),
+            balls,
+            crop,
+            contact,
+            approach=normals[:32].astype(np.float32),
+            depth=rng.uniform(0.0, 0.04, 32).astype(np.float32),
+            k=config.k,
         )
 
     @property

@@ -127,7 +127,8 @@ HAND = NetworkConfig(
 class CheckpointMetadata:
     """What a checkpoint says of itself.
 
-    The digest is the file's SHA-256, in hex; empty until the checkpoint was loaded from a file.
+    `save_checkpoint` fills in `tensors_digest` and `reference_logits`, which `load_checkpoint`
+    checks; it fills in the file's `digest`. Digests are SHA-256, in hex.
 
     Raises:
         ValueError: A field is out of range; names the field, the value and the fix.
@@ -139,7 +140,9 @@ class CheckpointMetadata:
     gripper: str  # name of the gripper it was trained for
     temperature: float = 1.0  # calibration: probability = sigmoid(logit / temperature)
     training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
-    digest: str = ""
+    tensors_digest: str = ""  # of the weights alone
+    reference_logits: tuple[float, ...] = ()  # what the network says of a fixed made-up batch
+    digest: str = ""  # of the whole file; empty until it was loaded from one
 
     def __post_init__(self) -> None:
         if not 0.0 < self.voxel_size < 1.0:

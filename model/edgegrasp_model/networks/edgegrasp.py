@@ -35,54 +35,6 @@ Float32 = NDArray[np.float32]
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
 
 
-class PointNetConv(nn.Module):
-    """Graph convolution: a two-layer MLP on [f_j, p_j - p_i], maximum over neighbours j."""
-
-    def __init__(self, inputs: int, width: int) -> None:
-        super().__init__()
-        self.hidden = nn.Linear(inputs + 3, width)
-        self.output = nn.Linear(width, width)
-
-    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, inputs) to (P, width)."""
-        if float32_inference(features):
-            return fused_convolution(self, features, batch)
-        # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
-        widths = [features.shape[1], 3]
-        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = row_linear(batch.points, point_weight)  # (P, width)
-        u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
-        output, pooled = PackedLinear(self.output.weight), []
-        for neighbors, v_here in in_chunks(CONVOLVED, batch.neighbors, v):
-            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
-            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
-        # The bias is the same for all neighbours: added once, after the maximum.
-        return torch.cat(pooled)[: len(v)] + self.output.bias
-
-
-class GlobalFeature(nn.Module):
-    """One feature per ball: MLP, maximum over the ball, joined to each point; the same again."""
-
-    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
-        super().__init__()
-        self.mlp_1 = mlp((inputs, *widths_1))
-        self.join = SharedLinear(inputs + widths_1[-1], widths_2[0])
-        self.mlp_2 = mlp(widths_2)
-
-    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, 224) to ball features (B, 1024)."""
-        pieces = ball_chunks(local, batch)
-        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
-        for piece in pieces:
-            maximum_1.add(mlp_1(piece.values), piece)
-        join = self.join.on(maximum_1.result())  # of (B, 512)
-        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
-        for piece in pieces:
-            joined = join(piece.values, piece.ball_of_point).relu_()  # (p, 1024)
-            maximum_2.add(mlp_2(joined), piece)
-        return maximum_2.result()
-
-
 class EdgeGraspNet(nn.Module):
     """The paper's network."""
 
@@ -126,7 +78,55 @@ class EdgeGraspNet(nn.Module):
         return torch.cat(parts, dim=1)
 
 
-def fused_convolution(layer: "PointNetConv", features: Tensor, batch: BallBatch) -> Tensor:
+class PointNetConv(nn.Module):
+    """Graph convolution: a two-layer MLP on [f_j, p_j - p_i], maximum over neighbours j."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(inputs + 3, width)
+        self.output = nn.Linear(width, width)
+
+    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, inputs) to (P, width)."""
+        if float32_inference(features):
+            return fused_convolution(self, features, batch)
+        # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
+        widths = [features.shape[1], 3]
+        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
+        v = row_linear(batch.points, point_weight)  # (P, width)
+        u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
+        output, pooled = PackedLinear(self.output.weight), []
+        for neighbors, v_here in in_chunks(CONVOLVED, batch.neighbors, v):
+            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
+            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
+        # The bias is the same for all neighbours: added once, after the maximum.
+        return torch.cat(pooled)[: len(v)] + self.output.bias
+
+
+class GlobalFeature(nn.Module):
+    """One feature per ball: MLP, maximum over the ball, joined to each point; the same again."""
+
+    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
+        super().__init__()
+        self.mlp_1 = mlp((inputs, *widths_1))
+        self.join = SharedLinear(inputs + widths_1[-1], widths_2[0])
+        self.mlp_2 = mlp(widths_2)
+
+    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 224) to ball features (B, 1024)."""
+        chunks = ball_chunks(local, batch)
+        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
+        for chunk in chunks:
+            maximum_1.add(mlp_1(chunk.values), chunk)
+        join = self.join.on(maximum_1.result())  # of (B, 512)
+        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
+        for chunk in chunks:
+            joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
+            maximum_2.add(mlp_2(joined), chunk)
+        return maximum_2.result()
+
+
+def fused_convolution(layer: PointNetConv, features: Tensor, batch: BallBatch) -> Tensor:
     """`PointNetConv.forward`: maps point features (P, inputs) to (P, width)."""
     # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
     weight, output = layer.hidden.weight, PackedLinear(layer.output.weight)

@@ -28,13 +28,14 @@ from edgegrasp_model.networks.layers import (
     mlp,
 )
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.scene import Scene
 
 Float32 = NDArray[np.float32]
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
-PIECE = 32  # hands at a time, so that the work stays in cache
+CHUNK = 32  # hands at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,19 @@ class HandBatch:
         )
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
 
+    @classmethod
+    def made_up(cls, config: NetworkConfig) -> Self:
+        """A fixed batch of 32 hands, to see whether a network computes as it did before."""
+        rng = np.random.default_rng(0)
+        description = rng.normal(size=(32, HAND_DESCRIPTION_SIZE))
+        points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
+        count = rng.integers(0, config.hand_points + 1, 32)
+        return cls(
+            torch.from_numpy(description.astype(np.float32)),
+            torch.from_numpy(points.astype(np.float32)),
+            torch.from_numpy(count),
+        )
+
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
         return HandBatch(
@@ -88,6 +102,23 @@ class HandBatch:
             self.points.to(device),
             self.point_count.to(device),
         )
+
+
+def hand_batch(
+    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
+) -> HandBatch:
+    """What the hand network is told of some candidates of a scene."""
+    return HandBatch.from_cloud(
+        scene.cloud,
+        candidates,
+        gripper,
+        UP,
+        scene.support,
+        scene.viewpoint,
+        scene.at_side,
+        network.hand_points,
+        view,
+    )
 
 
 class HandNet(nn.Module):
@@ -119,11 +150,11 @@ class HandNet(nn.Module):
         """
         description = (batch.description - self.mean) / self.std  # (E, F)
         encoder = PackedMlp(self.point_encoder)
-        pieces = [
+        chunks = [
             _around(encoder, points, count)
-            for points, count in in_chunks(PIECE, batch.points, batch.point_count)
+            for points, count in in_chunks(CHUNK, batch.points, batch.point_count)
         ]
-        around = torch.cat(pieces)[: len(description)]  # (E, 2 C)
+        around = torch.cat(chunks)[: len(description)]  # (E, 2 C)
         seen = torch.cat((description, around), dim=1)
         if left_out is not None:
             draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)

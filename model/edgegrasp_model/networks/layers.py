@@ -1,4 +1,4 @@
-"""Layers, matrix products and pieces of rows that the networks share.
+"""Layers, matrix products and chunks of rows that the networks share.
 
 In inference no bit of a row depends on the other rows: a candidate's score is the same whatever
 else is scored with it.
@@ -41,7 +41,7 @@ class SharedLinear(nn.Linear):
         return self.on(shared)(own, shared_of_row)
 
     def on(self, shared: Tensor) -> "SharedProduct":
-        """The layer on shared parts (B, ..., C2), for the rows of many pieces."""
+        """The layer on shared parts (B, ..., C2), for the rows of many chunks."""
         return SharedProduct(self.weight, self.bias, shared)
 
 
@@ -97,7 +97,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 
 
 class PackedLinear:
-    """A linear layer on many pieces of rows, one after another, by the faster of two libraries.
+    """A linear layer on many chunks of rows, one after another, by the faster of two libraries.
 
     For as long as the weights stay as they are: one forward pass.
     """
@@ -118,7 +118,7 @@ class PackedLinear:
     def __call__(self, values: Tensor) -> Tensor:
         """Maps (M, ..., C) to (M, ..., outputs).
 
-        oneDNN prepares anew for each number of rows: let all pieces have the same.
+        oneDNN prepares anew for each number of rows: let all chunks have the same.
         """
         if self._packed is None:
             rows = row_linear(values, self._weight, self._bias)
@@ -188,24 +188,24 @@ def _packed(weight: Tensor) -> Tensor | None:
 
 
 class BallChunk(NamedTuple):
-    """p points of a few balls, one of which may go on in the next piece."""
+    """p points of a few balls, one of which may go on in the next chunk."""
 
     values: Tensor  # (p, ...)
     ball_of_point: Tensor  # (p,) int64
     balls: list[int]
-    sizes: list[int]  # rows of each of these balls, in order, then of what fills the piece up
+    sizes: list[int]  # rows of each of these balls, in order, then of what fills the chunk up
 
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
-    """Splits values (P, ...) of a batch's points into pieces of `rows`, the last one filled up.
+    """Splits values (P, ...) of a batch's points into chunks of `rows`, the last one filled up.
 
-    To record gradients, which keeps all of them anyway, and off the processor: one piece.
+    To record gradients, which keeps all of them anyway, and off the processor: one chunk.
     """
     ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
     if torch.is_grad_enabled() or values.device.type != "cpu":
         return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
     ends = torch.tensor(sizes).cumsum(0).tolist()
-    pieces = []
+    chunks = []
     ball, start = 0, 0
     for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, ball_of_point)):
         end = (number + 1) * rows
@@ -216,24 +216,24 @@ def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
             sizes.append(stop - start)
             start = stop
             ball += stop == ends[ball]
-        pieces.append(BallChunk(part, ball_of_row, balls, [*sizes, end - start]))
-    return pieces
+        chunks.append(BallChunk(part, ball_of_row, balls, [*sizes, end - start]))
+    return chunks
 
 
 def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
-    """Splits values (M, ...) of equal length into pieces of `rows`.
+    """Splits values (M, ...) of equal length into chunks of `rows`.
 
-    In inference the last one is filled up with zeros. Off the processor it is one piece.
+    In inference the last one is filled up with zeros. Off the processor it is one chunk.
     """
     if values[0].device.type != "cpu":
         return [values]
-    pieces = list(zip(*(torch.split(each, rows) for each in values), strict=True))
-    missing = rows - len(pieces[-1][0])
+    chunks = list(zip(*(torch.split(each, rows) for each in values), strict=True))
+    missing = rows - len(chunks[-1][0])
     if missing and not torch.is_grad_enabled():
-        pieces[-1] = tuple(
-            F.pad(part, (0, 0) * (part.dim() - 1) + (0, missing)) for part in pieces[-1]
+        chunks[-1] = tuple(
+            F.pad(part, (0, 0) * (part.dim() - 1) + (0, missing)) for part in chunks[-1]
         )
-    return pieces
+    return chunks
 
 
 def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROWS) -> Tensor:
@@ -243,14 +243,14 @@ def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROW
 
 
 class BallMaximum:
-    """Maximum over the points of each ball, piece by piece."""
+    """Maximum over the points of each ball, chunk by chunk."""
 
     def __init__(self, num_balls: int) -> None:
         self._parts: list[list[Tensor]] = [[] for _ in range(num_balls)]
 
-    def add(self, values: Tensor, piece: BallChunk) -> None:
-        """Take in the values (p, C) of a piece's points."""
-        for ball, part in zip(piece.balls, torch.split(values, piece.sizes), strict=False):
+    def add(self, values: Tensor, chunk: BallChunk) -> None:
+        """Take in the values (p, C) of a chunk's points."""
+        for ball, part in zip(chunk.balls, torch.split(values, chunk.sizes), strict=False):
             self._parts[ball].append(maximum(part, dim=0))
 
     def result(self) -> Tensor:

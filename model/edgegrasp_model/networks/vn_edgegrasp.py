@@ -1,7 +1,9 @@
 """VNEdgeGraspNet: EdgeGraspNet on vector neurons; its scores do not change when the cloud turns.
 
 Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. Features are
-(M, 3, C), see `vn_layers`; P points in B balls, E grasps.
+(M, 3, C): C vectors each; P points in B balls, E grasps. On a processor inference runs in loops
+that Numba compiles: there each ReLU's and each maximum's direction map is composed with the linear
+layer before it, so that one product gives vectors and directions side by side, (M, 3, 2C).
 """
 
 import numpy as np
@@ -36,78 +38,8 @@ _TINY = 1e-7  # keeps the division finite where a direction vanishes; the refere
 FUSED_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
 FUSED_ROWS = 256  # points at a time in the global layers
 
-
-class VNPointNetConv(nn.Module):
-    """Graph convolution: a two-layer vector MLP on [f_j, p_j - p_i], maximum over neighbours j."""
-
-    def __init__(self, inputs: int, width: int) -> None:
-        super().__init__()
-        self.hidden = RowLinear(inputs + 1, width, bias=False)
-        self.hidden_relu = VNReLU(width)
-        self.output = RowLinear(width, width, bias=False)
-        self.reach = RowLinear(width, width, bias=False)
-        self.output_relu = VNReLU(width)
-
-    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, 3, inputs) to (P, 3, width)."""
-        if float32_inference(features):
-            return fused_convolution(self, features, batch)
-        # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
-        widths = [features.shape[2], 1]
-        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = row_linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
-        u = row_linear(features, feature_weight) + v  # (P, 3, width)
-        u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
-        pooled = []
-        for neighbors, v_here, v_direction_here in in_chunks(
-            CONVOLVED, batch.neighbors, v, v_direction
-        ):
-            hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
-            direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
-            messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
-            pooled.append(vector_maximum(messages, self.reach, dim=1))
-        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(v)])
-        return vectors
-
-
-class VNBallMaximum(nn.Module):
-    """Per channel the vector of each ball that reaches furthest along its learned direction."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.reach = RowLinear(width, width, bias=False)
-        self.relu = VNReLU(width)
-
-    def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, 3, width) to ball features (B, 3, width)."""
-        balls = torch.split(vectors, batch.ball_sizes)
-        furthest = [vector_maximum(ball, self.reach, dim=0) for ball in balls]
-        pooled: Tensor = self.relu(torch.stack(furthest))
-        return pooled
-
-
-class VNGlobalFeature(nn.Module):
-    """One feature per ball: vector MLP, maximum, joined to each point; the same again."""
-
-    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
-        super().__init__()
-        self.vn_1 = VNLinearReLU(inputs, widths_1[0])
-        self.vn_2 = VNLinearReLU(widths_1[0], widths_1[1])
-        self.vn_3 = RowLinear(widths_1[1], widths_1[2], bias=False)
-        self.maximum_1 = VNBallMaximum(widths_1[2])
-        self.join = VNSharedLinearReLU(inputs + widths_1[2], widths_2[0])
-        self.vn_5 = RowLinear(widths_2[0], widths_2[1], bias=False)
-        self.maximum_2 = VNBallMaximum(widths_2[1])
-
-    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
-        if float32_inference(local):
-            return fused_ball_feature(self, local, batch)
-        hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
-        pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
-        joined = self.join(local, pooled, batch.ball_of_point)  # (P, 3, 381)
-        ball: Tensor = self.maximum_2(self.vn_5(joined), batch)
-        return ball
+# Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
+_compiled = compiled("contract", "nsz", "arcp", "reassoc")
 
 
 class VNEdgeGraspNet(nn.Module):
@@ -148,38 +80,77 @@ class VNEdgeGraspNet(nn.Module):
         return logits
 
 
-def vector_relu(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Removes from each vector (M, 3, C) its part against its direction (M, 3, C), if any."""
-    along = (vectors * directions).sum(dim=-2, keepdim=True).clamp(max=0.0)  # (M, 1, C)
-    length_squared = directions.square().sum(dim=-2, keepdim=True)  # (M, 1, C)
-    return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
+class VNPointNetConv(nn.Module):
+    """Graph convolution: a two-layer vector MLP on [f_j, p_j - p_i], maximum over neighbours j."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.hidden = RowLinear(inputs + 1, width, bias=False)
+        self.hidden_relu = VNReLU(width)
+        self.output = RowLinear(width, width, bias=False)
+        self.reach = RowLinear(width, width, bias=False)
+        self.output_relu = VNReLU(width)
+
+    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, inputs) to (P, 3, width)."""
+        if float32_inference(features):
+            return fused_convolution(self, features, batch)
+        # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
+        widths = [features.shape[2], 1]
+        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
+        v = row_linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
+        u = row_linear(features, feature_weight) + v  # (P, 3, width)
+        u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
+        pooled = []
+        for neighbors, v_here, v_direction_here in in_chunks(
+            CONVOLVED, batch.neighbors, v, v_direction
+        ):
+            hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
+            direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
+            messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
+            pooled.append(vector_maximum(messages, self.reach, dim=1))
+        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(v)])
+        return vectors
 
 
-def vector_maximum(vectors: Tensor, direction: nn.Linear, dim: int) -> Tensor:
-    """For each channel the vector that reaches furthest along its own direction.
+class VNGlobalFeature(nn.Module):
+    """One feature per ball: vector MLP, maximum, joined to each point; the same again."""
 
-    Args:
-        vectors: (..., 3, C).
-        direction: Maps the vectors to their directions. It gets no gradient, as a choice has none:
-            training leaves it as it was drawn, in the reference too.
-        dim: The dimension to reduce, one of those before the last two.
-    """
-    with torch.no_grad():
-        reach = (vectors * direction(vectors)).sum(dim=-2, keepdim=True)  # (..., 1, C)
-        furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
-    return vectors.take_along_dim(furthest, dim).squeeze(dim)
+    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
+        super().__init__()
+        self.vn_1 = VNLinearReLU(inputs, widths_1[0])
+        self.vn_2 = VNLinearReLU(widths_1[0], widths_1[1])
+        self.vn_3 = RowLinear(widths_1[1], widths_1[2], bias=False)
+        self.maximum_1 = VNBallMaximum(widths_1[2])
+        self.join = VNSharedLinearReLU(inputs + widths_1[2], widths_2[0])
+        self.vn_5 = RowLinear(widths_2[0], widths_2[1], bias=False)
+        self.maximum_2 = VNBallMaximum(widths_2[1])
+
+    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
+        if float32_inference(local):
+            return fused_ball_feature(self, local, batch)
+        hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
+        pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
+        joined = self.join(local, pooled, batch.ball_of_point)  # (P, 3, 381)
+        ball: Tensor = self.maximum_2(self.vn_5(joined), batch)
+        return ball
 
 
-class VNReLU(nn.Module):
-    """Vector ReLU along directions that are learned from the vectors themselves."""
+class VNBallMaximum(nn.Module):
+    """Per channel the vector of each ball that reaches furthest along its learned direction."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.direction = RowLinear(width, width, bias=False)
+        self.reach = RowLinear(width, width, bias=False)
+        self.relu = VNReLU(width)
 
-    def forward(self, vectors: Tensor) -> Tensor:
-        """Maps (M, 3, width) to the same shape."""
-        return vector_relu(vectors, self.direction(vectors))
+    def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 3, width) to ball features (B, 3, width)."""
+        balls = torch.split(vectors, batch.ball_sizes)
+        furthest = [vector_maximum(ball, self.reach, dim=0) for ball in balls]
+        pooled: Tensor = self.relu(torch.stack(furthest))
+        return pooled
 
 
 class VNLinearReLU(nn.Module):
@@ -210,11 +181,41 @@ class VNSharedLinearReLU(nn.Module):
         )
 
 
-# Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
-_compiled = compiled("contract", "nsz", "arcp", "reassoc")
+class VNReLU(nn.Module):
+    """Vector ReLU along directions that are learned from the vectors themselves."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.direction = RowLinear(width, width, bias=False)
+
+    def forward(self, vectors: Tensor) -> Tensor:
+        """Maps (M, 3, width) to the same shape."""
+        return vector_relu(vectors, self.direction(vectors))
 
 
-def fused_convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatch) -> Tensor:
+def vector_relu(vectors: Tensor, directions: Tensor) -> Tensor:
+    """Removes from each vector (M, 3, C) its part against its direction (M, 3, C), if any."""
+    along = (vectors * directions).sum(dim=-2, keepdim=True).clamp(max=0.0)  # (M, 1, C)
+    length_squared = directions.square().sum(dim=-2, keepdim=True)  # (M, 1, C)
+    return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
+
+
+def vector_maximum(vectors: Tensor, direction: nn.Linear, dim: int) -> Tensor:
+    """For each channel the vector that reaches furthest along its own direction.
+
+    Args:
+        vectors: (..., 3, C).
+        direction: Maps the vectors to their directions. It gets no gradient, as a choice has none:
+            training leaves it as it was drawn, in the reference too.
+        dim: The dimension to reduce, one of those before the last two.
+    """
+    with torch.no_grad():
+        reach = (vectors * direction(vectors)).sum(dim=-2, keepdim=True)  # (..., 1, C)
+        furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
+    return vectors.take_along_dim(furthest, dim).squeeze(dim)
+
+
+def fused_convolution(layer: VNPointNetConv, features: Tensor, batch: BallBatch) -> Tensor:
     """`VNPointNetConv.forward`: maps point features (P, 3, inputs) to (P, 3, width)."""
     # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
     weight = _beside(layer.hidden.weight, layer.hidden_relu.direction.weight)
@@ -238,25 +239,25 @@ def fused_convolution(layer: "VNPointNetConv", features: Tensor, batch: BallBatc
     return _own_relu(pooled, layer.output_relu.direction)
 
 
-def fused_ball_feature(layer: "VNGlobalFeature", local: Tensor, batch: BallBatch) -> Tensor:
+def fused_ball_feature(layer: VNGlobalFeature, local: Tensor, batch: BallBatch) -> Tensor:
     """`VNGlobalFeature.forward`: maps point features (P, 3, C) to ball features (B, 3, width)."""
     first, second = PackedLinear(_weights(layer.vn_1)), PackedLinear(_weights(layer.vn_2))
     third = PackedLinear(_beside(layer.vn_3.weight, layer.maximum_1.reach.weight))
     last = PackedLinear(_beside(layer.vn_5.weight, layer.maximum_2.reach.weight))
-    pieces = ball_chunks(local, batch, FUSED_ROWS)
+    chunks = ball_chunks(local, batch, FUSED_ROWS)
     maximum = _BallMaximum(batch.num_balls, len(layer.vn_3.weight))
-    for piece in pieces:
-        maximum.add(third(_relu(second(_relu(first(piece.values))))), piece)
+    for chunk in chunks:
+        maximum.add(third(_relu(second(_relu(first(chunk.values))))), chunk)
     ball = maximum.activated(layer.maximum_1)  # (B, 3, width)
     join = SharedProduct(_weights(layer.join), None, ball)
     maximum = _BallMaximum(batch.num_balls, len(layer.vn_5.weight))
-    for piece in pieces:
-        maximum.add(last(_relu(join(piece.values, piece.ball_of_point))), piece)
+    for chunk in chunks:
+        maximum.add(last(_relu(join(chunk.values, chunk.ball_of_point))), chunk)
     return maximum.activated(layer.maximum_2)
 
 
 def fused_logits(
-    network: "VNEdgeGraspNet", grasp: Tensor, ball: Tensor, ball_of_edge: Tensor
+    network: VNEdgeGraspNet, grasp: Tensor, ball: Tensor, ball_of_edge: Tensor
 ) -> Tensor:
     """The end of `VNEdgeGraspNet.forward`: logits (E,) of grasps (E, 3, C) in balls (B, 3, D)."""
     join = SharedProduct(_weights(network.frame_1), None, ball)
@@ -279,25 +280,25 @@ def _own_relu(vectors: Tensor, direction: nn.Linear) -> Tensor:
     return by_chunks(lambda v: _relu(torch.cat((v, directions(v)), dim=2)), vectors, FUSED_ROWS)
 
 
-def _weights(layer: "VNLinearReLU | VNSharedLinearReLU") -> Tensor:
+def _weights(layer: VNLinearReLU | VNSharedLinearReLU) -> Tensor:
     """The weights of a layer and of its directions, one above the other."""
     return torch.cat((layer.feature.weight, layer.direction.weight))
 
 
 class _BallMaximum:
-    """`VNBallMaximum` piece by piece."""
+    """`VNBallMaximum` chunk by chunk."""
 
     def __init__(self, num_balls: int, width: int) -> None:
         self._best = torch.full((num_balls, width), -torch.inf)
         self._vectors = torch.zeros(num_balls, 3, width)
 
-    def add(self, both: Tensor, piece: BallChunk) -> None:
-        """Take in the vectors and directions (p, 3, 2 width) of a piece's points."""
-        bounds = np.cumsum([0, *piece.sizes[: len(piece.balls)]])
-        balls = slice(piece.balls[0], piece.balls[-1] + 1)
+    def add(self, both: Tensor, chunk: BallChunk) -> None:
+        """Take in the vectors and directions (p, 3, 2 width) of a chunk's points."""
+        bounds = np.cumsum([0, *chunk.sizes[: len(chunk.balls)]])
+        balls = slice(chunk.balls[0], chunk.balls[-1] + 1)
         _furthest(both.numpy(), bounds, self._best[balls].numpy(), self._vectors[balls].numpy())
 
-    def activated(self, layer: "VNBallMaximum") -> Tensor:
+    def activated(self, layer: VNBallMaximum) -> Tensor:
         """The furthest vectors (B, 3, width) after the layer's ReLU."""
         return _own_relu(self._vectors, layer.relu.direction)
 

@@ -17,6 +17,7 @@ MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more 
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 
 

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Region, SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import (
+    UP,
     CanonicalFrame,
     CheckedCloud,
     Cloud,
@@ -237,7 +238,7 @@ def _normals(
 ) -> Float32:
     """Unit normals of the kept voxels: those given, else estimated and turned to the camera."""
     points = middles[kept]
-    seen_from = assumed_viewpoint(points, np.array([0.0, 0.0, 1.0], dtype=np.float32))
+    seen_from = assumed_viewpoint(points, UP)
     if viewpoints is not None:
         seen_from = frame.points(viewpoints).astype(np.float32)
         if len(viewpoints) > 1 and sent.view_ids is not None:
