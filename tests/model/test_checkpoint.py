@@ -14,7 +14,12 @@ from safetensors.torch import load_file, save_file
 
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
-from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.checkpoint import (
+    build_network,
+    check_reference_logits,
+    load_checkpoint,
+    save_checkpoint,
+)
 from edgegrasp_model.networks.config import EDGEGRASP, HAND, VN_EDGEGRASP, CheckpointMetadata
 from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
@@ -57,7 +62,9 @@ def path(tmp_path: Path, network: torch.nn.Module) -> Path:
 
 def test_a_checkpoint_survives_the_round_trip(path: Path, network: torch.nn.Module) -> None:
     loaded, read = load_checkpoint(path)
-    assert read == replace(METADATA, digest=hashlib.sha256(path.read_bytes()).hexdigest())
+    written = replace(read, digest="", tensors_digest="", reference_logits=())
+    assert written == replace(METADATA, reference_logits=())
+    assert read.digest == hashlib.sha256(path.read_bytes()).hexdigest()
     assert not loaded.training
     expected = network.state_dict()
     assert "mean" in expected
@@ -116,6 +123,27 @@ def test_unusable_metadata_is_refused(path: Path, changes: dict[str, Any], compl
     save_file(load_file(path), path, metadata={"edgegrasp": json.dumps(values)})
     with pytest.raises(InvalidCheckpoint, match=f"(?s){path.name}.*{complaint}"):
         load_checkpoint(path)
+
+
+@pytest.mark.parametrize("value", [7.0, float("nan")])
+def test_damaged_weights_are_refused(path: Path, value: float) -> None:
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    tensors["mean"][3] = value
+    save_file(tensors, path, metadata=metadata)
+    with pytest.raises(InvalidCheckpoint, match=path.name):
+        load_checkpoint(path)
+
+
+def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(
+    path: Path,
+) -> None:
+    loaded, read = load_checkpoint(path)
+    check_reference_logits(loaded, read)
+    check_reference_logits(loaded, replace(read, reference_logits=()))  # of older files
+    with pytest.raises(InvalidCheckpoint, match="edgegrasp-plus"):
+        check_reference_logits(build_network(CONFIG), read)
 
 
 def write_layout(directory: Path, number: int = 1, **weights: object) -> None:

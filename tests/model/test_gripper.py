@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.candidates.collision import hits_cloud
-from edgegrasp_model.candidates.edge_grasps import (
-    edge_grasps,
-    support_clearance,
-    top_down_grasps,
-)
+from edgegrasp_model.candidates.edge_grasps import edge_grasps, support_clearance, top_down_grasps
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.gripper import (
     GRIPPER_FOLDER,
