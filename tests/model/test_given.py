@@ -61,28 +61,14 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> 
     def row(x: float, y: float) -> int:
         return row_of(cloud, np.array([x, y, 0.0]))
 
-    asked = np.array(
-        [
-            [row(0, 0), row(0, 0)],
-            [row(0, 0), row(0.06, 0)],
-            [row(0, 0), row(0.02, 0)],
-            [row(0, 0), 4001],
-            [row(0.02, 0), row(0, 0)],
-        ]
-    )
+    origin, near, far = row(0, 0), row(0.02, 0), row(0.06, 0)
+    asked = [[origin, origin], [origin, far], [origin, near], [origin, 4001], [near, origin]]
     outside = {"min": (-1, -1, -0.1), "max": (1, 1, 1)}
-    answer = detector().score(cloud, ask(support=None, workspace=outside), edges=asked)
-    assert [each.reason for each in answer.evaluations] == [
-        NoGrasp.TOO_SHORT,
-        NoGrasp.TOO_LONG,
-        None,
-        NoGrasp.NO_POINT,
-        None,
-    ]
+    answer = detector().score(cloud, ask(support=None, workspace=outside), edges=np.array(asked))
+    reasons = [NoGrasp.TOO_SHORT, NoGrasp.TOO_LONG, None, NoGrasp.NO_POINT, None]
+    assert [each.reason for each in answer.evaluations] == reasons
     assert [each.grasp is None for each in answer.evaluations] == [True, True, False, True, False]
     one, other = answer.evaluations[2].grasp, answer.evaluations[4].grasp
-    assert one is not None
-    assert other is not None
     # The hand moves from p_a to p_c, along the sheet.
     assert one.approach_direction[0] > 0.9
     assert other.approach_direction[0] < -0.9
@@ -134,8 +120,6 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
     assert near > 0.8 * len(poses)
     flipped = detector().score(cloud, ask(), hand_poses=poses @ FLIP)
     for one, other in zip(scored.evaluations, flipped.evaluations, strict=True):
-        assert one.grasp is not None
-        assert other.grasp is not None
         np.testing.assert_allclose(one.grasp.score, other.grasp.score, atol=1e-3)
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
 

@@ -102,16 +102,13 @@ def test_a_turned_scene_has_the_same_grasps_turned(
         np.testing.assert_allclose(b.score, a.score, atol=1e-3)
         np.testing.assert_allclose(b.clearance, a.clearance, atol=1e-4)
         np.testing.assert_allclose(b.width, a.width, atol=1e-4)
-        np.testing.assert_allclose(
-            b.T_cloud_hand[:3, :3], turned.turn.as_matrix() @ a.T_cloud_hand[:3, :3], atol=1e-4
-        )
-        for mine, theirs in (
-            (a.T_cloud_hand[:3, 3], b.T_cloud_hand[:3, 3]),
-            (a.T_cloud_tcp[:3, 3], b.T_cloud_tcp[:3, 3]),
-            (a.approach_point, b.approach_point),
-            (a.contact_point, b.contact_point),
-        ):
-            np.testing.assert_allclose(theirs, turned.points(mine), atol=1e-4)
+        rotation = turned.turn.as_matrix() @ a.T_cloud_hand[:3, :3]
+        np.testing.assert_allclose(b.T_cloud_hand[:3, :3], rotation, atol=1e-4)
+        places = [
+            (g.T_cloud_hand[:3, 3], g.T_cloud_tcp[:3, 3], g.approach_point, g.contact_point)
+            for g in (a, b)
+        ]
+        np.testing.assert_allclose(places[1], turned.points(np.array(places[0])), atol=1e-4)
 
 
 @pytest.mark.parametrize("viewpoint", [None, (0.1, 0.2, 9.0), (3.0, 1.0, 0.5)])
