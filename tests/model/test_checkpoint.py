@@ -107,6 +107,8 @@ def test_a_missing_a_pickled_and_a_foreign_file_are_refused(tmp_path: Path) -> N
         ({"format": 2}, "format: got 2"),
         ({"format": None}, "format"),
         ({"network": {"architecture": "gpd"}}, "architecture: got .*gpd"),
+        ({"network": CONFIG.to_dict() | {"dropout": 0.1}}, "dropout"),
+        ({"network": {"architecture": "hand"}}, r"hand_widths: got \(\)"),
         ({"network": None}, "network"),
         ({"network": [1]}, "metadata"),
         ({"network": replace(CONFIG, classifier_widths=(24, 20)).to_dict()}, r"classifier\.0"),

@@ -37,15 +37,13 @@ def normals_in_cloud(scene: Scene) -> np.ndarray:
     return scene.frame.directions_in_cloud(scene.cloud.normals)
 
 
-def test_given_normals_are_averaged_in_each_voxel_instead_of_estimated() -> None:
+def test_given_normals_are_averaged_in_each_voxel_and_estimated_where_they_cancel() -> None:
     sent = np.random.default_rng(1).normal([0.3, 0.2, -1.0], 0.01, (3000, 3)) * 5.0
     scene, _, _ = build(CloudInput(sheet(0.3), normals=sent), viewpoint=(0, 0, 9))
     expected = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
     np.testing.assert_allclose(normals_in_cloud(scene) @ expected, 1.0, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(scene.cloud.normals, axis=1), 1.0, atol=1e-5)
 
-
-def test_normals_that_cancel_in_a_voxel_are_estimated() -> None:
     sent = np.where(np.arange(3000)[:, None] % 2, [[1.0, 0, 0]], [[-1.0, 0, 0]])
     twice = np.repeat(sheet(0.3, 1500), 2, axis=0)
     scene, _, _ = build(CloudInput(twice, normals=sent), viewpoint=(0, 0, 9))
