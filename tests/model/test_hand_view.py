@@ -124,6 +124,8 @@ def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(
     assert before.description.shape[1] == HAND_DESCRIPTION_SIZE
     # Points within rounding of a box's face may fall on its other side: rare, so count them.
     assert np.isclose(before.description, after.description, atol=2e-3).mean() > 0.98
+    sums = [batch.points.sum(dim=1) for batch in (before, after)]  # (E, 6)
+    assert np.isclose(*sums, atol=2e-3).mean() > 0.95
     assert np.isclose(scores(before), scores(after), atol=2e-3).mean() > 0.9
 
 
