@@ -1,17 +1,15 @@
 """Edges and hand poses that a caller gives."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.given import FLIP
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.cloud import CloudInput
+
+from .scenes import PANDA, box_on_table, detector
 
 ASKED = {
     "viewpoint": (0.3, 0.2, 0.5),
@@ -24,22 +22,20 @@ ASKED = {
 
 
 def ask(**fields: object) -> DetectOptions:
-    return DetectOptions.model_validate({**ASKED, **fields})
+    return DetectOptions.model_validate(ASKED | fields)
 
 
 def row_of(cloud: np.ndarray, point: np.ndarray) -> int:
     return int(np.linalg.norm(cloud - point, axis=1).argmin())
 
 
-def test_edges_of_detected_grasps_get_the_scores_they_were_detected_with(
-    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
-) -> None:
-    cloud = box_on_table(count=2000)
-    found = plus.detect(cloud, ask())
+def test_edges_of_detected_grasps_get_the_scores_they_were_detected_with() -> None:
+    cloud = box_on_table()
+    found = detector().detect(cloud, ask())
     edges = np.array(
         [[row_of(cloud, g.approach_point), row_of(cloud, g.contact_point)] for g in found.grasps]
     )
-    scored = plus.score(cloud, ask(), edges=edges)
+    scored = detector().score(cloud, ask(), edges=edges)
     assert len(scored.evaluations) == len(found.grasps)
     same = 0
     for mine, theirs in zip(scored.evaluations, found.grasps, strict=True):
@@ -56,9 +52,7 @@ def test_edges_of_detected_grasps_get_the_scores_they_were_detected_with(
     assert same > 0.5 * len(found.grasps)
 
 
-def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp(
-    plus: GraspDetector,
-) -> None:
+def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> None:
     rng = np.random.default_rng(0)
     flat = rng.uniform(-0.1, 0.1, (4000, 3)) * (1, 1, 0)
     edge = np.array([[0.001, 0.0, 0.0]])
@@ -67,28 +61,14 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp(
     def row(x: float, y: float) -> int:
         return row_of(cloud, np.array([x, y, 0.0]))
 
-    asked = np.array(
-        [
-            [row(0, 0), row(0, 0)],
-            [row(0, 0), row(0.06, 0)],
-            [row(0, 0), row(0.02, 0)],
-            [row(0, 0), 4001],
-            [row(0.02, 0), row(0, 0)],
-        ]
-    )
+    origin, near, far = row(0, 0), row(0.02, 0), row(0.06, 0)
+    asked = [[origin, origin], [origin, far], [origin, near], [origin, 4001], [near, origin]]
     outside = {"min": (-1, -1, -0.1), "max": (1, 1, 1)}
-    answer = plus.score(cloud, ask(support=None, workspace=outside), edges=asked)
-    assert [each.reason for each in answer.evaluations] == [
-        NoGrasp.TOO_SHORT,
-        NoGrasp.TOO_LONG,
-        None,
-        NoGrasp.NO_POINT,
-        None,
-    ]
+    answer = detector().score(cloud, ask(support=None, workspace=outside), edges=np.array(asked))
+    reasons = [NoGrasp.TOO_SHORT, NoGrasp.TOO_LONG, None, NoGrasp.NO_POINT, None]
+    assert [each.reason for each in answer.evaluations] == reasons
     assert [each.grasp is None for each in answer.evaluations] == [True, True, False, True, False]
     one, other = answer.evaluations[2].grasp, answer.evaluations[4].grasp
-    assert one is not None
-    assert other is not None
     # The hand moves from p_a to p_c, along the sheet.
     assert one.approach_direction[0] > 0.9
     assert other.approach_direction[0] < -0.9
@@ -97,9 +77,7 @@ def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp(
     assert answer.counts["scored"] == 2
 
 
-def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp(
-    plus: GraspDetector,
-) -> None:
+def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> None:
     rng = np.random.default_rng(0)
     lower = rng.uniform(-0.05, 0.05, (3000, 3)) * (1, 1, 0)
     normals = np.concatenate([np.tile([0.0, 0, 1], (3000, 1)), np.tile([0.0, 1, 0], (3000, 1))])
@@ -108,29 +86,26 @@ def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp(
     c = int(a - 3000)
     sent = CloudInput(cloud, normals=normals)
     # The voxels of both sheets are the same ones but for their height: the edge is vertical.
-    both = plus.score(sent, ask(support=None), edges=np.array([[a, c], [c, a]]))
+    both = detector().score(sent, ask(support=None), edges=np.array([[a, c], [c, a]]))
     assert both.evaluations[0].reason == NoGrasp.NO_DIRECTION
     assert both.evaluations[1].grasp is not None
-    panda = load_gripper("panda")
     short = {
-        "max_opening": panda.max_opening,
-        "tip_z": panda.palm_z + 0.02,
-        "contact_z": panda.palm_z + 0.015,
+        "max_opening": PANDA.max_opening,
+        "tip_z": PANDA.palm_z + 0.02,
+        "contact_z": PANDA.palm_z + 0.015,
         "tcp_z": 0.1,
-        "hand": {"boxes": panda.hand_boxes},
-        "finger": {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, panda.palm_z + 0.02]]]},
+        "hand": {"boxes": PANDA.hand_boxes},
+        "finger": {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, PANDA.palm_z + 0.02]]]},
     }
-    deep = plus.score(sent, ask(support=None, gripper=short), edges=np.array([[c, a]]))
+    deep = detector().score(sent, ask(support=None, gripper=short), edges=np.array([[c, a]]))
     assert deep.evaluations[0].reason == NoGrasp.TOO_DEEP
 
 
-def test_hand_poses_of_detected_grasps_find_their_own_contacts(
-    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
-) -> None:
-    cloud = box_on_table(count=2000)
-    found = plus.detect(cloud, ask(collision="avoid"))
+def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
+    cloud = box_on_table()
+    found = detector().detect(cloud, ask(collision="avoid"))
     poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
-    scored = plus.score(cloud, ask(), hand_poses=poses)
+    scored = detector().score(cloud, ask(), hand_poses=poses)
     assert len(scored.evaluations) == len(poses) > 20
     near = 0
     for pose, theirs, mine in zip(poses, found.grasps, scored.evaluations, strict=True):
@@ -140,42 +115,29 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts(
         assert mine.grasp.collision_free
         near += np.linalg.norm(mine.grasp.contact_point - theirs.contact_point) < 0.012
         contact = (mine.grasp.contact_point - pose[:3, 3]) @ pose[:3, :3]
-        assert abs(contact[0]) < plus.gripper.pad_half_width
-        assert abs(contact[1]) < plus.gripper.max_opening / 2
+        assert abs(contact[0]) < PANDA.pad_half_width
+        assert abs(contact[1]) < PANDA.max_opening / 2
     assert near > 0.8 * len(poses)
-    flipped = plus.score(cloud, ask(), hand_poses=poses @ FLIP)
+    flipped = detector().score(cloud, ask(), hand_poses=poses @ FLIP)
     for one, other in zip(scored.evaluations, flipped.evaluations, strict=True):
-        assert one.grasp is not None
-        assert other.grasp is not None
         np.testing.assert_allclose(one.grasp.score, other.grasp.score, atol=1e-3)
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
 
 
-def test_a_pose_in_the_air_holds_nothing(
-    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
-) -> None:
-    far = np.tile(np.eye(4), (2, 1, 1))
-    far[0, :3, 3] = 1.0
-    answer = plus.score(box_on_table(count=500), ask(), hand_poses=far)
-    assert answer.evaluations[0].reason == NoGrasp.NOTHING_BETWEEN
+def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_said_to_collide() -> None:
+    poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (2, 1, 1))
+    poses[0, :3, 3] = 1.0
+    poses[1, 2, 3] = 0.1  # the tips below the table, the palm in the box
+    air, box = detector().score(box_on_table(500), ask(), hand_poses=poses).evaluations
+    assert air.reason == NoGrasp.NOTHING_BETWEEN
+    assert box.grasp is not None
+    assert not box.grasp.collision_free
+    assert box.grasp.clearance < 0
 
 
-def test_a_colliding_pose_is_scored_and_said_to_collide(
-    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
-) -> None:
-    down = np.diag([1.0, -1.0, -1.0, 1.0])
-    down[2, 3] = 0.1  # the tips below the table, the palm in the box
-    (only,) = plus.score(box_on_table(count=500), ask(), hand_poses=down[None]).evaluations
-    assert only.grasp is not None
-    assert not only.grasp.collision_free
-    assert only.grasp.clearance < 0
-
-
-def test_a_cloud_that_is_cropped_away_answers_for_every_edge(
-    plus: GraspDetector, box_on_table: Callable[..., np.ndarray]
-) -> None:
+def test_a_cloud_that_is_cropped_away_answers_for_every_edge() -> None:
     nowhere = ask(workspace={"min": (5, 5, 5), "max": (6, 6, 6)})
-    answer = plus.score(box_on_table(count=500), nowhere, edges=np.array([[0, 1], [2, 3]]))
+    answer = detector().score(box_on_table(500), nowhere, edges=np.array([[0, 1], [2, 3]]))
     assert [each.reason for each in answer.evaluations] == [NoGrasp.NO_POINT] * 2
 
 
@@ -202,13 +164,9 @@ GOOD = np.eye(4)[None]
     ],
 )
 def test_what_is_no_edge_and_no_pose_is_refused(
-    plus: GraspDetector,
-    box_on_table: Callable[..., np.ndarray],
-    given: dict[str, object],
-    field: str,
-    value: str,
+    given: dict[str, object], field: str, value: str
 ) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        plus.score(box_on_table(count=500), ask(), **given)
+        detector().score(box_on_table(500), ask(), **given)
     assert caught.value.field == field
     assert value in caught.value.value
