@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_cli.planners.paper_candidates import PaperCandidates, estimate_normals
+from edgegrasp_cli.planners.baselines import PaperCandidates, estimate_normals
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation
