@@ -44,7 +44,7 @@ DECIDED = (
 )
 
 
-@takes_flags(connection=CONNECTION, options=option_flags(*DECIDED))
+@takes_flags(connection=CONNECTION, options=option_flags(*DECIDED, defaults=False))
 def benchmark(
     scene: Annotated[str, Option(help="packed or pile.")] = "pile",
     protocol: Annotated[
@@ -89,7 +89,7 @@ def benchmark(
     """Clear simulated clutter with a planner's grasps and count what succeeds.
 
     GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
-    Grasps that collide are ranked lower (collision penalise) unless --collision says otherwise.
+    Options of the detection are the protocol's, with collision penalise, unless a flag is given.
     """
     from edgegrasp_cli.planners.choice import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig

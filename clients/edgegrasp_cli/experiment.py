@@ -29,7 +29,7 @@ Option = typer.Option
 SAMPLES = {"num_approach_points": 32, "num_candidates": 2000}  # unless varied, or flags say other
 
 
-@takes_flags(options=option_flags(*DECIDED))
+@takes_flags(options=option_flags(*DECIDED, defaults=False))
 def experiment(
     name: Annotated[
         str, typer.Argument(help="robustness, samples, labels, families or baselines: what varies.")

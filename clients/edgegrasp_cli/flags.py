@@ -53,13 +53,19 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
     return decorate
 
 
-def model_flags(model: "type[BaseModel]", leave_out: Sequence[str] = (), panel: str = "") -> Flags:
+def model_flags(
+    model: "type[BaseModel]",
+    leave_out: Sequence[str] = (),
+    panel: str = "Options",
+    defaults: bool = True,
+) -> Flags:
     """A flag for each field of a pydantic model, with the field's description and default.
 
     Args:
         model: The fields; those that are no number, text, truth value or path are given as JSON.
         leave_out: Fields without a flag.
-        panel: Heading of the flags in the help; empty: that of the command's own.
+        panel: Heading of the flags in the help.
+        defaults: Whether the help shows the fields' defaults.
     """
     flags = []
     for name, field in model.model_fields.items():
@@ -67,10 +73,10 @@ def model_flags(model: "type[BaseModel]", leave_out: Sequence[str] = (), panel: 
             continue
         flag_type, choices = _flag_type(field.annotation)
         option = typer.Option(
-            help=f"{field.description}{_default_text(field.default)}",
+            help=f"{field.description}{_default_text(field.default) if defaults else ''}",
             show_default=False,
             metavar=choices,
-            rich_help_panel=panel or None,
+            rich_help_panel=panel,
         )
         annotation: Any = Annotated[flag_type | None, option]  # type: ignore[valid-type]
         keyword = inspect.Parameter.KEYWORD_ONLY
@@ -78,11 +84,11 @@ def model_flags(model: "type[BaseModel]", leave_out: Sequence[str] = (), panel: 
     return flags
 
 
-def option_flags(*leave_out: str) -> Flags:
-    """A flag for each option of a detection."""
+def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
+    """A flag for each option of a detection; `defaults`: whether the help shows the detector's."""
     from edgegrasp_model.options import DetectOptions
 
-    return model_flags(DetectOptions, leave_out, "Options of the detection")
+    return model_flags(DetectOptions, leave_out, "Options of the detection", defaults)
 
 
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -122,9 +122,7 @@ def _shifted(pose: Float32, along_x: float, along_y: float) -> Float32:
 class PaperCandidates:
     """Draws the candidates of the paper's evaluation, as its published code does.
 
-    They have no top-down grasps and no check for collisions.
-
-    Outliers are dropped and normals estimated in the dense cloud, approach points sampled
+    There are no top-down grasps among them, and nothing is checked for collisions. Outliers are dropped and normals estimated in the dense cloud, approach points sampled
     farthest from each other in the voxelised one; what of a hand may come near the table is the
     published code's probe points. No constraint depends on which way a normal points.
 
