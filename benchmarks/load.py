@@ -26,10 +26,10 @@ import numpy as np
 from benchmarks.measuring import RESULTS, machine, served, write_results
 from numpy.typing import NDArray
 
-from edgegrasp_client import GraspClient, GraspClientError
+from edgegrasp_client import DetectOptions, GraspClient, GraspClientError
 
 POINTS = 20_000
-OPTIONS = {"num_approach_points": 32, "num_candidates": 500}
+OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
 PROCESSES = 2  # that the clients are shared among
 OPEN_CLIENTS = 96  # connections of an open loop
 START_SECONDS = 1.0  # from the order to the first request: clouds are made

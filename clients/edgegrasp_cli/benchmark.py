@@ -172,12 +172,13 @@ def compare(
 def ending_with_a_sentence(command: str, *, resumes: bool = False) -> Iterator[None]:
     """End the program with a message where its user can mend something, or has interrupted it."""
     from edgegrasp_client import GraspClientError
+    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_sim.trials import PlannerUnavailableError
 
     try:
         yield
     except (
-        *(GraspClientError, PlannerUnavailableError),
+        *(EdgeGraspError, GraspClientError, PlannerUnavailableError),
         *(ValueError, FileNotFoundError, RuntimeError),
     ) as error:
         sys.exit(f"edgegrasp {command}: {error}")

@@ -92,13 +92,20 @@ def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
 
 
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that flags of `option_flags` stand for; text is read as in query parameters."""
+    """The options that flags of `option_flags` stand for; text is read as in query parameters.
+
+    Raises:
+        InvalidRequest: A value is of the wrong type or out of range.
+    """
+    from edgegrasp_model.options import parse_options
     from edgegrasp_service.options_text import options_from_query
 
-    texts = {
-        n: value if isinstance(value, str) else json.dumps(value) for n, value in given.items()
-    }
-    return options_from_query(texts.items())
+    options = options_from_query(
+        (name, value if isinstance(value, str) else json.dumps(value))
+        for name, value in given.items()
+    )
+    parse_options(options)  # a wrong value is refused before anything is started
+    return options
 
 
 def connect(
@@ -164,6 +171,6 @@ def _flag_type(annotation: Any) -> tuple[Any, str | None]:
 
 def _default_text(default: Any) -> str:
     """A default behind its description; none for nothing, nor for an object."""
-    if default in ("", (), None) or hasattr(default, "model_fields"):
+    if default in ("", (), None) or hasattr(default, "model_dump"):
         return ""
     return f" ({default if isinstance(default, (str, Path)) else json.dumps(default)})"
