@@ -143,7 +143,7 @@ def collect(results: Path, kept: Path) -> None:
         curves_figure(drawn).savefig(kept / "curves.png")
 
 
-def page(kept: Path) -> str:
+def page(kept: Path = DOCS / "results") -> str:
     """The whole page, from the folder of what is kept."""
     return "\n".join([INTRODUCTION, *_sections(kept)])
 

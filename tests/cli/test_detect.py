@@ -13,16 +13,18 @@ import trustme
 from edgegrasp_cli.flags import option_flags
 from edgegrasp_model.options import DetectOptions
 
-OPTIONS = (
-    "--model dummy --gripper panda --num-approach-points 12 --num-candidates 9 "
-    "--sampling uniform --seed 4 --viewpoint -0.1,0,-0.5 --up 0,0,1 "
-    '--support {"kind":"ransac","distance":0.01} '
-    '--workspace {"min":[-1,-1,-1],"max":[1,1,1]} '
-    '--approach-region {"exclude":[{"kind":"indices","indices":[1,2]}]} '
-    '--contact-region {"include":[{"kind":"sphere","center":[0,0,0],"radius":1}]} '
-    '--approach-direction {"preset":"side"} --collision {"margin":0.001} '
-    "--min-score 0.1 --top-k 2 --suppression null --order highest --debug --timeout 20"
-).split()
+OPTIONS = [
+    *("--model", "dummy", "--gripper", "panda", "--sampling", "uniform", "--seed", "4"),
+    *("--num-approach-points", "12", "--num-candidates", "9"),
+    *("--viewpoint", "-0.1,0,-0.5", "--up", "0,0,1"),
+    *("--support", '{"kind":"ransac","distance":0.01}'),
+    *("--workspace", '{"min":[-1,-1,-1],"max":[1,1,1]}'),
+    *("--approach-region", '{"exclude":[{"kind":"indices","indices":[1,2]}]}'),
+    *("--contact-region", '{"include":[{"kind":"sphere","center":[0,0,0],"radius":1}]}'),
+    *("--approach-direction", '{"preset":"side"}', "--collision", '{"margin":0.001}'),
+    *("--min-score", "0.1", "--top-k", "2", "--suppression", "null", "--order", "highest"),
+    "--debug",
+]
 
 
 @pytest.fixture

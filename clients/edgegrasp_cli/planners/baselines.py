@@ -122,9 +122,10 @@ def _shifted(pose: Float32, along_x: float, along_y: float) -> Float32:
 class PaperCandidates:
     """Draws the candidates of the paper's evaluation, as its published code does.
 
-    There are no top-down grasps among them, and nothing is checked for collisions. Outliers are dropped and normals estimated in the dense cloud, approach points sampled
-    farthest from each other in the voxelised one; what of a hand may come near the table is the
-    published code's probe points. No constraint depends on which way a normal points.
+    There are no top-down grasps among them, and no collision is checked but that with the table,
+    at the published code's seven points of the hand. Outliers are dropped and normals estimated in
+    the dense cloud, approach points sampled farthest from each other in the voxelised one. No
+    constraint depends on which way a normal points.
 
     Attributes:
         num_approach_points: approach points sampled.
