@@ -78,7 +78,7 @@ def model_flags(
             metavar=choices,
             rich_help_panel=panel,
         )
-        annotation: Any = Annotated[flag_type | None, option]  # type: ignore[valid-type]
+        annotation: Any = Annotated[flag_type | None, option]
         keyword = inspect.Parameter.KEYWORD_ONLY
         flags.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
     return flags
