@@ -17,7 +17,7 @@ import torch
 from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, write_results
 from benchmarks.speed import detector, observe, request
 
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 from edgegrasp_model.options import Collision
 from edgegrasp_sim.observation import Observation
 

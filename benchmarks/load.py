@@ -163,7 +163,7 @@ def run_clients(task: Task) -> list[Sample]:
     lock = threading.Lock()
 
     def work() -> None:
-        with GraspClient(task.address, timeout=task.timeout) as client:
+        with GraspClient(task.address, timeout=task.timeout, retry=False) as client:
             while True:
                 with lock:
                     due = next(moments, None)

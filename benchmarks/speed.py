@@ -25,14 +25,14 @@ from benchmarks.measuring import (
 from benchmarks.textbook.networks import edge_grasp_logits, vn_edge_grasp_logits
 from benchmarks.textbook.pipeline import detect
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import (
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     VN_EDGEGRASP,
+    CheckpointMetadata,
     NetworkConfig,
 )
 from edgegrasp_model.options import DetectOptions

@@ -8,14 +8,16 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import EdgeGraspNet, GlobalFeature, PointNetConv
-from edgegrasp_model.vn_layers import VNLinearReLU, VNReLU, VNSharedLinearReLU
-from edgegrasp_model.vn_network import (
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet, GlobalFeature, PointNetConv
+from edgegrasp_model.networks.vn_edgegrasp import (
     VNBallMaximum,
     VNEdgeGraspNet,
     VNGlobalFeature,
+    VNLinearReLU,
     VNPointNetConv,
+    VNReLU,
+    VNSharedLinearReLU,
 )
 
 

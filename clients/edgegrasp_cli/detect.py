@@ -130,8 +130,7 @@ def _detect_here(
     parsed = parse_options(options)
     cloud = decode_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
 
-    from edgegrasp_model.catalogue import ModelCatalogue  # after what fails fast
-    from edgegrasp_model.on_device.choice import choose_device
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
     return catalogue.get(parsed.model).detect(cloud, parsed)
@@ -139,7 +138,7 @@ def _detect_here(
 
 def _models_here(weights: list[Path]) -> "list[Model]":
     from edgegrasp_client import Model
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
 
     facts = ModelCatalogue.load(weights).describe()
     return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]

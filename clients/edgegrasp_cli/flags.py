@@ -111,6 +111,7 @@ def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
 def connect(
     address: str,
     timeout: float,
+    retry: bool = True,
     *,
     token_file: Annotated[
         Path | None, typer.Option(help=f"File with the server's token; else {TOKEN_VARIABLE}.")
@@ -137,6 +138,7 @@ def connect(
     return GraspClient(
         address,
         timeout=timeout,
+        retry=retry,
         token=_token(token_file),
         tls=Tls(*files) if tls or any(files) else None,
     )

@@ -19,13 +19,15 @@ def generate_data(
     ] = None,
     scenes: Annotated[int, Option(min=1, help="Scenes.")] = 100,
     scene: Annotated[
-        Literal["packed", "pile"] | None, Option(help="Of one kind; else half packed, half piles.")
+        Literal["packed", "pile"] | None,
+        Option(help="Kind of the scenes; else half packed, half piles."),
     ] = None,
     views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
     grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,
     seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 1,
     weights: Annotated[
-        Path | None, Option(help="Network that chooses half of the grasps: its best, its unsure.")
+        Path | None,
+        Option(help="Network that chooses half of the grasps: its best, and its least certain."),
     ] = None,
     workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
 ) -> None:
@@ -78,7 +80,9 @@ def train(
     ] = "plateau",
     rotations: Annotated[
         Literal["any", "upright", "none"],
-        Option(help="Turn training balls: any way, about up, or not; edgegrasp and its kin only."),
+        Option(
+            help="Random rotations of training balls: any, about up only, none; edgegrasp networks."
+        ),
     ] = "any",
     teacher: Annotated[
         Path | None,
@@ -89,7 +93,7 @@ def train(
         Option(
             min=0.01,
             max=0.99,
-            help="Of the balls, metres, in place of the recipe's; 0.5: the paper's NoBall.",
+            help="Radius of the balls, metres; else the recipe's. 0.5: the paper's NoBall.",
         ),
     ] = None,
     evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
@@ -106,8 +110,8 @@ def train(
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again goes on from the last state. What a teacher
-    says is kept beside the run folder, in `taught`.
+    done a model card. Running the same command again goes on from the last state. The scores of a
+    teacher are kept beside the run folder, in `taught`.
     """
     from edgegrasp_model.errors import InvalidCheckpoint
     from edgegrasp_training.recipes import recipe
@@ -131,7 +135,7 @@ def train(
         training_views = part_of(training_views, training_share, seed)
         metadata = recipe(model)
         taught = run.parent / "taught"
-        guide = None if teacher is None else Teacher(teacher, metadata.crop_radius, taught)
+        guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
         if crop_radius is not None:
             metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
         trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
@@ -156,10 +160,10 @@ def import_checkpoint(
     gripper: Annotated[str, Option(help="Gripper it was trained for.")] = "panda",
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""
-    from edgegrasp_model.checkpoint import save_checkpoint
     from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.gripper import load_gripper
-    from edgegrasp_model.import_checkpoint import import_checkpoint as convert
+    from edgegrasp_model.networks.checkpoint import save_checkpoint
+    from edgegrasp_model.networks.import_checkpoint import import_checkpoint as convert
 
     try:
         load_gripper(gripper)

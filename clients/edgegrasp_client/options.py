@@ -1,12 +1,9 @@
 """Options of a request; what is left out, or None, takes the server's default."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NotRequired, TypedDict
 
-import numpy as np
 from numpy.typing import NDArray
-
-from edgegrasp_client.errors import invalid
 
 Vector = Sequence[float] | NDArray[Any]  # x, y, z in the cloud's frame
 
@@ -24,7 +21,7 @@ class SupportPlane(TypedDict):
     kind: NotRequired[Literal["plane"]]
     normal: Vector  # unit, away from the table
     offset: float  # metres
-    max_depth_error: NotRequired[float]  # share of the depths that what is seen of it may correct
+    max_depth_error: NotRequired[float]  # largest relative error of depths that is corrected
 
 
 class RansacPlane(TypedDict):
@@ -132,7 +129,7 @@ class HandPart(TypedDict):
     boxes: Sequence[Sequence[Vector]]  # [min corner, max corner] each, metres
 
 
-class Swing(TypedDict):
+class Linkage(TypedDict):
     """A linkage that carries each finger along an arc."""
 
     radius: float  # length of the link that carries a finger, metres
@@ -149,7 +146,7 @@ class GripperGeometry(TypedDict):
     tcp_z: float  # origin of the TCP frame, metres along z
     hand: HandPart
     finger: HandPart  # one finger, its inner face at y = 0
-    swing: NotRequired[Swing | None]  # None: the fingers close in a straight line
+    swing: NotRequired[Linkage | None]  # None: the fingers close in a straight line
 
 
 class Suppression(TypedDict, total=False):
@@ -181,34 +178,3 @@ class DetectOptions(TypedDict, total=False):
     suppression: Suppression | None  # non-maximum suppression; None: none
     order: Literal["score", "highest", "clearance"]  # what comes first
     debug: bool  # whether to return the processed cloud and every candidate
-
-
-def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options with numpy values turned into plain ones, and those left out that are None.
-
-    `suppression` alone has a None of its own: no suppression.
-
-    Raises:
-        InvalidRequestError: An option has no such name.
-    """
-    for name in options:
-        if name not in DetectOptions.__annotations__:
-            known = ", ".join(DetectOptions.__annotations__)
-            raise invalid(
-                f"options.{name}", "an unknown field", f"Remove it; the options are: {known}."
-            )
-    return {
-        name: _plain(value)
-        for name, value in options.items()
-        if value is not None or name == "suppression"
-    }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {name: _plain(part) for name, part in value.items() if part is not None}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return value

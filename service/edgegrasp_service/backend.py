@@ -5,9 +5,9 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.settings import Settings
 
 
@@ -90,8 +90,7 @@ def load_backend(settings: Settings) -> Catalogue:
 
         return DummyCatalogue(settings.dummy_seconds)
     # Torch takes seconds to import, and the ports should answer meanwhile.
-    from edgegrasp_model.catalogue import ModelCatalogue
-    from edgegrasp_model.on_device.choice import choose_device
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     return ModelCatalogue.load(
         settings.weights,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.npy_file import check_count, read_npy, read_npz
 from edgegrasp_service.pcd_file import read_pcd

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.option_types import Finite, Strict
-from edgegrasp_model.options import MAX_VIEWS
+from edgegrasp_model.options import MAX_VIEWS, Finite, Strict
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.npy_file import check_count
 from edgegrasp_service.sent_arrays import array_from_lists
 from edgegrasp_service.sent_fields import Bytes, parse_fields

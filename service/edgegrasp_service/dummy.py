@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput, check_cloud
 from edgegrasp_model.errors import InvalidRequest, UnknownModel
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
@@ -22,6 +21,7 @@ from edgegrasp_model.results import (
     Outcome,
     Scoring,
 )
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.point_records import columns, read_ascii_records, read_binary_records
 
 TYPES = {

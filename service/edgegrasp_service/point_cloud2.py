@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.option_types import Strict
+from edgegrasp_model.options import Strict
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.npy_file import check_count
 from edgegrasp_service.point_records import columns, unpacked_colors
 from edgegrasp_service.sent_fields import Bytes, parse_fields

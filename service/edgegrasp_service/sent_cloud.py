@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.cloud_decoding import decode_file, decode_list, decode_packed
 from edgegrasp_service.depth_images import FIELD as DEPTH_IMAGES
 from edgegrasp_service.depth_images import fuse_depth_images

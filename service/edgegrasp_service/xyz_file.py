@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.point_records import numbers_from_words
 
 FIX = "Send lines of three numbers: x y z in metres. Normals and colours go into a .ply file."

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edgegrasp_model.checkpoint import load_checkpoint
+from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_sim import experiments
 from edgegrasp_training.recipes import recipe
 

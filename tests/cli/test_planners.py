@@ -15,8 +15,8 @@ from edgegrasp_cli.planners.baselines import (
 )
 from edgegrasp_cli.planners.choice import PlannerChoice, named_planner, open_planner
 from edgegrasp_cli.planners.detection import request_options, select_grasp
-from edgegrasp_model.catalogue import WEIGHTS_FOLDER
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.detector import WEIGHTS_FOLDER
+from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_sim.gripper import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.observation import Observation

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.grpc_messages import request_from_message, score_request_from_message
 from edgegrasp_service.options_text import options_from_query
 from edgegrasp_service.sent_arrays import PER_POINT, ListArray, NpyArray, PackedArray

@@ -3,9 +3,9 @@ import base64
 import numpy as np
 import pytest
 
-from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.depth_images import fuse_depth_images
 from edgegrasp_service.errors import PayloadTooLarge
 from edgegrasp_service.sent_arrays import ListArray

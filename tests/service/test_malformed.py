@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.option_messages import fill
+from edgegrasp_client.grpc_wire import fill
 
 INVALID = {"grpc": "INVALID_ARGUMENT", "rest": "400"}
 NOT_FOUND = {"grpc": "NOT_FOUND", "rest": "404"}

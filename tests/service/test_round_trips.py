@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.option_messages import fill
-from edgegrasp_client.options import plain_options
+from edgegrasp_client.grpc_wire import fill
+from edgegrasp_client.requests import plain_options
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_service.grpc_messages import options_from_message
 from edgegrasp_service.options_text import options_from_query

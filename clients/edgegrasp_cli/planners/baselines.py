@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_cli.planners.detection import request_options, view_ids
-from edgegrasp_model.candidates import edge_grasp_poses, measure_edges
-from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.cloud import Cloud, Voxels
-from edgegrasp_model.cloud_input import CloudInput
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.candidates.edge_grasps import (
+    edge_grasp_poses,
+    measure_edges,
+    sample_approach_points,
+)
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.sampling import sample_approach_points
+from edgegrasp_model.scene.cloud import Cloud, CloudInput, Voxels
 from edgegrasp_sim.grasping import GraspResult
 from edgegrasp_sim.gripper import MAX_OPENING
 from edgegrasp_sim.observation import Observation, crop
@@ -253,7 +254,7 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
 
 
 def _statistical_outlier_removal(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) are as near to their neighbours as the others."""
+    """Which points (N,) to keep: those with usual mean distances to their neighbours."""
     distances, _ = _nearest(points)
     mean = distances.mean(axis=1)
     near: NDArray[np.bool_] = mean < mean.mean() + OUTLIER_DEVIATIONS * mean.std(ddof=1)
@@ -261,7 +262,7 @@ def _statistical_outlier_removal(points: Float64) -> NDArray[np.bool_]:
 
 
 def _radius_outlier_removal(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) have more than NEIGHBORS points near them, themselves included."""
+    """Which points (N,) to keep: those with at least NEIGHBORS others within ISOLATED."""
     distances, _ = _nearest(points, NEIGHBORS + 1)
     near: NDArray[np.bool_] = distances[:, -1] <= ISOLATED
     return near

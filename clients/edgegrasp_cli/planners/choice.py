@@ -227,7 +227,7 @@ def _on_own_candidates(choice: PlannerChoice, rules: PlanningRules) -> ChosenPla
 
 def _metadata(weights: tuple[Path, ...], model: str) -> Any:
     """The metadata of the weights that a name stands for."""
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.errors import EdgeGraspError
 
     try:

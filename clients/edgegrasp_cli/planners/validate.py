@@ -109,7 +109,7 @@ def own_successes(
 
 
 def densities(clouds: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> list[float]:
-    """Points per square millimetre of a surface, by how aslant it is seen (`COSINES`).
+    """Points per square millimetre of a surface, by the angle it is seen at (`COSINES`).
 
     Args:
         clouds: (N, 3) points and (3,) camera of each, metres.

@@ -1,0 +1,104 @@
+"""How a client knows its server, what it shows it, and when it asks again; for both clients."""
+
+import random
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+import grpc
+
+from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
+
+DEFAULT_ADDRESS = "127.0.0.1:50051"
+
+CHANNEL_OPTIONS = (
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+    ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
+    ("grpc.max_reconnect_backoff_ms", 1000),
+    # A server that vanished without a word is found out, and streams to it end.
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+)
+
+RETRIES = 4  # of a call to a server that is away; a busy one is asked until the timeout
+FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
+
+
+@dataclass(frozen=True)
+class Tls:
+    """How to know the server, and what to show it; files in PEM.
+
+    Attributes:
+        ca: Certificates of the authorities to trust; None: those of the machine.
+        certificate: One's own, for servers that ask for it.
+        key: The key of that certificate.
+    """
+
+    ca: str | Path | None = None
+    certificate: str | Path | None = None
+    key: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InvalidRequestError for a certificate without its key."""
+        if (self.certificate is None) != (self.key is None):
+            raise invalid("tls", "a certificate or a key alone", "Give both or neither.")
+
+
+def is_rest(address: str) -> bool:
+    """Whether an address names the REST transport."""
+    return address.startswith(("http://", "https://"))
+
+
+def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
+    """Seconds to wait after a failed attempt, counted from 0; None: it was the last.
+
+    The delays double and are drawn at random, so that clients refused together come back apart.
+    """
+    longest = min(FIRST_DELAY * 2 ** min(attempt, 10), LONGEST_DELAY)
+    jittered = random.uniform(longest / 2, longest)
+    if isinstance(error, OverloadedError):
+        return error.retry_after + jittered
+    return jittered if attempt < RETRIES else None
+
+
+def channel_credentials(tls: Tls) -> grpc.ChannelCredentials:
+    """For a gRPC channel; raises InvalidRequestError for files that cannot be read."""
+    return grpc.ssl_channel_credentials(
+        root_certificates=_read("tls.ca", tls.ca),
+        private_key=_read("tls.key", tls.key),
+        certificate_chain=_read("tls.certificate", tls.certificate),
+    )
+
+
+def ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
+    """For httpx; raises InvalidRequestError for files that cannot be used."""
+    if tls is None:
+        return True
+    for name in ("ca", "certificate", "key"):
+        _read(f"tls.{name}", getattr(tls, name))
+    try:
+        context = ssl.create_default_context(cafile=tls.ca)
+        if tls.certificate is not None:
+            context.load_cert_chain(tls.certificate, tls.key)
+    except ssl.SSLError as error:
+        raise invalid("tls", f"files that do not hold it ({error})", "Give PEM files.") from None
+    return context
+
+
+def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
+    """What carries a token, in metadata and headers; raises InvalidRequestError if none can."""
+    if token is None:
+        return ()
+    if not (token.isascii() and token.isprintable() and token and " " not in token):
+        raise invalid("token", f"{len(token)} letters", "Give printable ASCII without spaces.")
+    return (("authorization", f"Bearer {token}"),)
+
+
+def _read(name: str, path: str | Path | None) -> bytes | None:
+    if path is None:
+        return None
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise invalid(name, repr(str(path)), f"{error.strerror}.") from None
