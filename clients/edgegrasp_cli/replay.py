@@ -60,7 +60,7 @@ def attempt(
 
 @replay.command()
 def request(
-    file: Annotated[Path, typer.Argument(help="Request that a server with --record-dir wrote.")],
+    file: Annotated[Path, typer.Argument(help="File that a server with --record-folder wrote.")],
 ) -> None:
     """Answer a recorded request again, in this process, and compare with the recorded answer."""
     from edgegrasp_service.recording import replay as answer_again
