@@ -1,8 +1,9 @@
 """`edgegrasp replay`: make an attempt of a benchmark again, or a request that a server recorded."""
 
+import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -60,14 +61,42 @@ def attempt(
 
 @replay.command()
 def request(
-    file: Annotated[Path, typer.Argument(help="File that a server with --record-folder wrote.")],
+    file: Annotated[Path, typer.Argument(help="A file that a server with --record-folder wrote.")],
+    config: Annotated[Path | None, Option(help="TOML file with the server's settings.")] = None,
 ) -> None:
-    """Answer a recorded request again, in this process, and compare with the recorded answer."""
+    """Answer a recorded request again, in this process, and compare with the answer of then.
+
+    Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
+    """
     from edgegrasp_service.recording import replay as answer_again
 
     from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_service.settings import load_settings
 
     try:
-        print(answer_again(file))
+        again = answer_again(file, load_settings(config))
     except (EdgeGraspError, ValueError, OSError) as error:
         sys.exit(f"edgegrasp replay: {error}")
+    refused = again.answer.error
+    print(f"{again.answer.facts.grasps} grasps" if refused is None else refused.detail)
+    before, now = (_without_times(again.job, body) for body in (again.recorded, again.answer.body))
+    if now != before:
+        sys.exit("edgegrasp replay: the answer differs from the recorded one")
+    print("the answer is the same")
+
+
+def _without_times(job: Any, body: bytes) -> Any:
+    """An answer but for the seconds it took; None for an error, whose body is empty."""
+    from google.protobuf import json_format
+
+    from edgegrasp.v1 import grasp_pb2
+
+    if not body:
+        return None
+    if job.transport == "http":
+        answer = json.loads(body)
+    else:
+        message = getattr(grasp_pb2, f"{job.method}Response").FromString(body)
+        answer = json_format.MessageToDict(message)
+    answer.pop("seconds", None)
+    return answer

@@ -1,13 +1,15 @@
 """The program as a whole: its help, and what it says where something is missing."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 
 HEAVY = {"torch", "open3d", "grpc", "pybullet", "fastapi", "uvicorn", "matplotlib", "httpx"}
@@ -68,16 +70,25 @@ def test_the_command_line_is_an_extra() -> None:
     assert "pip install 'edgegrasp[cli]'" in done.stderr
 
 
+@pytest.mark.parametrize("transport", ["http", "grpc"])
 def test_a_recorded_request_is_answered_again(
-    run, refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    transport: str, run, refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def body(model: str, seconds: float) -> bytes:
+        if transport == "http":
+            return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()
+        response = grasp_pb2.DetectGraspsResponse(model=model, seconds={"total": seconds})
+        return response.SerializeToString()
+
+    def replay(path: Path, settings: object) -> SimpleNamespace:
+        answer = SimpleNamespace(
+            body=body(path.stem, 2.0), error=None, facts=SimpleNamespace(grasps=7)
+        )
+        job = SimpleNamespace(transport=transport, method="DetectGrasps")
+        return SimpleNamespace(job=job, recorded=body("plus", 1.0), answer=answer)
+
     recording = ModuleType("edgegrasp_service.recording")
-    recording.replay = lambda path: f"{path.name}: the same"  # type: ignore[attr-defined]
+    recording.replay = replay  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "edgegrasp_service.recording", recording)
-    assert run("replay", "request", tmp_path / "request.npz") == "request.npz: the same\n"
-
-    def broken(path: Path) -> str:
-        raise ValueError(f"{path.name} is no recorded request")
-
-    recording.replay = broken  # type: ignore[attr-defined]
-    assert "is no recorded request" in refused("replay", "request", tmp_path / "request.npz")
+    assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
+    assert "differs" in refused("replay", "request", "small.job")
