@@ -12,7 +12,6 @@ import pytest
 
 import edgegrasp_client
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_cli.detect import NOT_OPTIONS, detect
 from edgegrasp_model import directions, gripper, options, regions, results, support
 from edgegrasp_service import depth_images, http_bodies, point_cloud2
 from edgegrasp_service.core import GraspService, ModelInfo
@@ -30,9 +29,6 @@ def test_options() -> None:
     names = list(options.DetectOptions.model_fields)
     assert fields(grasp_pb2.DetectOptions) == names
     assert list(edgegrasp_client.DetectOptions.__annotations__) == names
-    assert [name for name in inspect.signature(detect).parameters if name not in NOT_OPTIONS] == (
-        names
-    )
     operation = openapi()["paths"]["/v1/grasps"]["post"]
     queries = [parameter for parameter in operation["parameters"] if parameter["in"] == "query"]
     assert [parameter["name"] for parameter in queries] == names

@@ -1,23 +1,40 @@
-"""The candidates of the paper's evaluation, as its published code draws them."""
+"""Planners without a network, Edge-Sample and an oracle, and the candidates they choose from."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_cli.planners.detection import request_options, view_ids
 from edgegrasp_model.candidates.edge_grasps import (
     edge_grasp_poses,
     measure_edges,
     sample_approach_points,
 )
-from edgegrasp_model.scene.cloud import Cloud, Voxels
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import Cloud, CloudInput, Voxels
+from edgegrasp_sim.grasping import GraspResult
+from edgegrasp_sim.gripper import MAX_OPENING
 from edgegrasp_sim.observation import Observation, crop
+from edgegrasp_sim.protocol import PlanningRules
+from edgegrasp_sim.trials import PlannedGrasp
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+
+# From what is seen to poses `T_world_hand` in random order, (E, 4, 4); can be pickled.
+Sampler: TypeAlias = Callable[[Observation, np.random.Generator], Float32]
+
+MAX_TRIES = 300  # candidates tried in one view
+# Metres along the hand's x and y: a grasp that holds there as well is no close call.
+SHIFTS = ((0.002, 0.0), (-0.002, 0.0), (0.0, 0.002), (0.0, -0.002))
 
 NEIGHBORS = 30  # of each point, itself among them, for outliers and normals
 OUTLIER_DEVIATIONS = 1.0
@@ -47,12 +64,69 @@ TABLE_CLEARANCE = 0.004  # metres
 
 
 @dataclass(frozen=True)
-class PaperCandidates:
-    """Draws candidate edge grasps without level grasps and without a check for collisions.
+class EdgeSamplePlanner:
+    """Edge-Sample, the paper's baseline: takes any candidate, without a network."""
 
-    Outliers are dropped and normals estimated in the dense cloud, approach points sampled
-    farthest from each other in the voxelised one; what of a hand may come near the table is the
-    published code's probe points. No constraint depends on which way a normal points.
+    sampler: Sampler
+
+    def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
+        """A random candidate; None where there is none."""
+        poses = self.sampler(observation, np.random.default_rng(seed))
+        if len(poses) == 0:
+            return None
+        return PlannedGrasp(poses[0], score=0.0, width=MAX_OPENING)
+
+
+class OraclePlanner:
+    """Tries candidates in a copy of the scene: the ceiling of what sampling offers.
+
+    Takes the first random candidate that holds when tried, and when tried a little aside.
+    Without one, it takes the first that holds at all; without that, any.
+    """
+
+    def __init__(self, sampler: Sampler) -> None:
+        self.sampler = sampler
+        self._try_grasp: Callable[[ArrayLike], GraspResult] | None = None
+
+    def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
+        """Take what tries a grasp without changing the scene."""
+        self._try_grasp = try_grasp
+
+    def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
+        """A candidate that holds; score 1 if safely, 0.5 if barely, 0 if none did."""
+        poses = self.sampler(observation, np.random.default_rng(seed))[:MAX_TRIES]
+        if len(poses) == 0:
+            return None
+        fallback = PlannedGrasp(poses[0], 0.0, MAX_OPENING)
+        for pose in poses:
+            if not self._holds(pose):
+                continue
+            if all(self._holds(_shifted(pose, *shift)) for shift in SHIFTS):
+                return PlannedGrasp(pose, 1.0, MAX_OPENING)
+            if fallback.score == 0.0:
+                fallback = PlannedGrasp(pose, 0.5, MAX_OPENING)
+        return fallback
+
+    def _holds(self, pose: Float32) -> bool:
+        if self._try_grasp is None:
+            raise RuntimeError("the oracle has no scene to try grasps in; call use_trial first")
+        return self._try_grasp(pose).success
+
+
+def _shifted(pose: Float32, along_x: float, along_y: float) -> Float32:
+    shifted = pose.copy()
+    shifted[:3, 3] += along_x * pose[:3, 0] + along_y * pose[:3, 1]
+    return shifted
+
+
+@dataclass(frozen=True)
+class PaperCandidates:
+    """Draws the candidates of the paper's evaluation, as its published code does.
+
+    There are no top-down grasps among them, and no collision is checked but that with the table,
+    at the published code's seven points of the hand. Outliers are dropped and normals estimated in
+    the dense cloud, approach points sampled farthest from each other in the voxelised one. No
+    constraint depends on which way a normal points.
 
     Attributes:
         num_approach_points: approach points sampled.
@@ -77,6 +151,40 @@ class PaperCandidates:
         contact = np.concatenate([np.asarray(rows, dtype=np.int64) for rows in balls])
         _, poses = paper_grasps(cloud, approach, contact, observation.table_height)
         return poses[rng.permutation(len(poses))[: self.num_candidates]]
+
+
+@dataclass
+class OwnCandidates:
+    """Draws the candidates that our own pipeline would score: collision-free, top-down ones too.
+
+    Attributes:
+        rules: of the protocol.
+        options: of each request, besides the protocol's.
+        weights: files or folders besides those that ship; they decide only how clouds are prepared.
+        model: of them; empty: the default.
+    """
+
+    rules: PlanningRules
+    options: dict[str, Any] = field(default_factory=dict)
+    weights: tuple[Path, ...] = ()
+    model: str = ""
+
+    @cached_property
+    def detector(self) -> GraspDetector:
+        """Loaded where it is first needed, so that this can be sent to worker processes."""
+        return ModelCatalogue.load(self.weights).get(self.model)
+
+    def __call__(self, observation: Observation, rng: np.random.Generator) -> Float32:
+        """Poses `T_world_hand` of candidates, in random order: (E, 4, 4)."""
+        seed = int(rng.integers(2**31))
+        options = request_options(observation, seed, self.rules, self.options)
+        cloud = CloudInput(observation.cloud, view_ids=view_ids(observation))
+        prepared = self.detector.prepare(cloud, parse_options(options))
+        if prepared.scene is None or prepared.sample is None:
+            return np.empty((0, 4, 4), dtype=np.float32)
+        sample = prepared.sample
+        poses = sample.candidates.take(sample.collision_free).T_cloud_hand
+        return prepared.scene.frame.poses_in_cloud(poses[rng.permutation(len(poses))])
 
 
 def paper_grasps(
@@ -128,7 +236,7 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
         The mean of the points and normals in each voxel; normals are of either sign.
     """
     dense = points.astype(np.float64)
-    for keep in (_inliers, _in_company):
+    for keep in (_statistical_outlier_removal, _radius_outlier_removal):
         if len(dense) < MIN_POINTS:
             return None
         dense = dense[keep(dense)]
@@ -145,16 +253,16 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
     return Cloud(voxels.mean(dense), voxels.mean(normals))
 
 
-def _inliers(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) are as near to their neighbours as the others."""
+def _statistical_outlier_removal(points: Float64) -> NDArray[np.bool_]:
+    """Which points (N,) to keep: those with usual mean distances to their neighbours."""
     distances, _ = _nearest(points)
     mean = distances.mean(axis=1)
     near: NDArray[np.bool_] = mean < mean.mean() + OUTLIER_DEVIATIONS * mean.std(ddof=1)
     return near
 
 
-def _in_company(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) have more than NEIGHBORS points near them, themselves included."""
+def _radius_outlier_removal(points: Float64) -> NDArray[np.bool_]:
+    """Which points (N,) to keep: those with at least NEIGHBORS others within ISOLATED."""
     distances, _ = _nearest(points, NEIGHBORS + 1)
     near: NDArray[np.bool_] = distances[:, -1] <= ISOLATED
     return near
