@@ -8,13 +8,20 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from edgegrasp_sim.camera import EVALUATION_VIEWS, Camera, ViewRange
-from edgegrasp_sim.grasping import GraspResult, run_grasp
-from edgegrasp_sim.gripper import Gripper
+from edgegrasp_sim.camera import (
+    CLOUD_BOX,
+    EVALUATION_VIEWS,
+    WORKSPACE_BOX,
+    Camera,
+    Observation,
+    ViewRange,
+    crop,
+    resample_surfaces,
+)
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.observation import CLOUD_BOX, WORKSPACE_BOX, Observation, crop
 from edgegrasp_sim.poses import require_pose
-from edgegrasp_sim.resampling import resample_surfaces
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
@@ -26,7 +33,6 @@ from edgegrasp_sim.scene import (
     make_pile,
     settle,
 )
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -35,10 +41,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from edgegrasp_sim.noise import DepthNoise
-    from edgegrasp_sim.observation import TableView
+    from edgegrasp_sim.camera import DepthNoise, TableView
     from edgegrasp_sim.poses import Matrix
-    from edgegrasp_sim.world import Body
 
 NOISE_STD = 0.001  # metres
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
@@ -68,7 +72,7 @@ class ClutterSimulation:
 
     Args:
         objects: what to make scenes from, for each kind; the built-in sets by default.
-        gui: show PyBullet's window.
+        gui: show the engine's window.
         start_contact_fails: call a grasp failed (`PREGRASP`) if the open hand overlaps anything
             at its start pose. The reference simulator asks for contacts there before the engine
             has looked for any, so that it never fails a grasp for this and lets the engine push
@@ -129,11 +133,6 @@ class ClutterSimulation:
         return [item.model for item in self._objects]
 
     @property
-    def object_bodies(self) -> list[Body]:
-        """Bodies of the objects that are left, to paint or to measure."""
-        return [item.body for item in self._objects]
-
-    @property
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [
@@ -183,11 +182,11 @@ class ClutterSimulation:
         return self.num_objects
 
     def reset_from_poses(self, placements: Sequence[ObjectPlacement]) -> None:
-        """Put objects exactly where they are said to be, at rest, without letting time pass.
+        """Put objects exactly at the given poses, at rest, without simulating.
 
         Raises:
             FileNotFoundError: an object's file is missing.
-            ValueError: PyBullet cannot read it.
+            ValueError: the engine cannot read it.
         """
         self._clear()
         for placement in placements:

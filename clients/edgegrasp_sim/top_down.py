@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgegrasp_sim.gripper import FINGERTIP, MAX_OPENING
-from edgegrasp_sim.trials import PlannedGrasp
+from edgegrasp_sim.hand import FINGERTIP, MAX_OPENING
+from edgegrasp_sim.trial import PlannedGrasp
 
 if TYPE_CHECKING:
-    from edgegrasp_sim.observation import Observation
+    from edgegrasp_sim.camera import Observation
 
 REACH = 0.04  # metres around the highest point that count as the thing to grasp
 DEPTH = 0.025  # metres that the fingertips go below its top

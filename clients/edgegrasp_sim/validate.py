@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edgegrasp_sim.gripper import T_HANDCOM_HAND
+from edgegrasp_sim.hand import T_HANDCOM_HAND
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 

@@ -1,4 +1,4 @@
-"""The training loop: resumable to the step, stops by itself, keeps the best network."""
+"""The training loop: resumes at the exact step, stops by itself, keeps the best network."""
 
 import csv
 import math
@@ -22,11 +22,11 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_network import HandNet
 from edgegrasp_model.network import build_network
-from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
+from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
 from edgegrasp_training.examples import (
-    Lessons,
     Packed,
     Rotations,
+    SoftLabels,
     TriedGrasps,
     pack_balls,
     pack_hands,
@@ -34,8 +34,7 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
-from edgegrasp_training.metrics import Evaluation, evaluate_scores
-from edgegrasp_training.model_card import write_model_card
+from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train
 from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import load_view
 
@@ -57,16 +56,16 @@ class TrainingOptions:
     patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
-    averaging: float = 0.998  # share of the old weights in the running mean that is kept and judged
+    averaging: float = 0.998  # share of the old weights in the running mean, which is what is kept
     unknown: float = 0.1  # share of training views without their table, and without their camera
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate
-    mixed_precision: bool = False  # products in bfloat16: for a GPU
+    mixed_precision: bool = False  # matrix products in bfloat16, for a GPU
     seed: int = 0
 
 
 class Trainer:
-    """Trains one network; everything it needs to go on is in its run folder."""
+    """Trains one network; its run folder holds everything it needs to resume."""
 
     def __init__(
         self,
@@ -78,7 +77,7 @@ class Trainer:
         device: torch.device | str = "cpu",
         teacher: Teacher | None = None,
     ) -> None:
-        """Set up, and go on from the folder's last state if there is one.
+        """Set up, and resume from the folder's last state if there is one.
 
         Args:
             metadata: Name, widths and gripper of the network to train.
@@ -87,10 +86,10 @@ class Trainer:
             folder: Gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far.
             options: The recipe.
             device: Where the network runs.
-            teacher: Scores further candidates, to learn from beside the labels.
+            teacher: Scores further candidates to learn from.
 
         Raises:
-            ValueError: There is a teacher for a network that sees hands, not balls.
+            ValueError: The network is one of hands, which no teacher can teach.
         """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
@@ -99,7 +98,7 @@ class Trainer:
         self.train_paths, self.validation_paths = train_paths, validation_paths
         self.gripper = load_gripper(metadata.gripper)
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
-        self._lessons = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._learn)
+        self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._score)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
@@ -138,7 +137,7 @@ class Trainer:
         self._save_state()
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
-        """Score the validation views against what held; of each so many balls, or all of them."""
+        """Score the validation views, or at most `balls_per_view` balls of each."""
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
@@ -218,7 +217,7 @@ class Trainer:
         return float(loss.detach())
 
     def _training_batch(self, rng: np.random.Generator) -> Packed:
-        """Some balls of some views; the step number alone decides which."""
+        """Some balls of some views; the seed and the step number alone decide which."""
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
@@ -227,14 +226,14 @@ class Trainer:
             grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
-            balls, lessons = grasps.balls(), None
+            balls, soft_labels = grasps.balls(), None
             if self.teacher is not None:
-                lessons = self._lessons(self.train_paths[index])
-                balls = np.union1d(balls, lessons.approach_index).astype(np.int64)
+                soft_labels = self._soft_labels(self.train_paths[index])
+                balls = np.union1d(balls, soft_labels.approach_index).astype(np.int64)
             if len(balls) == 0:
                 continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
-            packed = self._pack(grasps, np.sort(chosen), rng, lessons)
+            packed = self._pack(grasps, np.sort(chosen), rng, soft_labels)
             if self.metadata.network.architecture == "edgegrasp":
                 packed = self._turned(packed, rng, bool(camera_known))
             parts.append(packed)
@@ -247,16 +246,16 @@ class Trainer:
         grasps: TriedGrasps,
         balls: NDArray[np.int64],
         rng: np.random.Generator | None = None,
-        lessons: Lessons | None = None,
+        soft_labels: SoftLabels | None = None,
     ) -> Packed:
-        """Some balls of a view; varied where there is a random stream."""
+        """Some balls of a view; `rng` picks the points of hands at random."""
         network = self.metadata.network
         if network.architecture == "hand":
             return pack_hands(grasps, balls, network, rng)
-        return pack_balls(grasps, balls, network, lessons)
+        return pack_balls(grasps, balls, network, soft_labels)
 
     def _turned(self, packed: Packed, rng: np.random.Generator, camera_known: bool) -> Packed:
-        """Balls turned at random: what Vector Neurons need not learn, this network must."""
+        """Rotate balls at random: this network, unlike Vector Neurons, is not equivariant."""
         # Without a camera the detector's frame is upright, but may be turned any way about up.
         known = camera_known or self.options.rotations == "any"
         rotations = self.options.rotations if known else "upright"
@@ -268,12 +267,12 @@ class Trainer:
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
 
-    def _learn(self, path: Path) -> Lessons:
+    def _score(self, path: Path) -> SoftLabels:
         assert self.teacher is not None
-        return self.teacher.lessons(path)
+        return self.teacher.soft_labels(path)
 
     def _standardise(self) -> None:
-        """Fit the description's mean and spread to the training views."""
+        """Fit the mean and spread of the hand descriptions to the training views."""
         if not isinstance(self.network, HandNet):
             return
         seen = [self._tried(path, True).seen for path in self.train_paths]
@@ -295,7 +294,7 @@ class Trainer:
         self._save_state()
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:
-        """Write the running mean, for lengths in metres."""
+        """Write the running mean of the weights, for lengths in metres."""
         path = self.folder / f"{metadata.name}.safetensors"
         save_checkpoint(path, in_metres(self.average), metadata)
 

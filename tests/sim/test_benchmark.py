@@ -12,13 +12,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores, manifest, run_benchmark
+from edgegrasp_sim.benchmark import (
+    BenchmarkConfig,
+    RayRunner,
+    _result,
+    available_cores,
+    manifest,
+    run_benchmark,
+)
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.ray_cluster import RayRunner, _result
 from edgegrasp_sim.results import ResultFolder, attempts_digest
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import PlannerUnavailableError
+from edgegrasp_sim.trial import PlannerUnavailableError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +40,7 @@ DIES_ONCE = """
 import os, signal
 from pathlib import Path
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import PlannerUnavailableError
+from edgegrasp_sim.trial import PlannerUnavailableError
 
 MARK = Path(__file__).with_suffix(".died")
 

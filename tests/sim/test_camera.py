@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.camera import EVALUATION_VIEWS, TRAINING_VIEWS, Camera, ViewRange, look_at
-from edgegrasp_sim.world import World
+from edgegrasp_sim.engine import World
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])

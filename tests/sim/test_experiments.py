@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from edgegrasp_sim.experiment_report import experiment_figure, experiment_table
-from edgegrasp_sim.experiments import EXPERIMENTS, Case
-from edgegrasp_sim.families import FAMILIES, write_family
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.experiments import EXPERIMENTS, Case, experiment_figure, experiment_table
+from edgegrasp_sim.objects import FAMILIES, ObjectSet, SceneKind, write_family
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.published import published
+from edgegrasp_sim.report import published
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,11 +9,18 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.benchmark import BenchmarkConfig, objects_digest, run_benchmark
-from edgegrasp_sim.meshes import LONGEST_SIDE, SHORTEST_SIDE, cache_folder, prepare_mesh
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.objects import (
+    LONGEST_SIDE,
+    SHORTEST_SIDE,
+    ObjectModel,
+    ObjectSet,
+    SceneKind,
+    cache_folder,
+    prepare_mesh,
+)
 from edgegrasp_sim.scene import OBJECT_MASS, add_table, load_object
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -3,12 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edgegrasp_sim.camera import Camera, look_at
+from edgegrasp_sim.camera import WORKSPACE, Camera, look_at, resample_surfaces
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import WORKSPACE
-from edgegrasp_sim.resampling import resample_surfaces
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.world import World
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])

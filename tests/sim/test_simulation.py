@@ -7,15 +7,12 @@ import numpy as np
 import pybullet_data
 import pytest
 
-from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.families import write_family
-from edgegrasp_sim.grasping import GraspOutcome, retreat_pose
-from edgegrasp_sim.gripper import FINGERTIP
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.observation import WORKSPACE
+from edgegrasp_sim.camera import WORKSPACE, look_at
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
 from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim import trials
-from edgegrasp_sim.grasping import FailureCause, GraspOutcome
+from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import (
+from edgegrasp_sim.trial import (
     PlannedGrasp,
     PlannerUnavailableError,
     Round,
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from edgegrasp_sim.grasping import GraspResult
-    from edgegrasp_sim.observation import Observation
+    from edgegrasp_sim.camera import Observation
+    from edgegrasp_sim.hand import GraspResult
 
 IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)

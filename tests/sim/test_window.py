@@ -8,14 +8,14 @@ import numpy as np
 import pybullet
 
 from edgegrasp_sim import window
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.results import attempts_digest
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import PlannedGrasp, run_round
+from edgegrasp_sim.trial import PlannedGrasp, run_round
 from edgegrasp_sim.window import SPACE, ShownPlanner, Window
-from edgegrasp_sim.world import World
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -5,17 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_training.drawn_shapes import (
+from edgegrasp_training.shapes import (
+    DRAWN,
+    HOLLOW,
     LONGEST,
     NUM_DRAWN,
     NUM_FREE,
     PLAIN_HEIGHT,
     PLAIN_WIDTH,
+    SHAPES,
     THINNEST,
+    any_made_object,
     drawn_shape,
+    made_object,
+    revolved,
 )
-from edgegrasp_training.hollow_shapes import SHAPES, revolved
-from edgegrasp_training.made_shapes import DRAWN, HOLLOW, any_made_object, made_object
 
 
 def _surface(obj: str) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import expit
 
-from edgegrasp_training.metrics import (
+from edgegrasp_training.evaluation import (
     accuracy,
     auroc,
     cross_entropy,

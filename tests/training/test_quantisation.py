@@ -1,13 +1,13 @@
 from pathlib import Path
 
 import pytest
+from edgegrasp_training.quantisation import quantise_detector
 
 from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import EDGEGRASP_SMALL, HAND, NetworkConfig
-from edgegrasp_training.quantisation import quantise_detector
 from edgegrasp_training.views import find_views
 
 VIEWS = Path(__file__).parents[2] / "examples" / "labelled_views"

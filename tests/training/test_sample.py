@@ -7,10 +7,15 @@ import pytest
 
 from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_sim.objects import ObjectSet, SceneKind
-from edgegrasp_training.data_card import CARD_FILE, write_data_card
 from edgegrasp_training.recipes import RECIPES
 from edgegrasp_training.training import Trainer, TrainingOptions
-from edgegrasp_training.views import find_views, load_view, split_by_scene
+from edgegrasp_training.views import (
+    CARD_FILE,
+    find_views,
+    load_view,
+    split_by_scene,
+    write_data_card,
+)
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 

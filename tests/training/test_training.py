@@ -11,7 +11,6 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.scene import at_workspace_side
-from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.examples import (
     SUPPORT,
     UP,
@@ -22,7 +21,7 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
-from edgegrasp_training.recipes import RECIPES, recipe
+from edgegrasp_training.recipes import LENGTH_UNIT, RECIPES, recipe
 from edgegrasp_training.training import Trainer, TrainingOptions
 from edgegrasp_training.views import LabelledView, split_by_scene
 

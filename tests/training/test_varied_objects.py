@@ -4,12 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.world import World
 from edgegrasp_training.generation import GenerationOptions, generate
-from edgegrasp_training.made_shapes import HOLLOW, made_object
-from edgegrasp_training.varied_objects import DRAWN, STRETCH, stretched, varied_objects
+from edgegrasp_training.shapes import DRAWN, HOLLOW, STRETCH, made_object, stretched, varied_objects
 from edgegrasp_training.views import find_views, load_view
 
 
