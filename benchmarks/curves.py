@@ -21,7 +21,7 @@ from benchmarks.timing import interleaved, machine
 from edgegrasp_model.ball_batch import BallBatch
 from edgegrasp_model.network_config import EDGEGRASP_SMALL
 from edgegrasp_model.options import Collision
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 
 RESULTS = Path(__file__).parent / "results"
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)

@@ -8,8 +8,8 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.network import build_network
 from edgegrasp_model.network_config import NetworkConfig
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.simulation import ClutterSimulation
 
 VOXEL_SIZE = 0.0045  # metres

@@ -34,8 +34,8 @@ from edgegrasp_model.network_config import (
     VN_EDGEGRASP,
     NetworkConfig,
 )
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.recipes import recipe
 

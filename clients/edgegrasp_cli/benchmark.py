@@ -88,11 +88,10 @@ def benchmark(
     from edgegrasp_cli.progress import with_progress
     from edgegrasp_client import GraspClientError
     from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
-    from edgegrasp_sim.gate import below_gate
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
-    from edgegrasp_sim.results import ResultFolder, summarise
-    from edgegrasp_sim.trials import PlannerUnavailableError
+    from edgegrasp_sim.results import ResultFolder, below_gate, summarise
+    from edgegrasp_sim.trial import PlannerUnavailableError
 
     choice = PlannerChoice(
         planner,

@@ -17,8 +17,8 @@ def compare(
     from rich.console import Console
     from rich.table import Table
 
-    from edgegrasp_sim.comparison import compare as figures_of
     from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import compare as figures_of
 
     try:
         figures = figures_of(ResultFolder(first), ResultFolder(second))

@@ -57,7 +57,7 @@ def experiment(
     from edgegrasp_sim.experiments import EXPERIMENTS
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
-    from edgegrasp_sim.trials import PlannerUnavailableError
+    from edgegrasp_sim.trial import PlannerUnavailableError
 
     try:
         if name not in EXPERIMENTS:
@@ -107,8 +107,7 @@ def _run(
     from edgegrasp_cli.planners.making import planner_of
     from edgegrasp_cli.progress import with_progress
     from edgegrasp_sim.benchmark import available_cores, manifest, run_benchmark
-    from edgegrasp_sim.record import record_of
-    from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import ResultFolder, record_of
 
     folder = ResultFolder(where)
     with planner_of(choice, config.protocol.planning) as made:
@@ -131,7 +130,7 @@ def _run(
 
 def _write(name: str, cases: list[dict[str, Any]], output: Path) -> None:
     """Write what is known so far, so that an interrupted experiment can be looked at."""
-    from edgegrasp_sim.experiment_report import experiment_figure, experiment_table
+    from edgegrasp_sim.experiments import experiment_figure, experiment_table
 
     results = {"experiment": name, "command": _command(), "cases": cases}
     (output / "experiment.json").write_text(json.dumps(results, indent=1) + "\n")

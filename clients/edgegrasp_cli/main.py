@@ -23,7 +23,6 @@ COMMANDS = {
     "compare": ("sim", "Compare two benchmarks scene by scene."),
     "generate-data": ("train", "Make labelled edge grasps in simulation."),
     "train": ("train", "Train weights on generated data."),
-    "quantise": ("train", "Make weights in int8 of edgegrasp weights."),
     "import-checkpoint": ("model", "Convert the authors' checkpoints to safetensors."),
 }
 

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Round
+    from edgegrasp_sim.trial import Round
 
 
 def with_progress(

@@ -32,11 +32,9 @@ def attempt(
     picture: Annotated[
         Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
     ] = None,
-    film: Annotated[Path | None, Option(help="GIF to write, of the whole round.")] = None,
     gui: Annotated[bool, Option(help="Show the simulator's window.")] = False,
 ) -> None:
     """Make one recorded attempt again, in the scene and view it was made in."""
-    from edgegrasp_sim.film import film_round
     from edgegrasp_sim.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
     from edgegrasp_sim.report import DrawnAttempt, attempt_title
@@ -57,8 +55,6 @@ def attempt(
                     camera_position=seen.camera_position,
                     title=attempt_title(done, number),
                 )
-            if film is not None:
-                film_round(repeated, done, film)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"edgegrasp replay: {error}")
     print(attempt_title(done, number))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from benchmarks import curves
 
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 
 if TYPE_CHECKING:
     from pathlib import Path

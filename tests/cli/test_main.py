@@ -45,7 +45,7 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_a_missing_package_of_a_command_in_a_group_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, tmp_path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "edgegrasp_sim.film", None)
+    monkeypatch.setitem(sys.modules, "edgegrasp_sim.replay", None)
     result = CliRunner().invoke(main.app, ["replay", "attempt", str(tmp_path)])
     assert result.exit_code == 1
     assert "pip install 'edgegrasp[sim]'" in result.output

@@ -14,13 +14,13 @@ from edgegrasp_cli.planners.paper_candidates import PaperCandidates, clean_cloud
 from edgegrasp_cli.planners.requests import choose, request_options
 from edgegrasp_model.catalogue import WEIGHTS_FOLDER
 from edgegrasp_model.cloud import Cloud
-from edgegrasp_sim.gripper import FINGERTIP
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
+from edgegrasp_sim.trial import PlannedGrasp, RoundDriver
 
 PAPER, ROBOT = load_protocol("edgegrasp").planning, load_protocol("robot").planning
 MEMORY = load_protocol("edgegrasp-memory").planning

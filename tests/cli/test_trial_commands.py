@@ -9,9 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli.main import app
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.checkpoint import load_checkpoint
 from edgegrasp_training.recipes import recipe
 
 
@@ -109,20 +107,6 @@ def test_the_authors_checkpoint_becomes_one_file(shared_dir: Path, tmp_path: Pat
     run("import-checkpoint", shared_dir / "reference" / "vn_edge_grasp", weights)
     _, metadata = load_checkpoint(weights)
     assert metadata.name == metadata.network.architecture == "vn-edgegrasp"
-
-
-def test_weights_in_int8_are_written_beside_the_correlation_of_their_logits(
-    data: Path, tmp_path: Path
-) -> None:
-    weights, output = tmp_path / "small.safetensors", tmp_path / "small-int8.safetensors"
-    metadata = CheckpointMetadata("small", EDGEGRASP_SMALL, 0.0045, "panda")
-    save_checkpoint(weights, build_network(EDGEGRASP_SMALL), metadata)
-    said = run("quantise", weights, data, "--output", output)
-    assert "logits correlate 0.99" in said or "logits correlate 1.00" in said
-    assert load_checkpoint(output)[1].name == "small-int8"
-    assert output.stat().st_size < 0.7 * weights.stat().st_size
-    assert "got 'edgegrasp-int8'" in refused("quantise", output, data)
-    assert "no .npz views" in refused("quantise", weights, tmp_path)
 
 
 def test_wrong_arguments_end_with_a_sentence(data: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
-from edgegrasp_sim.trials import Planner
+from edgegrasp_sim.trial import Planner
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process", "edge-sample", "oracle", "oracle-own")

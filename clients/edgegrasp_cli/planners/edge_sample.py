@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from edgegrasp_cli.planners.paper_candidates import PaperCandidates
-from edgegrasp_sim.gripper import MAX_OPENING
-from edgegrasp_sim.observation import Observation
-from edgegrasp_sim.trials import PlannedGrasp
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import MAX_OPENING
+from edgegrasp_sim.trial import PlannedGrasp
 
 
 @dataclass(frozen=True)

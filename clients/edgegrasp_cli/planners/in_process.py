@@ -14,9 +14,9 @@ from edgegrasp_model.catalogue import ModelCatalogue
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trials import PlannedGrasp
+from edgegrasp_sim.trial import PlannedGrasp
 
 FLIP_STREAM = 7  # random stream of one request
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from edgegrasp_cli.connection import NO_CONNECTION, Connection, connect
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trials import Planner
+from edgegrasp_sim.trial import Planner
 
 CONNECT_SECONDS = 30.0
 SUFFIX = ".safetensors"

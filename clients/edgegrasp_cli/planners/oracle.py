@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_cli.planners.paper_candidates import Float32
-from edgegrasp_sim.grasping import GraspResult
-from edgegrasp_sim.gripper import MAX_OPENING
-from edgegrasp_sim.observation import Observation
-from edgegrasp_sim.trials import PlannedGrasp
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import MAX_OPENING, GraspResult
+from edgegrasp_sim.trial import PlannedGrasp
 
 # From what is seen to poses `T_world_hand` in random order, (E, 4, 4); can be pickled.
 Sampler: TypeAlias = Callable[[Observation, np.random.Generator], Float32]

@@ -13,7 +13,7 @@ from edgegrasp_model.catalogue import ModelCatalogue
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.options import parse_options
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from edgegrasp_model.candidates import edge_grasp_poses, measure_edges
 from edgegrasp_model.cloud import Cloud, Voxels
 from edgegrasp_model.sampling import sample_approach_points
-from edgegrasp_sim.observation import Observation, crop
+from edgegrasp_sim.camera import Observation, crop
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

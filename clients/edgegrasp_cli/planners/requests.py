@@ -6,7 +6,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 
 CHOICE = 64  # grasps to choose from where it is not the best one
