@@ -1,34 +1,26 @@
 """Many rounds of clutter removal, resumable: in this process, in several, or on a Ray cluster."""
 
-from __future__ import annotations
-
 import importlib
 import multiprocessing
 import os
 import platform
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
 from edgegrasp_sim import engine, hand, objects, scene, trial
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PATIENCE, Closes, Planner, Round, run_round
 from edgegrasp_sim.window import Window
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trial import Round
-
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]

@@ -5,25 +5,19 @@ slant; a volume of signed distances, from which the reference system takes its c
 wherever the distance changes its sign between two neighbours of a grid.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.poses import Matrix
 from edgegrasp_sim.scene import SIZE, TABLE_HEIGHT
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from edgegrasp_sim.engine import World
-    from edgegrasp_sim.poses import Matrix
-
-    Float32 = NDArray[np.float32]
-    Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 
 TRUNCATION = 4  # voxels; a point farther from a surface has no signed distance
@@ -67,32 +61,6 @@ class Observation:
     failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
-class Camera:
-    """A depth camera in a world."""
-
-    def __init__(self, world: World, intrinsics: Intrinsics | None = None) -> None:
-        self.world = world
-        self.intrinsics = intrinsics if intrinsics is not None else Intrinsics()
-
-    def render_depth(self, T_world_camera: Matrix) -> NDArray[np.float64]:
-        """Distance along the line of sight for every pixel: (height, width) metres.
-
-        Pixels that show nothing read `far`.
-        """
-        return self.world.render_depth(T_world_camera, self.intrinsics)
-
-    def points(self, depth: NDArray[np.float64], T_world_camera: Matrix) -> NDArray[np.float64]:
-        """The points of a depth image nearer than `far`, world frame: (N, 3) metres."""
-        k = self.intrinsics
-        row, column = np.nonzero(depth < 0.999 * k.far)
-        z = depth[row, column]
-        # The renderer samples a pixel at its lower left corner.
-        x = (column - k.centre_x) * z / k.focal_length
-        y = (row + 1.0 - k.centre_y) * z / k.focal_length
-        in_camera = np.stack((x, y, z), axis=1)
-        return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-
-
 @dataclass(frozen=True, slots=True)
 class ViewRange:
     """Where a camera may stand: ranges of spherical coordinates around `target`.
@@ -109,12 +77,11 @@ class ViewRange:
     azimuth: tuple[float, float]
     target: tuple[float, float, float] = (0.15, 0.15, 0.25)
 
-    def sample(self, rng: np.random.Generator) -> Matrix:
-        """Draw one pose `T_world_camera`, uniform in each coordinate: (4, 4)."""
-        return self.sample_ring(rng, 1)[0]
+    def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
+        """Draw a pose `T_world_camera` (4, 4), and spread others evenly over a full turn from it.
 
-    def sample_ring(self, rng: np.random.Generator, views: int) -> list[Matrix]:
-        """Draw one pose as `sample` does, and spread others evenly over a full turn from it."""
+        The first is uniform in each coordinate.
+        """
         radius = rng.uniform(*self.radius)
         polar = rng.uniform(*self.polar_angle)
         first = rng.uniform(*self.azimuth)
@@ -153,6 +120,19 @@ def look_at(eye: Matrix, target: Matrix) -> Matrix:
     T = np.eye(4)
     T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, np.cross(z, x), z, eye
     return T
+
+
+def points_of(
+    depth: NDArray[np.float64], T_world_camera: Matrix, camera: Intrinsics
+) -> NDArray[np.float64]:
+    """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
+    row, column = np.nonzero(depth < 0.999 * camera.far)
+    z = depth[row, column]
+    # The renderer samples a pixel at its lower left corner.
+    x = (column - camera.centre_x) * z / camera.focal_length
+    y = (row + 1.0 - camera.centre_y) * z / camera.focal_length
+    in_camera = np.stack((x, y, z), axis=1)
+    return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
 @dataclass(frozen=True, slots=True)

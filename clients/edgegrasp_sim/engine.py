@@ -3,24 +3,17 @@
 PyBullet is named in this file alone.
 """
 
-from __future__ import annotations
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import pybullet
 import pybullet_data
+from numpy.typing import NDArray
 
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
 
 TIME_STEP = 1.0 / 80.0  # seconds
 SOLVER_ITERATIONS = 100
@@ -76,12 +69,7 @@ class World:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -132,7 +120,7 @@ class World:
 
     def load_urdf(
         self, path: Path, position: Sequence[float], quaternion_xyzw: Sequence[float], scale: float
-    ) -> Body:
+    ) -> "Body":
         """Load a body from a URDF file.
 
         Raises:
@@ -153,7 +141,7 @@ class World:
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         return Body(self.client, uid)
 
-    def add_box(self, size: Sequence[float], centre: Sequence[float], *, friction: float) -> Body:
+    def add_box(self, size: Sequence[float], centre: Sequence[float], *, friction: float) -> "Body":
         """Add an axis-aligned box that never moves; `size` is its full extent in metres."""
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX,
@@ -175,7 +163,7 @@ class World:
         finger_mass: float,
         finger_base: float,
         position: Sequence[float],
-    ) -> Body:
+    ) -> "Body":
         """Add a hand whose two fingers, its links 0 and 1, slide apart along y.
 
         Args:
@@ -344,7 +332,7 @@ class Body:
         points = pybullet.getContactPoints(self.uid, physicsClientId=self.client)
         return [Contact(other_uid=point[2], distance=point[8]) for point in points]
 
-    def joint(self, index: int) -> Joint:
+    def joint(self, index: int) -> "Joint":
         """The joint that carries link `index`."""
         return Joint(self, index)
 

@@ -1,25 +1,17 @@
 """Experiments: benchmarks that differ in one thing each, and their table and figure."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path, PurePath
+from typing import Any, TypeAlias
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from edgegrasp_sim.objects import FAMILIES, SceneKind, write_family
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import planner_title
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
-
-    from matplotlib.figure import Figure
-
 
 NOISE_MILLIMETRES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 VOXEL_MILLIMETRES = (3.0, 4.0, 5.0, 6.0, 8.0)

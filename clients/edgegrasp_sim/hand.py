@@ -1,22 +1,14 @@
 """A floating Panda hand, and a grasp with it: approach, close, retreat, and the outcome."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgegrasp_sim.engine import ASSETS, TIME_STEP, WorldAnchor, couple_joints
+from edgegrasp_sim.engine import ASSETS, TIME_STEP, World, WorldAnchor, couple_joints
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from edgegrasp_sim.engine import World
-    from edgegrasp_sim.scene import SceneObject
-
+from edgegrasp_sim.scene import SceneObject
 
 MESHES = ASSETS / "franka_panda" / "meshes" / "collision"
 MAX_OPENING = 0.08  # metres between the fingers
@@ -107,7 +99,7 @@ class GraspResult:
 
 
 def run_grasp(
-    gripper: Gripper,
+    gripper: "Gripper",
     T_world_hand: Matrix,
     objects: Mapping[int, SceneObject],
     *,

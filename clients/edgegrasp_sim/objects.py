@@ -3,8 +3,6 @@
 A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
@@ -12,22 +10,18 @@ import logging
 import os
 import shutil
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edgegrasp_sim.engine import ASSETS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
 
 OBJECT_MASS = 0.5  # kg
 OBJECT_FRICTION = 1.0
@@ -65,7 +59,7 @@ class ObjectModel:
     name: str
     urdf: Path
     scale: float = 1.0
-    origin: ObjectModel | None = None
+    origin: "ObjectModel | None" = None
 
     @property
     def files(self) -> list[Path]:
@@ -112,7 +106,7 @@ class ObjectSet:
         return self.models[int(rng.integers(len(self.models)))]
 
     @classmethod
-    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> ObjectSet:
+    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name.
 
         These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), or in `root` itself
@@ -145,7 +139,7 @@ class ObjectSet:
         return cls(name, tuple(models))
 
     @classmethod
-    def builtin(cls, scene: SceneKind) -> ObjectSet:
+    def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that ship with the engine, scaled to the hand."""
         models = tuple(
             ObjectModel(name, ASSETS / file, scale)

@@ -1,18 +1,14 @@
 """A picture of a cloud and the grasps found in it, as a person would want to see them."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
+Points = NDArray[np.float64]
 
-    from numpy.typing import ArrayLike, NDArray
-
-    Points = NDArray[np.float64]
 
 PALM_Z = 0.0658  # metres along the hand's z: the palm's surface
 TIP_Z = 0.1122  # metres along the hand's z: the fingertips

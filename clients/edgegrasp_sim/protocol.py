@@ -3,21 +3,16 @@
 A protocol is a named and versioned file in `protocols/`; its constants go into every result.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from edgegrasp_sim import scene
 from edgegrasp_sim.camera import DepthNoise, TableView, ViewRange
-
-if TYPE_CHECKING:
-    from edgegrasp_sim.objects import SceneKind
-
+from edgegrasp_sim.objects import SceneKind
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)

@@ -1,23 +1,15 @@
 """Repeat any attempt that a benchmark recorded, in the scene and view it was made in."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Self
 
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import protocol_from
+from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import PlannedGrasp, RoundDriver
+from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 from edgegrasp_sim.window import Window
-
-if TYPE_CHECKING:
-    from types import TracebackType
-    from typing import Self
-
-    from edgegrasp_sim.camera import Observation
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trial import Attempt, Round
 
 
 class Replay:
@@ -59,12 +51,7 @@ class Replay:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.simulation.close()
 
     def find(self, seed: int, index: int, attempt: int = 0) -> Round:

@@ -1,33 +1,25 @@
 """The report of a benchmark: one HTML file with tables, plots and pictures."""
 
-from __future__ import annotations
-
 import base64
 import tempfile
 import tomllib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.replay import Replay
-from edgegrasp_sim.results import planner_title
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trial import Attempt, Round
-
+from edgegrasp_sim.results import ResultFolder, planner_title
+from edgegrasp_sim.trial import Attempt, Round
 
 PICTURES = 6
 PICTURE_WIDTH = 1250  # pixels

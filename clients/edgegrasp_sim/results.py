@@ -1,27 +1,21 @@
 """The results of a benchmark: its folder, figures with intervals, comparison and gate."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json
 import os
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import fmean, median, stdev
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.trial import Attempt, Round, RoundEnd
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike
-
 
 CSV_COLUMNS = (
     "seed",
@@ -133,7 +127,7 @@ class Counts:
     objects: int
 
     @classmethod
-    def of(cls, rounds: Iterable[Round]) -> Counts:
+    def of(cls, rounds: Iterable[Round]) -> "Counts":
         """Count over rounds."""
         rounds = tuple(rounds)
         return cls(

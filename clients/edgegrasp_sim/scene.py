@@ -1,22 +1,14 @@
 """Making packed and pile scenes, and bringing them to rest."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_sim.engine import TIME_STEP
-from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS
+from edgegrasp_sim.engine import TIME_STEP, Body, World
+from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
 from edgegrasp_sim.poses import yaw_quaternion_xyzw
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from edgegrasp_sim.engine import Body, World
-    from edgegrasp_sim.objects import ObjectModel, ObjectSet
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres

@@ -3,27 +3,20 @@
 A planner is any callable; what runs behind it is up to the caller.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.hand import FailureCause, GraspOutcome
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from edgegrasp_sim.hand import GraspResult
-    from edgegrasp_sim.objects import SceneKind
-    from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
-    from edgegrasp_sim.simulation import ClutterSimulation
-
+from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
+from edgegrasp_sim.simulation import ClutterSimulation
 
 MIN_POINTS = 100
 FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # seconds between tries of a planner that is unavailable

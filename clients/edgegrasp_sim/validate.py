@@ -3,8 +3,6 @@
 python -m edgegrasp_sim.validate --shared ../shared
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

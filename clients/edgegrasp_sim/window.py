@@ -1,18 +1,12 @@
 """The simulator's window, for a person who watches a round or drives it."""
 
-from __future__ import annotations
-
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edgegrasp_sim.engine import TIME_STEP
+from edgegrasp_sim.engine import TIME_STEP, World
 from edgegrasp_sim.picture import fork
-
-if TYPE_CHECKING:
-    from edgegrasp_sim.engine import World
-    from edgegrasp_sim.trial import PlannedGrasp
+from edgegrasp_sim.trial import PlannedGrasp
 
 TARGET = (0.15, 0.15, 0.12)  # metres, what the window's camera looks at
 DISTANCE, YAW, PITCH = 0.38, 30.0, -30.0  # metres and degrees
