@@ -141,9 +141,14 @@ class ObjectSet:
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that ship with the engine, scaled to the hand."""
+        known = list(_BUILTIN)
+        for blobs, stands in ((_STANDING_BLOBS, True), (_OTHER_BLOBS, False)):
+            for number, scale in blobs.items():
+                file = f"random_urdfs/{number:03d}/{number:03d}.urdf"
+                known.append((f"blob_{number:03d}", file, scale, stands))
         models = tuple(
             ObjectModel(name, ASSETS / file, scale)
-            for name, file, scale, stands in _BUILTIN
+            for name, file, scale, stands in known
             if stands or scene is SceneKind.PILE
         )
         return cls(f"builtin/{scene}", models)
@@ -273,11 +278,6 @@ class Prism:
         return as_obj([(corners, np.array(faces))])
 
 
-def _blob(number: int, scale: float, *, stands: bool) -> tuple[str, str, float, bool]:
-    name = f"{number:03d}"
-    return f"blob_{name}", f"random_urdfs/{name}/{name}.urdf", scale, stands
-
-
 # Name, file among the engine's assets, scale, and whether it stands upright in a packed scene.
 _BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
     ("cube", "cube_small.urdf", 1.2, True),
@@ -288,73 +288,38 @@ _BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
     ("block", "block.urdf", 1.5, False),
     ("duck", "duck_vhacd.urdf", 1.0, False),
     ("teddy", "teddy_vhacd.urdf", 1.0, False),
-    _blob(3, 1.0, stands=True),
-    _blob(8, 0.8, stands=True),
-    _blob(21, 1.0, stands=True),
-    _blob(36, 1.1, stands=True),
-    _blob(41, 0.8, stands=True),
-    _blob(45, 1.0, stands=True),
-    _blob(51, 1.0, stands=True),
-    _blob(61, 1.0, stands=True),
-    _blob(0, 0.75, stands=False),
-    _blob(2, 0.75, stands=False),
-    _blob(9, 1.2, stands=False),
-    _blob(14, 1.1, stands=False),
-    _blob(16, 0.8, stands=False),
-    _blob(39, 0.75, stands=False),
-    _blob(59, 0.8, stands=False),
-    _blob(66, 0.8, stands=False),
 )
+# Scales of objects of random shape, by number: those that stand upright, and others.
+_STANDING_BLOBS = {3: 1.0, 8: 0.8, 21: 1.0, 36: 1.1, 41: 0.8, 45: 1.0, 51: 1.0, 61: 1.0}
+_OTHER_BLOBS = {0: 0.75, 2: 0.75, 9: 1.2, 14: 1.1, 16: 0.8, 39: 0.75, 59: 0.8, 66: 0.8}
 
 
-def _box(x: float, y: float, z: float) -> Prism:
-    return Prism(4, (x, y, z))
+def _boxes(*sizes: Size) -> tuple[Prism, ...]:
+    return tuple(Prism(4, size) for size in sizes)
 
 
-def _can(diameter: float, height: float) -> Prism:
-    return Prism(10, (diameter, diameter, height))
+def _cans(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
+    """Upright prisms of a diameter and a height."""
+    return tuple(Prism(10, (diameter, diameter, height)) for diameter, height in sizes)
 
 
-def _rod(diameter: float, length: float) -> Prism:
-    return Prism(6, (length, diameter, diameter), axis=0)
+def _rods(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
+    """Lying prisms of a diameter and a length."""
+    return tuple(Prism(6, (length, diameter, diameter), axis=0) for diameter, length in sizes)
 
 
 # Families that common object sets hardly hold, and a regular one. Sizes in metres as they come into
-# a scene, upright as they stand in a packed one. Thin: at most
-# 14 mm across, lying. Flat: 8 to 14 mm high. Large: 60 to 70 mm in a hand that opens 80 mm.
+# a scene, upright as they stand in a packed one. Thin: at most 14 mm across, lying. Flat: 8 to
+# 14 mm high. Large: 60 to 70 mm in a hand that opens 80 mm.
 FAMILIES: dict[str, tuple[Prism, ...]] = {
-    "regular": (
-        _box(0.03, 0.03, 0.08),
-        _box(0.04, 0.04, 0.04),
-        _box(0.03, 0.05, 0.07),
-        _can(0.03, 0.08),
-        _can(0.04, 0.06),
-        _can(0.05, 0.05),
-    ),
-    "thin": (
-        _box(0.09, 0.008, 0.008),
-        _box(0.12, 0.012, 0.012),
-        _box(0.10, 0.014, 0.010),
-        _rod(0.008, 0.09),
-        _rod(0.010, 0.12),
-        _rod(0.014, 0.10),
-    ),
-    "flat": (
-        _box(0.05, 0.07, 0.008),
-        _box(0.06, 0.06, 0.011),
-        _box(0.05, 0.10, 0.014),
-        _can(0.06, 0.008),
-        _can(0.06, 0.011),
-        _can(0.07, 0.014),
-    ),
-    "large": (
-        _box(0.065, 0.065, 0.10),
-        _box(0.06, 0.09, 0.12),
-        _box(0.07, 0.07, 0.07),
-        _can(0.06, 0.12),
-        _can(0.065, 0.10),
-        _can(0.07, 0.08),
-    ),
+    "regular": _boxes((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07))
+    + _cans((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
+    "thin": _boxes((0.09, 0.008, 0.008), (0.12, 0.012, 0.012), (0.10, 0.014, 0.010))
+    + _rods((0.008, 0.09), (0.010, 0.12), (0.014, 0.10)),
+    "flat": _boxes((0.05, 0.07, 0.008), (0.06, 0.06, 0.011), (0.05, 0.10, 0.014))
+    + _cans((0.06, 0.008), (0.06, 0.011), (0.07, 0.014)),
+    "large": _boxes((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07))
+    + _cans((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
 }
 
 

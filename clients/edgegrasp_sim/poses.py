@@ -5,7 +5,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Matrix: TypeAlias = "NDArray[np.float64]"
+Matrix: TypeAlias = NDArray[np.float64]
 
 
 def quaternion_xyzw(T: Matrix) -> list[float]:
