@@ -1,9 +1,7 @@
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +17,6 @@ from edgegrasp_sim.results import (
     wilson,
 )
 from edgegrasp_sim.trial import Attempt, Round, RoundEnd
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 HELD = Attempt(
     GraspOutcome.SUCCESS, None, "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25,
