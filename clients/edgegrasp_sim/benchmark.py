@@ -205,14 +205,35 @@ def available_cores() -> int:
 
 
 class RoundRunner:
-    """A simulation with a planner, for one process."""
+    """A simulation with a planner, for one process.
+
+    Args:
+        config: what to run.
+        make_planner: called once.
+        gui: show the simulator's window.
+        digest: that the objects must have, if they are read on another machine.
+
+    Raises:
+        ValueError: the objects have another digest.
+    """
 
     def __init__(
-        self, config: BenchmarkConfig, make_planner: PlannerFactory, gui: bool = False
+        self,
+        config: BenchmarkConfig,
+        make_planner: PlannerFactory,
+        *,
+        gui: bool = False,
+        digest: str | None = None,
     ) -> None:
+        objects = config.object_set()
+        if digest not in (None, objects.digest):
+            raise ValueError(
+                f"the objects in {config.objects} differ between the machines of the cluster; put "
+                "the same folder at the same path on each"
+            )
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
+        self.simulation = ClutterSimulation({config.scene: objects}, gui=gui)
         self.window = Window(self.simulation.world) if gui else None
 
     def run(self, task: Task) -> Round:
@@ -242,7 +263,7 @@ def _run_here(
 ) -> Iterator[Round]:
     if not tasks:
         return
-    runner = RoundRunner(config, make_planner, gui)
+    runner = RoundRunner(config, make_planner, gui=gui)
     try:
         yield from map(runner.run, tasks)
     finally:
@@ -350,9 +371,9 @@ def _run_on_ray(
         workers = max(1, min(workers, int(ray.cluster_resources().get("CPU", 1))))
         actor: Any = ray.remote(
             num_cpus=1, max_restarts=MAX_CRASHES * len(tasks), max_task_retries=MAX_CRASHES
-        )(RayRunner)
+        )(RoundRunner)
         digest = config.object_set().digest
-        idle = [actor.remote(config, make_planner, digest) for _ in range(workers)]
+        idle = [actor.remote(config, make_planner, digest=digest) for _ in range(workers)]
         waiting = list(reversed(tasks))
         running: dict[Any, Any] = {}
         while waiting or running:
@@ -364,22 +385,6 @@ def _run_on_ray(
             yield _ray_result(ray, done)
     finally:
         ray.shutdown()
-
-
-class RayRunner(RoundRunner):
-    """A simulation with a planner, for one Ray actor.
-
-    Raises:
-        ValueError: the objects on its machine are not those of the benchmark.
-    """
-
-    def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory, digest: str) -> None:
-        if config.object_set().digest != digest:
-            raise ValueError(
-                f"the objects in {config.objects} differ between the machines of the cluster; put "
-                "the same folder at the same path on each"
-            )
-        super().__init__(config, make_planner)
 
 
 def _connect_ray(ray: Any, address: str, workers: int) -> None:

@@ -197,7 +197,7 @@ def resample_surfaces(
     for axis in range(3):
         here = np.moveaxis(distance, axis, 0)[:-1]
         there = np.moveaxis(distance, axis, 0)[1:]
-        # NaN, the distance of what no surface is near to, compares as false.
+        # NaN, the distance far from any surface, compares as false.
         crossed = np.moveaxis(here * there < 0, 0, axis)
         cell = np.nonzero(crossed)
         start = distance[cell]

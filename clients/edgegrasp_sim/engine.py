@@ -49,7 +49,7 @@ class Contact:
 
 
 class World:
-    """One physics server; every call names it, so that several can live in one process.
+    """One physics server; a process may have several.
 
     Args:
         gui: open PyBullet's window instead of running without a display.

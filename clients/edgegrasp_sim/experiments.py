@@ -177,7 +177,7 @@ def experiment_table(results: dict[str, Any]) -> str:
     for group in _unique(case["group"] for case in results["cases"]):
         cases = [case for case in results["cases"] if case["group"] == group]
         columns = _unique((c["scene"], planner_title(c["planner"])) for c in cases)
-        if group == "planner":  # the planner is what the rows name
+        if group == "planner":  # the rows name the planner
             columns = _unique((c["scene"], "") for c in cases)
         heads = [f"{scene}, {model}" if model else scene for scene, model in columns]
         lines = [

@@ -117,7 +117,7 @@ class DrawnAttempt:
 
 
 def attempt_title(done: Round, number: int) -> str:
-    """One line that says what an attempt was and what came of it."""
+    """One line about an attempt and its outcome."""
     attempt = done.attempts[number]
     outcome = f"{attempt.object} removed" if attempt.success else str(attempt.cause)
     target = attempt.target or "nothing between the fingers"
@@ -180,25 +180,14 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int) 
 
 
 def _key_figures(summary: dict[str, Any]) -> str:
-    gsr, dr, times = (
-        summary["grasp_success_rate"],
-        summary["declutter_rate"],
-        summary["planning_seconds"],
-    )
+    gsr, dr = summary["grasp_success_rate"]["value"], summary["declutter_rate"]["value"]
+    held, times = summary["successes"], summary["planning_seconds"]
+    waited = summary["planner_waited_seconds"]
     boxes = [
-        (
-            f"{_percent(gsr['value'])} %",
-            f"GSR: {summary['successes']} of {summary['attempts']} grasps held",
-        ),
-        (
-            f"{_percent(dr['value'])} %",
-            f"DR: {summary['successes']} of {summary['objects']} objects removed",
-        ),
+        (f"{_percent(gsr)} %", f"GSR: {held} of {summary['attempts']} grasps held"),
+        (f"{_percent(dr)} %", f"DR: {held} of {summary['objects']} objects removed"),
         (f"{times['median']:.2f} s" if times else "-", "planning, median"),
-        (
-            str(summary["planner_retries"]),
-            f"times asked again; {summary['planner_waited_seconds']:.1f} s waited",
-        ),
+        (str(summary["planner_retries"]), f"times asked again; {waited:.1f} s waited"),
     ]
     inner = "".join(f"<div><b>{escape(b)}</b><span>{escape(t)}</span></div>" for b, t in boxes)
     return f"<div class=key>{inner}</div>"
@@ -224,11 +213,8 @@ def _seed_table(summary: dict[str, Any]) -> str:
         (seed, _percent(gsr["by_seed"][seed]), _percent(dr["by_seed"][seed]))
         for seed in gsr["by_seed"]
     ]
-    return _table(
-        ("seed", "GSR %", "DR %"),
-        [*rows, ("mean ± standard deviation", _spread(gsr), _spread(dr))],
-        2,
-    )
+    rows.append(("mean ± standard deviation", _spread(gsr), _spread(dr)))
+    return _table(("seed", "GSR %", "DR %"), rows, 2)
 
 
 def _failure_table(summary: dict[str, Any]) -> str:

@@ -117,7 +117,7 @@ class ClutterSimulation:
 
     @property
     def object_models(self) -> list[ObjectModel]:
-        """What the objects that are left were made from."""
+        """Models of the objects that are left."""
         return [item.model for item in self._objects]
 
     @property

@@ -106,7 +106,7 @@ class Packed(NamedTuple):
 def tried_grasps(
     view: LabelledView, config: NetworkConfig, gripper: Gripper, *, viewpoint_known: bool = True
 ) -> TriedGrasps:
-    """Build the tried candidates of a view, with the hand network's inputs if it is one.
+    """Build the tried candidates of a view, with the inputs of a hand network.
 
     Args:
         view: The view.

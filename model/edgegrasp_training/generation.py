@@ -68,21 +68,6 @@ class Query(NamedTuple):
     request: DetectOptions
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What to try in a view.
-
-    Attributes:
-        grasps: How many at most.
-        weights: Of the network that guides the choice; None: a random choice.
-        hard: Whether the scene is known to be hard, even where the best grasp is sure.
-    """
-
-    grasps: int
-    weights: Path | None
-    hard: bool
-
-
 def generate(
     folder: Path, objects: Path | None, options: GenerationOptions, workers: int = 1
 ) -> Iterator[tuple[int, int, int]]:
@@ -250,13 +235,12 @@ def _views(
     streams: list[np.random.Generator],
 ) -> Iterator[LabelledView]:
     """Labelled views of the scene that stands in the simulation, the hard one first."""
-    choice = Choice(options.grasps_per_view, options.weights, hard is not None)
     models = [model.origin or model for model in simulation.object_models]
     names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
     for number in range(options.views_per_scene):
         query = hard if hard and number == 0 else _ask(simulation, options, streams)
         yield replace(
-            label(simulation, query, choice, streams[CHOICE_STREAM]),
+            label(simulation, query, options, streams[CHOICE_STREAM], hard=hard is not None),
             objects=names,
             object_digests=digests,
         )
@@ -265,21 +249,24 @@ def _views(
 def label(
     simulation: ClutterSimulation,
     query: Query,
-    choice: Choice,
+    options: GenerationOptions,
     rng: np.random.Generator,
+    *,
+    hard: bool,
 ) -> LabelledView:
     """Sample candidates as the detector does and try some of them.
 
     Args:
         simulation: Holds the scene.
         query: A view of it and the request.
-        choice: What to try.
+        options: How many to try, and the weights that guide the choice.
         rng: Chooses among the candidates.
+        hard: Whether the scene is known to be hard, even where the best grasp is sure.
     """
     observation, request = query
     if len(observation.cloud) == 0:
         return _empty(observation)
-    guide = None if choice.weights is None else detector(choice.weights)
+    guide = None if options.weights is None else detector(options.weights)
     if guide is None:
         scene, sample, score = *_sampled(observation, request), None
     else:
@@ -288,7 +275,7 @@ def label(
         score = None if prepared.batch is None else guide.run(prepared.batch)
     if scene is None or sample is None:
         return _empty(observation)
-    candidates = sample.candidates.take(_chosen(sample, score, choice, rng))
+    candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     return LabelledView(
@@ -322,22 +309,23 @@ def _sampled(
 def _chosen(
     sample: Sample,
     logit: NDArray[np.floating] | None,
-    choice: Choice,
+    total: int,
     rng: np.random.Generator,
+    hard: bool,
 ) -> NDArray[np.int64]:
-    """Ascending rows of the candidates to try.
+    """Ascending rows of the candidates to try, `total` at most.
 
     Some that a network would execute, as many whose outcome it leaves open, and the rest at
-    random: mostly hands that are free of collision. Fewer where the best one is sure to hold,
-    unless the scene is known to be hard.
+    random, mostly free of collision. Fewer where the best one is sure to hold, unless the scene is
+    known to be hard.
     """
     left = np.ones(len(sample.candidates), dtype=bool)
-    total, guided = choice.grasps, 0
+    guided = 0
     if logit is not None:
         score = 1.0 / (1.0 + np.exp(-logit))
         free = np.flatnonzero(sample.collision_free)
         ranked = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
-        if not choice.hard and len(ranked) > 0 and score[ranked[0]] >= SURE:
+        if not hard and len(ranked) > 0 and score[ranked[0]] >= SURE:
             total = round(EASY_SHARE * total)
         each = round(GUIDED_SHARE * total / 2)
         first, others = ranked[: each // 2], ranked[each // 2 :]

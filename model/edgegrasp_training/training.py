@@ -56,7 +56,7 @@ class TrainingOptions:
     patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
-    averaging: float = 0.998  # share of the old weights in the running mean, which is what is kept
+    averaging: float = 0.998  # share of the old weights in the running mean that is kept
     unknown: float = 0.1  # share of training views without their table, and without their camera
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate

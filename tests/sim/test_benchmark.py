@@ -12,7 +12,7 @@ import pytest
 
 from edgegrasp_sim.benchmark import (
     BenchmarkConfig,
-    RayRunner,
+    RoundRunner,
     available_cores,
     manifest,
     run_benchmark,
@@ -185,7 +185,7 @@ def test_a_missing_ray_or_cluster_is_named(
 ) -> None:
     config, _ = alone
     with pytest.raises(ValueError, match="differ between the machines"):
-        RayRunner(config, make_planner, "another digest")
+        RoundRunner(config, make_planner, digest="another digest")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(RuntimeError, match=r"ray is not .*edgegrasp\[ray\]"):
         run_benchmark(config, make_planner, ray="local")
