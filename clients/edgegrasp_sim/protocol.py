@@ -97,32 +97,14 @@ class CameraRules:
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseRules:
-    """Noise of the depth image and of the points made from it; see `DepthNoise`.
+class NoiseRules(DepthNoise):
+    """Noise of the depth image, see `DepthNoise`, and of the points made from it.
 
     Attributes:
         point_std: standard deviation of each coordinate of each point, metres.
-        gamma_shape: of one factor per image; 0: no factor.
-        gamma_scale: of the same.
-        correlated_std: of smooth Gaussian noise on the image, metres.
-        correlated_pixels: between its independent values.
-        correlated_share: of the images.
     """
 
     point_std: float
-    gamma_shape: float
-    gamma_scale: float
-    correlated_std: float
-    correlated_pixels: int
-    correlated_share: float
-
-    def depth_noise(self) -> DepthNoise | None:
-        """The noise of the images; None where they have none."""
-        if self.gamma_shape == 0 and self.correlated_std == 0:
-            return None
-        values = asdict(self)
-        del values["point_std"]
-        return DepthNoise(**values)
 
 
 @dataclass(frozen=True, slots=True)

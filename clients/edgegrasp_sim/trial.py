@@ -231,7 +231,7 @@ class RoundDriver:
             views=rules.camera.view_range(),
             num_views=rules.camera.views,
             noise_std=rules.noise.point_std,
-            depth_noise=rules.noise.depth_noise(),
+            depth_noise=rules.noise,
             table=rules.planning.table,
             surface_voxel=rules.camera.surface_voxel,
         )

@@ -42,6 +42,9 @@ VIEWS_IN_MEMORY = 8000
 Schedule = Literal["plateau", "cosine"]  # halve on a plateau, or fall to 0 at the last step
 DROPOUT_STREAM = 1  # random stream of a step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
+# Attributes of a trainer that its state file keeps.
+COUNTERS = ("step", "best_loss", "since_best", "halved", "seconds")
+STATEFUL = ("network", "average", "optimizer")
 
 
 @dataclass(frozen=True)
@@ -316,16 +319,8 @@ class Trainer:
             writer.writerow(row)
 
     def _save_state(self) -> None:
-        state = {
-            "step": self.step,
-            "best_loss": self.best_loss,
-            "since_best": self.since_best,
-            "halved": self.halved,
-            "seconds": self.seconds,
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-        }
+        state = {name: getattr(self, name) for name in COUNTERS}
+        state |= {name: getattr(self, name).state_dict() for name in STATEFUL}
         partial = self.folder / (STATE_FILE + ".partial")
         torch.save(state, partial)
         partial.replace(self.folder / STATE_FILE)
@@ -334,9 +329,7 @@ class Trainer:
         state: dict[str, Any] = torch.load(
             self.folder / STATE_FILE, weights_only=True, map_location=self.device
         )
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.best_loss = state["step"], state["best_loss"]
-        self.since_best, self.halved = state["since_best"], state["halved"]
-        self.seconds = state["seconds"]
+        for name in STATEFUL:
+            getattr(self, name).load_state_dict(state[name])
+        for name in COUNTERS:
+            setattr(self, name, state[name])
