@@ -16,6 +16,7 @@ FINGERTIP = 0.1122  # metres ahead of the link
 # The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
 T_HAND_HANDCOM = translation(0.0, 0.0, 0.04)
 T_HANDCOM_HAND = translation(0.0, 0.0, -0.04)
+
 HAND_MASS = 0.5  # kg
 HAND_FRICTION = 1.0
 FINGER_MASS = 0.1  # kg
@@ -30,14 +31,17 @@ GEAR_ERP = 0.1
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
 COLLISION_DEPTH = 0.001  # metres; a finger sliding along an object overlaps it by less
+
 # Far above the table and out of the cameras' sight.
 _PARKED = translation(0.15, 0.15, 5.0)
+
 PREGRASP_DISTANCE = 0.05  # metres back along the approach
 RETREAT_DISTANCE = 0.10  # metres
 SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand lifts straight up
 # The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
 STEP_LENGTH = 0.002  # metres in each time step
 MIN_OPENING = 0.1 * MAX_OPENING  # below it, the hand holds nothing
+
 # When a grasp that need not be run to its end has a clear outcome.
 STILL = 5e-5  # metres that fingers at rest still close in a time step
 STILL_STEPS = 5
@@ -173,8 +177,8 @@ def retreat_pose(T_world_hand: Matrix) -> Matrix:
 class Gripper:
     """The simulated hand; its link frame is `panda_hand` (z out of the palm, y closes).
 
-    The shapes are the convex hulls of the Panda's meshes: palm at z = 0.0658,
-    fingertips at z = 0.1122, hand within x ± 0.0316 and y ± 0.104.
+    The shapes are the convex hulls of the Panda's meshes: palm at z = 0.0658, fingertips at
+    z = 0.1122, hand within x ± 0.0316 and y ± 0.104, in metres.
     """
 
     def __init__(self, world: World) -> None:

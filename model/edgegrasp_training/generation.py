@@ -37,6 +37,7 @@ HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding netw
 HARD_TRIES = 3  # scenes looked through for a hard one
 OTHER_NOISE = 0.3  # share of the views with another noise than the benchmark's
 MAX_NOISE = 0.003  # metres
+
 BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
 UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
 SURE = 0.99  # score of the best grasp from which on a view teaches little

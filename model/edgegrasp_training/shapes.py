@@ -16,16 +16,18 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, write_object
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.6  # of a scene's objects that are computed
-ROUND_SHARE = 0.5  # of the objects, stretched by one factor along x and y: round ones stay round
+SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
 NUM_VARIED = 16  # objects that a scene is drawn from
 HOLLOW_SHARE = 0.25  # of the computed objects; the others are drawn at random
+
 NUM_FREE, NUM_PLAIN = 320, 160
 NUM_DRAWN = NUM_FREE + NUM_PLAIN  # different shapes, before a scene stretches them
-ROUND, FINE = 20, 32  # corners of a round ring
+CIRCLE, FINE_CIRCLE = 20, 32  # corners of a ring that stands for a circle
 LONGEST = 0.045, 0.12  # metres, range of the greatest extent
 THINNEST = 0.009  # metres, least extent
 PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
-SEGMENTS = 24  # around the axis
+
+SEGMENTS = 24  # of a surface of revolution, around its axis
 AXIS = 1e-4  # metres; profiles keep off the axis, where triangles would have no area
 Rings = NDArray[np.float64]  # (R, S, 3) corners of each ring along a part, any unit
 Profile = NDArray[np.float64]  # (P, 2) radius and height, metres; closed, counter-clockwise
@@ -47,7 +49,7 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
         made = rng.random() < MADE_SHARE
         model = any_made_object(folder / "made", rng) if made else objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
-        if rng.random() < ROUND_SHARE:
+        if rng.random() < SYMMETRIC_SHARE:
             factors[1] = factors[0]
         drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
     return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))
@@ -156,7 +158,7 @@ def _surface(rings: Rings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 def _plain(rng: np.random.Generator) -> Rings:
     """A box, a prism or a can in metres, as on a shelf."""
-    corners = int(rng.choice([4, 4, 6, FINE, FINE, FINE]))
+    corners = int(rng.choice([4, 4, 6, FINE_CIRCLE, FINE_CIRCLE, FINE_CIRCLE]))
     width, depth = rng.uniform(*PLAIN_WIDTH, size=2)
     half_height = rng.uniform(*PLAIN_HEIGHT) / 2.0
     ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
@@ -183,9 +185,9 @@ def _bodies(rng: np.random.Generator) -> list[Rings]:
 
 def _body(rng: np.random.Generator) -> Rings:
     """A box, a prism, a cylinder, a frustum or an ellipsoid within two units."""
-    corners = int(rng.choice([4, 4, 6, ROUND, ROUND]))
+    corners = int(rng.choice([4, 4, 6, CIRCLE, CIRCLE]))
     ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
-    if corners == ROUND and rng.random() < 0.3:
+    if corners == CIRCLE and rng.random() < 0.3:
         angle = np.linspace(-0.49 * np.pi, 0.49 * np.pi, 9)
         return _straight(ring, list(np.cos(angle)), list(np.sin(angle)))
     taper = rng.uniform(0.4, 1.0) if rng.random() < 0.3 else 1.0
@@ -198,7 +200,7 @@ def _bottle(rng: np.random.Generator) -> list[Rings]:
     widths = np.clip(0.5 + np.cumsum(rng.normal(0.0, 0.22, rows)), 0.15, 1.1)
     heights = np.sort(rng.uniform(-1.0, 1.0, rows)) * rng.uniform(0.6, 2.0)
     heights += 0.05 * np.arange(rows)  # no two at one height
-    ring = _ring(int(rng.choice([4, 8, ROUND, ROUND]))) * (1.0, rng.uniform(0.5, 1.0), 1.0)
+    ring = _ring(int(rng.choice([4, 8, CIRCLE, CIRCLE]))) * (1.0, rng.uniform(0.5, 1.0), 1.0)
     return [_straight(ring, list(widths), list(heights))]
 
 
@@ -234,7 +236,7 @@ def _hoop(rng: np.random.Generator) -> list[Rings]:
 
 def _pot(rng: np.random.Generator) -> list[Rings]:
     """Walls and a floor: cups, bowls, boxes without a lid."""
-    corners = int(rng.choice([4, 6, ROUND, ROUND]))
+    corners = int(rng.choice([4, 6, CIRCLE, CIRCLE]))
     bottom, wall, floor = rng.uniform(0.5, 1.1), rng.uniform(0.06, 0.3), rng.uniform(0.08, 0.5)
     ring = _ring(corners) * (1.0, rng.uniform(0.5, 1.0), 1.0)
     height = rng.uniform(0.5, 2.5)
