@@ -28,33 +28,17 @@ def test_robustness_changes_one_thing_at_a_time(tmp_path: Path) -> None:
     groups: dict[str, list[Case]] = {}
     for case in cases("robustness", tmp_path):
         groups.setdefault(case.group, []).append(case)
-    noise = [case.protocol.noise.point_std for case in groups["noise (mm)"]]
-    assert (min(noise), max(noise)) == (0.0, 0.003)
-    angles = groups["camera's polar angle (degrees)"]
-    polar = {case.protocol.camera.polar_degrees for case in angles}
-    assert {(15.0, 15.0), (75.0, 75.0)} <= polar
-    assert {c.planner["voxel_size"] for c in groups["voxel size (mm)"]} >= {0.003, 0.004, 0.006}
-    flipped = [case.planner["flipped_normals"] for case in groups["normals flipped (%)"]]
-    assert (min(flipped), max(flipped)) == (0.0, 0.5)
     giga = load_protocol("giga")
     plain, moved, full = (case.protocol for case in groups["view"][:3])
     assert (plain, full) == (PAPER, giga)
     assert (moved.camera, moved.noise) == (giga.camera, PAPER.noise)
-    for case in (*groups["noise (mm)"], *angles):
+    for case in (*groups["noise (mm)"], *groups["camera's polar angle (degrees)"]):
         rules = case.protocol
         changed = [part for part in ("scene", "round", "camera", "noise", "planning")
                    if getattr(rules, part) != getattr(PAPER, part)]  # fmt: skip
         assert len(changed) <= 1
         assert rules.name != PAPER.name  # not to be taken for the paper's
         assert set(case.planner) == {"model"}
-
-
-def test_samples_are_those_of_the_paper_s_table(tmp_path: Path) -> None:
-    numbers = {
-        case.value: (case.planner["num_approach_points"], case.planner["num_candidates"])
-        for case in cases("samples", tmp_path)
-    }
-    assert numbers == {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
 
 
 def test_labels_are_what_the_folders_say(tmp_path: Path) -> None:

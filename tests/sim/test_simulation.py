@@ -41,6 +41,19 @@ def grasps_near(simulation: ClutterSimulation, number: int) -> list[np.ndarray]:
     ]
 
 
+def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(
+    simulation: ClutterSimulation,
+) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    before = simulation.placements
+    result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))  # in the air
+    assert result.outcome is GraspOutcome.AFTER
+    assert result.opening < 0.008
+    assert result.held is None
+    assert not simulation.try_grasp(top_down(0.15, 0.25, 0.06)).success  # beside the cube
+    assert simulation.placements == before
+
+
 def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     result = simulation.try_grasp(top_down(0.15, 0.15, 0.06))
@@ -65,23 +78,6 @@ def test_thin_things_that_are_dropped_stay_on_the_table(tmp_path: Path) -> None:
             simulation.reset(SceneKind.PILE, np.random.default_rng(seed), 5) for seed in range(2)
         ]
     assert sum(left) >= 6  # of 10; some roll away
-
-
-def test_grasp_in_the_air_holds_nothing(simulation: ClutterSimulation) -> None:
-    simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))
-    assert result.outcome is GraspOutcome.AFTER
-    assert result.opening < 0.008
-    assert result.held is None
-
-
-def test_grasp_beside_the_middle_pushes_or_misses_but_never_moves_the_scene(
-    simulation: ClutterSimulation,
-) -> None:
-    simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    before = simulation.placements
-    assert not simulation.try_grasp(top_down(0.15, 0.25, 0.06)).success
-    assert simulation.placements == before
 
 
 def test_contact_at_the_start_pose() -> None:

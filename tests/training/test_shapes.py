@@ -1,6 +1,5 @@
 """Hollow shapes, shapes drawn at random, and stretched ones."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -53,14 +52,7 @@ def test_hollow_shapes_are_closed_and_face_outwards(name: str) -> None:
     assert 0.05 * full < _volume(revolved(profile)) < 0.9 * full
 
 
-def test_a_torus_has_the_volume_of_a_torus() -> None:
-    radius, tube = 0.030, 0.006
-    volume = 2 * np.pi**2 * radius * tube**2
-    # Twelve corners and 24 segments cut off some of it.
-    assert _volume(revolved(HOLLOW["made-torus-slim"])) == pytest.approx(volume, rel=0.06)
-
-
-@pytest.mark.parametrize("index", range(0, NUM_FREE, 20))
+@pytest.mark.parametrize("index", range(0, NUM_FREE, 13))
 def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
     shape = drawn_shape(index)
     points, _ = _surface(shape)
@@ -70,7 +62,7 @@ def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
     assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
 
 
-@pytest.mark.parametrize("index", range(NUM_FREE, NUM_DRAWN, 20))
+@pytest.mark.parametrize("index", range(NUM_FREE, NUM_DRAWN, 13))
 def test_plain_shapes_are_closed_and_stand_on_a_shelf(index: int) -> None:
     shape = drawn_shape(index)
     width, depth, height = np.ptp(_surface(shape)[0], axis=0)
@@ -83,12 +75,9 @@ def test_plain_shapes_are_closed_and_stand_on_a_shelf(index: int) -> None:
 def test_drawn_shapes_differ_and_stay_the_same() -> None:
     assert len({drawn_shape(index) for index in range(NUM_DRAWN)}) == NUM_DRAWN
     assert drawn_shape(7) == drawn_shape(7)
-
-
-@pytest.mark.parametrize("index", [-1, NUM_DRAWN])
-def test_there_are_so_many_drawn_shapes(index: int) -> None:
-    with pytest.raises(IndexError, match=f"{index} of {NUM_DRAWN}"):
-        drawn_shape(index)
+    for index in (-1, NUM_DRAWN):
+        with pytest.raises(IndexError, match=f"{index} of {NUM_DRAWN}"):
+            drawn_shape(index)
 
 
 def test_the_digest_of_a_made_object_is_that_of_its_own_files(tmp_path: Path) -> None:
@@ -129,12 +118,8 @@ def test_a_stretched_object_is_longer_by_each_factor(
         _extents(longer), _extents(bowl) * (1.3, 0.8, 2.0), atol=2 * margin, rtol=0
     )
     assert _extents(longer)[2] > 1.5 * _extents(bowl)[2]
-
-
-def test_stretching_twice_multiplies(shapes: tuple[ObjectModel, ...], tmp_path: Path) -> None:
-    once = stretched(shapes[0], (2.0, 1.0, 1.0), tmp_path / "once")
-    twice = stretched(once, (1.5, 1.0, 0.5), tmp_path / "twice")
-    assert 'scale="3.00000 1.00000 0.50000"' in twice.urdf.read_text()
+    twice = stretched(longer, (0.5, 1.0, 2.0), tmp_path / "twice")
+    assert 'scale="0.65000 0.80000 4.00000"' in twice.urdf.read_text()
 
 
 def test_objects_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
@@ -164,22 +149,10 @@ def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(
     named = {model.name for model in plain.models}
     assert set(first) & named
     assert set(first) - named
-    factors = [
-        float(each)
-        for text in first.values()
-        for each in text.split('scale="')[1].split('"')[0].split()
-    ]
-    assert 1 / STRETCH <= min(factors) < 0.95
-    assert 1.05 < max(factors) <= STRETCH
-
-
-def test_some_are_stretched_alike_along_x_and_y(
-    shapes: tuple[ObjectModel, ...], tmp_path: Path
-) -> None:
-    drawn = varied_objects(ObjectSet("plain", shapes), tmp_path, np.random.default_rng(0))
-    alike = 0
-    for model in drawn.models:
-        found = re.search(r'scale="(\S+) (\S+) \S+"', model.urdf.read_text())
-        assert found is not None
-        alike += found[1] == found[2]
-    assert 0 < alike < len(drawn.models)
+    factors = np.array(
+        [text.split('scale="')[1].split('"')[0].split() for text in first.values()], dtype=float
+    )
+    assert 1 / STRETCH <= factors.min() < 0.95
+    assert 1.05 < factors.max() <= STRETCH
+    alike = factors[:, 0] == factors[:, 1]
+    assert 0 < alike.sum() < len(factors)
