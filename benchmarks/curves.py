@@ -19,7 +19,7 @@ from benchmarks.speed import detector, observe, request
 
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 from edgegrasp_model.options import Collision
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 APPROACH_POINTS = (8, 16, 32, 64, 128, 256)

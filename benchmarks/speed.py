@@ -36,8 +36,8 @@ from edgegrasp_model.networks.config import (
     NetworkConfig,
 )
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.recipes import recipe
 

@@ -20,11 +20,10 @@ from matplotlib.figure import Figure
 from pages import filled, table
 
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_sim.experiment_report import experiment_table, percent, title_of
+from edgegrasp_sim.experiments import experiment_table, percent
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.published import published
-from edgegrasp_sim.record import record_of
-from edgegrasp_sim.results import ResultFolder
+from edgegrasp_sim.report import published
+from edgegrasp_sim.results import ResultFolder, planner_title, record_of
 from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
@@ -133,7 +132,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         least = f", scores from {options['min_score']:g}" if "min_score" in options else ""
         lines.append(
             (
-                title_of(record["planner"]) + least,
+                planner_title(record["planner"]) + least,
                 _version(record["protocol"]),
                 "-".join(filter(None, numbers)) or "the protocol's",
                 f"{record['rounds']} for each of {', '.join(map(str, record['seeds']))}",

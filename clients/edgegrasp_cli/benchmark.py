@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from edgegrasp_cli.planners.choice import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Round
+    from edgegrasp_sim.trial import Round
 
 Option = typer.Option
 MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
@@ -142,8 +142,8 @@ def compare(
     from rich.console import Console
     from rich.table import Table
 
-    from edgegrasp_sim.comparison import compare as figures_of
     from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import compare as figures_of
 
     with ending_with_a_sentence("compare"):
         figures = figures_of(ResultFolder(first), ResultFolder(second))
@@ -173,7 +173,7 @@ def ending_with_a_sentence(command: str, *, resumes: bool = False) -> Iterator[N
     """End the program with a message where its user can mend something, or has interrupted it."""
     from edgegrasp_client import GraspClientError
     from edgegrasp_model.errors import EdgeGraspError
-    from edgegrasp_sim.trials import PlannerUnavailableError
+    from edgegrasp_sim.trial import PlannerUnavailableError
 
     try:
         yield
@@ -320,7 +320,7 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
 
 
 def _check_gate(summary: dict[str, Any], gate: Path) -> None:
-    from edgegrasp_sim.gate import below_gate
+    from edgegrasp_sim.results import below_gate
 
     with ending_with_a_sentence("benchmark"):
         below = below_gate(summary, gate)

@@ -63,8 +63,7 @@ def experiment(
     from edgegrasp_sim.experiments import EXPERIMENTS
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
-    from edgegrasp_sim.record import record_of
-    from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import ResultFolder, record_of
 
     with ending_with_a_sentence("experiment", resumes=True):
         if name not in EXPERIMENTS:
@@ -105,7 +104,7 @@ def _planner(case: "Case", options: dict[str, Any]) -> "PlannerChoice":
 
 def _write(name: str, cases: list[dict[str, Any]], output: Path) -> None:
     """Write what is known so far, so that an interrupted experiment can be looked at."""
-    from edgegrasp_sim.experiment_report import experiment_figure, experiment_table
+    from edgegrasp_sim.experiments import experiment_figure, experiment_table
 
     results = {"experiment": name, "command": _command(), "cases": cases}
     (output / "experiment.json").write_text(json.dumps(results, indent=1) + "\n")

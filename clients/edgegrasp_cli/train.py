@@ -38,9 +38,8 @@ def generate_data(
     from rich.progress import track
 
     from edgegrasp_sim.objects import SceneKind
-    from edgegrasp_training.data_card import write_data_card
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
-    from edgegrasp_training.views import find_views
+    from edgegrasp_training.views import find_views, write_data_card
 
     kind = None if scene is None else SceneKind(scene)
     options = GenerationOptions(

@@ -17,13 +17,13 @@ from edgegrasp_cli.planners.detection import request_options, select_grasp
 from edgegrasp_cli.planners.validate import FUSED_VOXEL, densities, reference_successes
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_sim.gripper import FINGERTIP
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
-from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
+from edgegrasp_sim.trial import PlannedGrasp, RoundDriver
 
 PAPER, ROBOT = load_protocol("edgegrasp").planning, load_protocol("robot").planning
 MEMORY = load_protocol("edgegrasp-memory").planning

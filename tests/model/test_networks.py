@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import (
-    EDGEGRASP,
-    EDGEGRASP_SMALL,
-    HAND,
-    VN_EDGEGRASP,
-)
+from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND, VN_EDGEGRASP
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_model.networks.layers import PackedLinear, ball_chunks, by_chunks
 

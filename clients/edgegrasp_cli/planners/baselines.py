@@ -19,11 +19,10 @@ from edgegrasp_model.candidates.edge_grasps import (
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import Cloud, CloudInput, Voxels
-from edgegrasp_sim.grasping import GraspResult
-from edgegrasp_sim.gripper import MAX_OPENING
-from edgegrasp_sim.observation import Observation, crop
+from edgegrasp_sim.camera import Observation, crop
+from edgegrasp_sim.hand import MAX_OPENING, GraspResult
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trials import PlannedGrasp
+from edgegrasp_sim.trial import PlannedGrasp
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -14,7 +14,7 @@ from typing import Any
 
 from edgegrasp_cli.flags import connect
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trials import Planner
+from edgegrasp_sim.trial import Planner
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process", "edge-sample", "oracle", "oracle-own")

@@ -18,9 +18,9 @@ from edgegrasp_client import (
     Model,
     ServerUnavailableError,
 )
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trials import PlannedGrasp, PlannerUnavailableError
+from edgegrasp_sim.trial import PlannedGrasp, PlannerUnavailableError
 
 if TYPE_CHECKING:  # torch is loaded by the planner that needs it
     from edgegrasp_model.options import DetectOptions

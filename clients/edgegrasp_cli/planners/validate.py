@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from edgegrasp_sim.observation import Observation
+    from edgegrasp_sim.camera import Observation
 
 # How the labelled views were made: see the data's own description.
 MORE_OBJECTS = 4.0  # than one, on average; Poisson

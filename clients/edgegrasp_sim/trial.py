@@ -1,28 +1,22 @@
-"""One round of clutter removal: look, plan, grasp, until the table is empty or hope is lost.
+"""One round of clutter removal: look, plan, grasp, until the table is empty or planning fails.
 
-The loop knows a planner only as something to call; what runs behind it is the caller's affair.
+A planner is any callable; what runs behind it is up to the caller.
 """
-
-from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum, StrEnum
-from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from edgegrasp_sim.grasping import FailureCause, GraspOutcome
-from edgegrasp_sim.observation import Observation
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from edgegrasp_sim.grasping import GraspResult
-    from edgegrasp_sim.objects import SceneKind
-    from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
-    from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
+from edgegrasp_sim.simulation import ClutterSimulation
 
 MIN_POINTS = 100
 FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # seconds between tries of a planner that is unavailable
@@ -35,7 +29,7 @@ class PlannedGrasp:
 
     Attributes:
         T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-        score: the planner's opinion of the grasp, higher is better.
+        score: how good the planner believes the grasp is; higher is better.
         width: opening that the grasp needs, metres.
     """
 
@@ -44,38 +38,29 @@ class PlannedGrasp:
     width: float
 
 
-# From what is seen, and a seed for whatever is random in planning, to the grasp to execute;
-# None if there is none.
+# From an observation, and a seed for randomness in planning, to the grasp to execute; None if
+# there is none.
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
 class PlannerUnavailableError(Exception):
-    """For planners to raise when asking again may help, as when a server restarts."""
+    """Raised by planners when asking again may help, as when a server restarts."""
 
 
 @runtime_checkable
 class TriesGrasps(Protocol):
-    """A planner that also wants to try grasps in a copy of the scene it is asked about."""
+    """A planner that tries grasps in a copy of the scene before it decides."""
 
     def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
-        """Take what tries `T_world_hand`, (4, 4), in a copy of the scene as it is then."""
+        """Take a function that tries `T_world_hand`, (4, 4), in a copy of the present scene."""
 
 
 @runtime_checkable
 class Closes(Protocol):
-    """A planner that holds what has to be given back."""
+    """A planner that holds resources."""
 
     def close(self) -> None:
-        """Called once, after the last round."""
-
-
-class Stream(IntEnum):
-    """The random streams of a round; none depends on what another was used for."""
-
-    SCENE = 0
-    CAMERA = 1
-    NOISE = 2
-    POLICY = 3
+        """Release them; called once, after the last round."""
 
 
 class RoundEnd(StrEnum):
@@ -92,7 +77,7 @@ class Attempt:
     """One executed grasp.
 
     Attributes:
-        outcome: what came of it.
+        outcome: its outcome.
         cause: why it failed, None if it did not.
         object: name of the object removed, None after a failure.
         target: name of the object that was between the fingers, None if there was none.
@@ -158,9 +143,34 @@ class Round:
         return sum(attempt.success for attempt in self.attempts)
 
 
-def random_stream(seed: int, round_index: int, stream: Stream) -> np.random.Generator:
-    """The generator of one stream of one round."""
-    return np.random.default_rng([seed, round_index, stream])
+def run_round(
+    simulation: ClutterSimulation,
+    planner: Planner,
+    scene: SceneKind,
+    protocol: BenchmarkProtocol,
+    *,
+    seed: int,
+    index: int,
+    patience: float = PATIENCE,
+    on_grasp: Callable[[PlannedGrasp], None] | None = None,
+) -> Round:
+    """Run one round with a planner; `on_grasp` is called with every grasp before it is executed.
+
+    See `RoundDriver` for the other arguments, and errors.
+    """
+    if isinstance(planner, TriesGrasps):
+        planner.use_trial(simulation.try_in_copy)
+    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
+    while driver.end is None:
+        observation = driver.look()
+        if driver.end is not None:
+            break
+        grasp = driver.plan(planner, observation)
+        if grasp is not None:
+            if on_grasp is not None:
+                on_grasp(grasp)
+            driver.execute(grasp)
+    return driver.result()
 
 
 class RoundDriver:
@@ -174,7 +184,7 @@ class RoundDriver:
         protocol: objects, camera, noise and what ends the round.
         seed: not negative.
         index: number of the round, not negative.
-        patience: seconds to go on asking a planner that is unavailable.
+        patience: seconds to keep asking a planner that is unavailable.
 
     Raises:
         ValueError: unknown scene, or a negative seed or index.
@@ -213,7 +223,7 @@ class RoundDriver:
         self._update_end()
 
     def look(self) -> Observation:
-        """Take the next view; the round ends if it shows next to nothing."""
+        """Take the next view; the round ends if it shows almost nothing."""
         rules = self.protocol
         seen = self.simulation.observe(
             self._camera,
@@ -221,7 +231,7 @@ class RoundDriver:
             views=rules.camera.view_range(),
             num_views=rules.camera.views,
             noise_std=rules.noise.point_std,
-            depth_noise=rules.noise.depth_noise(),
+            depth_noise=rules.noise,
             table=rules.planning.table,
             surface_voxel=rules.camera.surface_voxel,
         )
@@ -234,10 +244,10 @@ class RoundDriver:
         return self._seen
 
     def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
-        """Ask the planner, again and again if it is unavailable; None if it finds no grasp.
+        """Ask the planner, repeatedly while it is unavailable; None if it finds no grasp.
 
         Raises:
-            PlannerUnavailableError: it stayed so for longer than `patience`.
+            PlannerUnavailableError: it was unavailable for longer than `patience`.
         """
         seed = int(self._policy.integers(2**31))
         waited, pause = 0.0, FIRST_WAIT
@@ -291,7 +301,7 @@ class RoundDriver:
         return attempt
 
     def result(self) -> Round:
-        """The round so far; whole once `end` is not None."""
+        """The round so far; complete once `end` is not None."""
         return replace(self._round, end=self.end) if self.end is not None else self._round
 
     def _update_end(self) -> None:
@@ -304,25 +314,15 @@ class RoundDriver:
             self.end = RoundEnd.NO_GRASP
 
 
-def run_round(
-    simulation: ClutterSimulation,
-    planner: Planner,
-    scene: SceneKind,
-    protocol: BenchmarkProtocol,
-    *,
-    seed: int,
-    index: int,
-    patience: float = PATIENCE,
-) -> Round:
-    """Run one round with a planner; see `RoundDriver` for arguments and errors."""
-    if isinstance(planner, TriesGrasps):
-        planner.use_trial(simulation.try_in_copy)
-    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
-    while driver.end is None:
-        observation = driver.look()
-        if driver.end is not None:
-            break
-        grasp = driver.plan(planner, observation)
-        if grasp is not None:
-            driver.execute(grasp)
-    return driver.result()
+class Stream(IntEnum):
+    """The random streams of a round; none depends on what another was used for."""
+
+    SCENE = 0
+    CAMERA = 1
+    NOISE = 2
+    POLICY = 3
+
+
+def random_stream(seed: int, round_index: int, stream: Stream) -> np.random.Generator:
+    """The generator of one stream of one round."""
+    return np.random.default_rng([seed, round_index, stream])

@@ -1,10 +1,8 @@
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.special import expit
 
-from edgegrasp_training.metrics import (
+from edgegrasp_training.evaluation import (
     accuracy,
     auroc,
     cross_entropy,
@@ -14,7 +12,7 @@ from edgegrasp_training.metrics import (
 )
 
 
-@given(seed=st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("seed", range(20))
 def test_auroc_is_the_share_of_pairs_in_the_right_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     logit, label = rng.integers(0, 5, 30).astype(float), rng.integers(0, 2, 30).astype(float)

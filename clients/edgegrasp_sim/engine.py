@@ -1,23 +1,38 @@
-"""PyBullet, wrapped once: a world with its bodies, joints and constraints."""
+"""The physics engine behind one interface: a world, its bodies, joints, constraints and images.
 
-from __future__ import annotations
+PyBullet is named in this file alone.
+"""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pybullet
+import pybullet_data
+from numpy.typing import NDArray
 
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-    from types import TracebackType
 
 TIME_STEP = 1.0 / 80.0  # seconds
 SOLVER_ITERATIONS = 100
 GRAVITY = 9.81  # m/s²
+ASSETS = Path(pybullet_data.getDataPath())  # meshes and URDF files that come with the engine
+SPACE = ord(" ")
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole camera; lengths in pixels, clipping distances in metres."""
+
+    width: int = 640
+    height: int = 480
+    focal_length: float = 540.0
+    centre_x: float = 320.0
+    centre_y: float = 240.0
+    near: float = 0.1
+    far: float = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +49,7 @@ class Contact:
 
 
 class World:
-    """One physics server; every call names it, so that several can live in one process.
+    """One physics server; a process may have several.
 
     Args:
         gui: open PyBullet's window instead of running without a display.
@@ -54,12 +69,7 @@ class World:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -110,12 +120,12 @@ class World:
 
     def load_urdf(
         self, path: Path, position: Sequence[float], quaternion_xyzw: Sequence[float], scale: float
-    ) -> Body:
+    ) -> "Body":
         """Load a body from a URDF file.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: PyBullet cannot read it.
+            ValueError: the engine cannot read it.
         """
         if not path.is_file():
             raise FileNotFoundError(f"no object file at {path}; check the object folder")
@@ -131,9 +141,7 @@ class World:
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         return Body(self.client, uid)
 
-    def add_box(
-        self, size: Sequence[float], centre: Sequence[float], *, lateral_friction: float
-    ) -> Body:
+    def add_box(self, size: Sequence[float], centre: Sequence[float], *, friction: float) -> "Body":
         """Add an axis-aligned box that never moves; `size` is its full extent in metres."""
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX,
@@ -142,8 +150,102 @@ class World:
         )
         uid = pybullet.createMultiBody(0.0, shape, -1, centre, physicsClientId=self.client)
         body = Body(self.client, uid)
-        body.change_dynamics(lateralFriction=lateral_friction)
+        body.set_dynamics(friction=friction)
         return body
+
+    def add_hand(
+        self,
+        palm: Path,
+        finger: Path,
+        *,
+        palm_mass: float,
+        palm_centre: Sequence[float],
+        finger_mass: float,
+        finger_base: float,
+        position: Sequence[float],
+    ) -> "Body":
+        """Add a hand whose two fingers, its links 0 and 1, slide apart along y.
+
+        Args:
+            palm: mesh; the engine takes its convex hull.
+            finger: mesh of the finger at y > 0; the other is it turned about z by half a turn.
+            palm_mass: kg.
+            palm_centre: centre of mass, hand frame, metres.
+            finger_mass: kg.
+            finger_base: metres along the hand's z to the fingers' frames.
+            position: of the hand, world frame, metres.
+        """
+        straight, half_turn = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]
+        palm_shape = self._hull(palm, straight)
+        uid = pybullet.createMultiBody(
+            baseMass=palm_mass,
+            baseCollisionShapeIndex=palm_shape,
+            basePosition=position,
+            baseInertialFramePosition=palm_centre,
+            linkMasses=[finger_mass] * 2,
+            linkCollisionShapeIndices=[self._hull(finger, each) for each in (straight, half_turn)],
+            linkVisualShapeIndices=[-1] * 2,
+            linkPositions=[[0.0, 0.0, finger_base]] * 2,
+            linkOrientations=[straight] * 2,
+            linkInertialFramePositions=[[0.0, 0.01, 0.02], [0.0, -0.01, 0.02]],
+            linkInertialFrameOrientations=[straight] * 2,
+            linkParentIndices=[0] * 2,
+            linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
+            linkJointAxis=[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]],
+            physicsClientId=self.client,
+        )
+        return Body(self.client, int(uid))
+
+    def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+        """Distance along the line of sight for every pixel: (height, width) metres.
+
+        Pixels that show nothing read `far`. A pixel is sampled at its lower left corner.
+        """
+        view = np.linalg.inv(T_world_camera)
+        view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
+        _, _, _, z_buffer, _ = pybullet.getCameraImage(
+            camera.width,
+            camera.height,
+            viewMatrix=view.flatten(order="F").tolist(),
+            projectionMatrix=_projection(camera).flatten(order="F").tolist(),
+            renderer=pybullet.ER_TINY_RENDERER,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self.client,
+        )
+        z = np.asarray(z_buffer, dtype=np.float64).reshape(camera.height, camera.width)
+        return camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
+
+    def aim_window(
+        self, target: Sequence[float], distance: float, yaw: float, pitch: float
+    ) -> None:
+        """Point the window's camera at `target` from `distance` metres; angles in degrees."""
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=self.client)
+        pybullet.resetDebugVisualizerCamera(
+            distance, yaw, pitch, target, physicsClientId=self.client
+        )
+
+    def draw_lines(self, lines: Matrix, colour: Sequence[float]) -> None:
+        """Draw lines (L, 2, 3), world frame, metres, in the window, and erase earlier ones."""
+        pybullet.removeAllUserDebugItems(physicsClientId=self.client)
+        for start, end in lines.tolist():
+            pybullet.addUserDebugLine(
+                start, end, colour, lineWidth=4.0, physicsClientId=self.client
+            )
+
+    def space_pressed(self) -> bool:
+        """Whether the space bar was pressed in the window since the last call."""
+        keys = pybullet.getKeyboardEvents(physicsClientId=self.client)
+        return bool(keys.get(SPACE, 0) & pybullet.KEY_WAS_TRIGGERED)
+
+    def _hull(self, mesh: Path, quaternion_xyzw: Sequence[float]) -> int:
+        """A collision shape: the convex hull of a mesh, turned."""
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH,
+            fileName=str(mesh),
+            collisionFrameOrientation=quaternion_xyzw,
+            physicsClientId=self.client,
+        )
+        return int(shape)
 
 
 class Body:
@@ -157,9 +259,39 @@ class Body:
         """Take the body out of its world."""
         pybullet.removeBody(self.uid, physicsClientId=self.client)
 
-    def change_dynamics(self, link: int = -1, **values: float) -> None:
-        """Set mass, friction and the like of one link (-1: the base)."""
-        pybullet.changeDynamics(self.uid, link, physicsClientId=self.client, **values)
+    def set_dynamics(self, *, friction: float, mass: float | None = None) -> None:
+        """Set the base's friction and mass (kg).
+
+        A given mass also makes the engine compute the inertia from the collision shape.
+        """
+        values = {} if mass is None else {"mass": mass}
+        pybullet.changeDynamics(
+            self.uid, -1, lateralFriction=friction, physicsClientId=self.client, **values
+        )
+
+    def set_finger(
+        self,
+        link: int,
+        *,
+        friction: float,
+        spinning_friction: float,
+        stiffness: float,
+        damping: float,
+        max_position: float,
+    ) -> None:
+        """Make a link a finger: soft contacts (N/m, N s/m), sliding from 0 to `max_position`."""
+        pybullet.changeDynamics(
+            self.uid,
+            link,
+            lateralFriction=friction,
+            spinningFriction=spinning_friction,
+            contactStiffness=stiffness,
+            contactDamping=damping,
+            frictionAnchor=1,
+            jointLowerLimit=0.0,
+            jointUpperLimit=max_position,
+            physicsClientId=self.client,
+        )
 
     @property
     def position(self) -> Matrix:
@@ -183,13 +315,6 @@ class Body:
         """Put the base's centre-of-mass frame there, at rest."""
         self.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
-    def paint(self, colour: str) -> None:
-        """Give every link a colour, `#rrggbb`; seen by people only, depth stays the same."""
-        rgba = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [1.0]
-        links = pybullet.getNumJoints(self.uid, physicsClientId=self.client)
-        for link in range(-1, links):
-            pybullet.changeVisualShape(self.uid, link, rgbaColor=rgba, physicsClientId=self.client)
-
     @property
     def speed(self) -> float:
         """Length of linear (m/s) and angular (rad/s) velocity taken together."""
@@ -207,7 +332,7 @@ class Body:
         points = pybullet.getContactPoints(self.uid, physicsClientId=self.client)
         return [Contact(other_uid=point[2], distance=point[8]) for point in points]
 
-    def joint(self, index: int) -> Joint:
+    def joint(self, index: int) -> "Joint":
         """The joint that carries link `index`."""
         return Joint(self, index)
 
@@ -294,3 +419,16 @@ def couple_joints(body: Body, first: int, second: int, *, erp: float, max_force:
     pybullet.changeConstraint(
         uid, gearRatio=-1.0, erp=erp, maxForce=max_force, physicsClientId=body.client
     )
+
+
+def _projection(camera: Intrinsics) -> Matrix:
+    """OpenGL's projection matrix of a pinhole camera (row-major)."""
+    matrix = np.zeros((4, 4))
+    matrix[0, 0] = 2.0 * camera.focal_length / camera.width
+    matrix[1, 1] = 2.0 * camera.focal_length / camera.height
+    matrix[0, 2] = 1.0 - 2.0 * camera.centre_x / camera.width
+    matrix[1, 2] = 2.0 * camera.centre_y / camera.height - 1.0
+    matrix[2, 2] = -(camera.far + camera.near) / (camera.far - camera.near)
+    matrix[2, 3] = -2.0 * camera.far * camera.near / (camera.far - camera.near)
+    matrix[3, 2] = -1.0
+    return matrix
