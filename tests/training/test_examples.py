@@ -80,7 +80,6 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
     batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
     np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
-    assert batch.num_balls == 2
     exact = HandBatch.from_cloud(
         grasps.cloud,
         grasps.candidates.take(rows),
