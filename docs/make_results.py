@@ -20,10 +20,10 @@ from matplotlib.figure import Figure
 from pages import filled, table
 
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_sim.experiments import experiment_table, percent
+from edgegrasp_sim.experiments import experiment_table
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.report import published
-from edgegrasp_sim.results import ResultFolder, planner_title, record_of
+from edgegrasp_sim.report import published, published_rates
+from edgegrasp_sim.results import ResultFolder, percent, planner_title, record_of
 from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
@@ -143,7 +143,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         )
     for row in published("edgegrasp", scene):
         title = f"*{row['method']}* ({row['source']})"
-        lines.append((title, "edgegrasp", row.get("samples", ""), "", *_rates(row), ""))
+        lines.append((title, "edgegrasp", row.get("samples", ""), "", *published_rates(row), ""))
     return table(head, lines)
 
 
@@ -198,20 +198,11 @@ def _published_table(methods: Sequence[str]) -> Iterator[str]:
         cells: list[str] = []
         for scene in SCENES:
             (row,) = [r for r in published("edgegrasp", scene) if r["method"] == method]
-            cells += _rates(row)
+            cells += published_rates(row)
         lines.append((f"*{method}*", row.get("samples", ""), *cells))
     if lines:
         head = ("published", "samples", "packed: GSR", "DR", "pile: GSR", "DR")
         yield table(head, lines)
-
-
-def _rates(row: dict[str, Any]) -> tuple[str, str]:
-    """Published GSR and DR: mean, and standard deviation where it is known."""
-    gsr, dr = (
-        " ± ".join(f"{number:.1f}" for number in row.get(name, ()))
-        for name in ("grasp_success_rate", "declutter_rate")
-    )
-    return gsr, dr
 
 
 def _curve(file: Path) -> list[dict[str, float]]:

@@ -35,7 +35,7 @@ def attempt(
     """Make one recorded attempt again, in the scene and view it was made in."""
     from edgegrasp_sim.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
-    from edgegrasp_sim.report import DrawnAttempt, attempt_title
+    from edgegrasp_sim.report import attempt_title
     from edgegrasp_sim.results import ResultFolder
 
     try:
@@ -48,8 +48,9 @@ def attempt(
         sys.exit(f"edgegrasp replay: {error}")
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        drawn = [DrawnAttempt.of(before)]
-        draw_grasps(picture, seen.cloud, drawn, camera_position=seen.camera_position, title=title)
+        draw_grasps(
+            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
+        )
     print(title)
     if any(
         getattr(now, name) != getattr(before, name)

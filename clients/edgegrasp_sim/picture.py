@@ -43,13 +43,13 @@ def draw_grasps(
     camera_position: ArrayLike,
     title: str,
 ) -> None:
-    """Write a PNG: the cloud and a fork for every gripper, seen by the camera and from above.
+    """Write a picture: the cloud and a fork for every gripper, seen by the camera and from above.
 
     A fork is a gripper's outline at the grasp: a stem where the hand comes from, the palm's
     surface, and the inner faces of the fingers at the opening they start from.
 
     Args:
-        path: file to write; its folder must exist.
+        path: `.png` or `.jpg` file to write; its folder must exist.
         cloud: (N, 3) metres.
         grasps: best first; coloured by score, the best one edged in red.
         camera_position: (3,) metres, cloud frame; the first view looks from there.

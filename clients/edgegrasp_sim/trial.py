@@ -10,7 +10,7 @@ from enum import IntEnum, StrEnum
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
@@ -110,6 +110,11 @@ class Attempt:
     def success(self) -> bool:
         """Whether an object was removed."""
         return self.outcome is GraspOutcome.SUCCESS
+
+    @property
+    def T_cloud_hand(self) -> NDArray[np.float32]:  # noqa: N802
+        """The pose as `draw_grasps` takes it: clouds are in the world's frame.  # (4, 4)."""
+        return np.asarray(self.T_world_hand, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
