@@ -2,8 +2,6 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,13 +49,12 @@ def detect(
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
-    with _ending_with_a_sentence("detect"):
-        fields = _options(options_file, options)
-        if server:
-            with connect(server, timeout, **connection) as client:
-                detection: Any = client.detect(file, **fields)
-        else:
-            detection = _detect_here(file, weights or [], grippers or [], device, fields)
+    fields = _options(options_file, options)
+    if server:
+        with connect(server, timeout, **connection) as client:
+            detection: Any = client.detect(file, **fields)
+    else:
+        detection = _detect_here(file, weights or [], grippers or [], device, fields)
     if as_document:
         print(json.dumps(_json_document(detection)))
     else:
@@ -79,12 +76,11 @@ def models(
     table = Table(
         "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
     )
-    with _ending_with_a_sentence("models"):
-        if server:
-            with connect(server, timeout, **connection) as client:
-                found = client.models()
-        else:
-            found = _models_here(weights or [])
+    if server:
+        with connect(server, timeout, **connection) as client:
+            found = client.models()
+    else:
+        found = _models_here(weights or [])
     for row in found:
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
@@ -98,18 +94,6 @@ def models(
     Console().print(table)
 
 
-@contextmanager
-def _ending_with_a_sentence(command: str) -> Iterator[None]:
-    """End the program with the message of an error that the caller can mend."""
-    from edgegrasp_client import GraspClientError
-    from edgegrasp_model.errors import EdgeGraspError
-
-    try:
-        yield
-    except (GraspClientError, EdgeGraspError, OSError) as error:
-        sys.exit(f"edgegrasp {command}: {error}")
-
-
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     """The options of the flags, and of the file where there is no flag."""
     try:
@@ -117,7 +101,7 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(fields, dict):
             raise ValueError("a JSON object is needed")
     except ValueError as error:
-        sys.exit(f"edgegrasp detect: {file}: {error}")
+        raise ValueError(f"{file}: {error}") from error
     return fields | parse_option_flags(given)
 
 
@@ -157,20 +141,17 @@ def _json_document(detection: Any) -> dict[str, Any]:
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
     """Arrays as lists, floats as float32, NaN as None."""
-    return {name: _plain_value(value) for name, value in fields.items()}
-
-
-def _plain_value(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(np.float32(value))
-    if not isinstance(value, np.ndarray):
-        return value
-    if value.dtype.kind in "iu":
-        return value.tolist()
-    floats = value.astype(np.float32)
-    if np.isnan(floats).any():  # of scores, which are flat
-        return [None if np.isnan(number) else number for number in floats.tolist()]
-    return floats.tolist()
+    plain = dict(fields)
+    for name, value in fields.items():
+        if isinstance(value, float):
+            plain[name] = float(np.float32(value))
+        elif isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            numbers = value.astype(np.float32).astype(object)
+            numbers[np.isnan(value)] = None
+            plain[name] = numbers.tolist()
+        elif isinstance(value, np.ndarray):
+            plain[name] = value.tolist()
+    return plain
 
 
 def _print_detection(detection: Any) -> None:

@@ -16,7 +16,7 @@ from edgegrasp_cli.benchmark import (
     Seeds,
     Split,
     Workers,
-    ending_with_a_sentence,
+    interruptible,
     run_rounds,
 )
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
@@ -65,7 +65,7 @@ def experiment(
     from edgegrasp_sim.protocol import load_protocol
     from edgegrasp_sim.results import ResultFolder, record_of
 
-    with ending_with_a_sentence("experiment", resumes=True):
+    with interruptible("experiment", resumes=True):
         scenes = [SceneKind(each) for each in scene or [kind.value for kind in SceneKind]]
         asked = SAMPLES | parse_option_flags(options)
         cases = cases_of(name, load_protocol(protocol), scenes, model or [""], output)

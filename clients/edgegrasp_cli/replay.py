@@ -38,14 +38,11 @@ def attempt(
     from edgegrasp_sim.report import attempt_title
     from edgegrasp_sim.results import ResultFolder
 
-    try:
-        folder = ResultFolder(results)
-        first = folder.manifest()["seeds"][0]
-        with Replay(folder, objects, gui=gui) as repeated:
-            done = repeated.find(first if seed is None else seed, round, number)
-            now, seen = repeated.repeat(done.seed, round, number)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"edgegrasp replay: {error}")
+    folder = ResultFolder(results)
+    first = folder.manifest()["seeds"][0]
+    with Replay(folder, objects, gui=gui) as repeated:
+        done = repeated.find(first if seed is None else seed, round, number)
+        now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
         draw_grasps(
@@ -71,13 +68,9 @@ def request(
     """
     from edgegrasp_service.recording import replay as answer_again
 
-    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_service.settings import load_settings
 
-    try:
-        again = answer_again(file, load_settings(config))
-    except (EdgeGraspError, ValueError, OSError) as error:
-        sys.exit(f"edgegrasp replay: {error}")
+    again = answer_again(file, load_settings(config))
     refused = again.answer.error
     print(f"{again.answer.facts.grasps} grasps" if refused is None else refused.detail)
     before, now = (_without_times(again.job, body) for body in (again.recorded, again.answer.body))
