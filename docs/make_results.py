@@ -1,8 +1,8 @@
 """Writes the tables of docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
 
 Results found below RESULTS_DIR (folders of `edgegrasp benchmark`, `edgegrasp experiment` and
-`edgegrasp train`) are first boiled down to docs/results/, where what is found again replaces what
-was there; the tables are written from that folder alone.
+`edgegrasp train`) are first summarised in docs/results/, where they replace earlier results of the
+same name; the tables are written from that folder alone.
 """
 
 import csv
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pages import filled, table
 
@@ -41,12 +40,12 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "families": (),
 }
 # Counted in the authors' checkpoint files.
-AUTHORS_PARAMETERS = {"edgegrasp": 3_048_993, "vn-edgegrasp": 1_702_268}
+AUTHORS_PARAMETERS = {"edgegrasp": "3,048,993", "vn-edgegrasp": "1,702,268"}
 NOT_YET = "Not measured yet.\n"
 
 
 def collect(results: Path, kept: Path) -> None:
-    """Boil down every result below a folder into another.
+    """Summarise every result below a folder in another.
 
     Raises:
         FileNotFoundError: there is nothing of the kind.
@@ -159,8 +158,7 @@ def _parameters_table() -> str:
     for name, config in RECIPES.items():
         network = build_network(config, torch.Generator().manual_seed(0))
         count = sum(parameter.numel() for parameter in network.parameters())
-        theirs = AUTHORS_PARAMETERS.get(name)
-        lines.append((name, f"{count:,}", "" if theirs is None else f"{theirs:,}"))
+        lines.append((name, f"{count:,}", AUTHORS_PARAMETERS.get(name, "")))
     return table(("weights", "parameters", "in the authors' checkpoint"), lines)
 
 
@@ -176,7 +174,6 @@ def _training(curves: Curves) -> str:
 def curves_figure(curves: Curves) -> Figure:
     """Validation loss and AUROC against steps, a line for each run."""
     figure = Figure(figsize=(9.6, 3.4), dpi=90, layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, column, label in zip(
         figure.subplots(1, 2),
         ("validation_loss", "auroc"),

@@ -223,7 +223,7 @@ class RoundDriver:
         self._seen: Observation | None = None
         self._failures = 0
         self._planning_seconds = 0.0
-        names = tuple(simulation.object_names)
+        names = tuple(model.name for model in simulation.object_models)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED)
         self._update_end()
 
