@@ -5,6 +5,7 @@ machine too. Networks carry random weights, which cost what trained ones cost.
 """
 
 import argparse
+import re
 import statistics
 import time
 from collections.abc import Callable
@@ -211,12 +212,11 @@ def write_table(readme: Path, results: dict[str, Any]) -> None:
     Raises:
         ValueError: The file does not hold both markers.
     """
-    text = readme.read_text()
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
+    place = re.compile(f"{BEGIN}.*{END}", re.DOTALL)
+    text, count = place.subn(lambda _: f"{BEGIN}\n{table(results)}\n{END}", readme.read_text())
+    if not count:
         raise ValueError(f"{readme} holds no {BEGIN} … {END}")
-    readme.write_text(f"{before}{BEGIN}\n{table(results)}\n{END}{after}")
+    readme.write_text(text)
 
 
 def table(results: dict[str, Any]) -> str:

@@ -220,28 +220,14 @@ def _progress(
     config: "BenchmarkConfig", folder: "ResultFolder | None"
 ) -> "Iterator[Callable[[Round], None]]":
     """A bar with the time left; yields what to call after each round."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress, TimeElapsedColumn
 
     from edgegrasp_sim.results import count
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
     tasks = config.tasks()
     finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
     came: list[Round] = []
-    with Progress(*columns) as progress:
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
         bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
 
         def on_round(done: "Round") -> None:

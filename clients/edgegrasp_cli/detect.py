@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -17,9 +17,6 @@ from edgegrasp_cli.flags import (
     parse_option_flags,
     takes_flags,
 )
-
-if TYPE_CHECKING:
-    from edgegrasp_client import Model
 
 Option = typer.Option
 WEIGHTS_HELP = "Weights file or folder besides those that ship, where there is no server."
@@ -80,7 +77,11 @@ def models(
         with connect(server, timeout, **connection) as client:
             found = client.models()
     else:
-        found = _models_here(weights or [])
+        from edgegrasp_client import Model
+        from edgegrasp_model.detector import ModelCatalogue
+
+        facts = ModelCatalogue.load(weights or []).describe()
+        found = [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
     for row in found:
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
@@ -118,14 +119,6 @@ def _detect_here(
 
     catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
     return catalogue.get(parsed.model).detect(cloud, parsed)
-
-
-def _models_here(weights: list[Path]) -> "list[Model]":
-    from edgegrasp_client import Model
-    from edgegrasp_model.detector import ModelCatalogue
-
-    facts = ModelCatalogue.load(weights).describe()
-    return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
 
 
 def _json_document(detection: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import PATIENCE, Closes, Planner, Round, run_round
+from edgegrasp_sim.trial import PATIENCE, Planner, Round, run_round
 from edgegrasp_sim.window import Window
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
@@ -233,8 +233,8 @@ class RoundRunner:
     def close(self) -> None:
         """Release what simulation and planner hold."""
         self.simulation.close()
-        if isinstance(self.planner, Closes):
-            self.planner.close()
+        if close := getattr(self.planner, "close", None):
+            close()
 
 
 def _run_here(

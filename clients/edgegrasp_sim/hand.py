@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from edgegrasp_sim.engine import ASSETS, TIME_STEP, Joint, World, WorldAnchor, couple_joints
+from edgegrasp_sim.engine import ASSETS, TIME_STEP, Body, Joint, World, WorldAnchor, couple_joints
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
@@ -132,7 +132,7 @@ def run_grasp(
 
     collided = False
     for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
-        collided = collided or gripper.penetrates()
+        collided = collided or any(c.distance < -COLLISION_DEPTH for c in gripper.body.contacts())
     _close(gripper, objects, to_the_end=to_the_end)
     missed = gripper.opening <= MIN_OPENING
     caught = _touched(gripper, objects)
@@ -237,10 +237,6 @@ class Gripper:
         for _ in self.steps_to(T_world_hand, step_length=step_length):
             pass
 
-    def penetrates(self) -> bool:
-        """Whether the hand overlaps something by more than `COLLISION_DEPTH`."""
-        return any(contact.distance < -COLLISION_DEPTH for contact in self.body.contacts())
-
     def close(self) -> None:
         """Drive the fingers together with full force."""
         for finger in self.fingers:
@@ -296,16 +292,15 @@ class _Watch:
         self._empty_steps = 0 if touched else self._empty_steps + 1
         if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
             return True
-        held = len(touched) == 1 and self._hangs(touched[0]) and self._keeps_still(touched[0])
+        held = len(touched) == 1 and self._hangs_still(touched[0].body)
         self._held_steps = self._held_steps + 1 if held else 0
         return self._held_steps >= HELD_STEPS
 
-    def _hangs(self, held: SceneObject) -> bool:
-        hand = self._gripper.body.uid
-        return all(contact.other_uid == hand for contact in held.body.contacts())
-
-    def _keeps_still(self, held: SceneObject) -> bool:
-        before, self._offset = self._offset, held.body.position - self._gripper.body.position
+    def _hangs_still(self, held: Body) -> bool:
+        hand = self._gripper.body
+        if any(contact.other_uid != hand.uid for contact in held.contacts()):
+            return False
+        before, self._offset = self._offset, held.position - hand.position
         return before is None or bool(np.linalg.norm(self._offset - before) < SLIP)
 
 

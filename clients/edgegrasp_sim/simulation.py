@@ -1,7 +1,6 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TypedDict, Unpack
@@ -168,7 +167,7 @@ class ClutterSimulation:
         Raises:
             ValueError: unknown scene, no object set for it, or `num_objects` below 1.
         """
-        kind = _scene_kind(scene)
+        kind = SceneKind(scene)
         if num_objects < 1:
             raise ValueError(f"num_objects is {num_objects}; ask for at least 1")
         objects = self.object_sets.get(kind)
@@ -370,9 +369,3 @@ class ClutterSimulation:
         if self._rest_state is not None:
             self.world.remove_state(self._rest_state)
             self._rest_state = None
-
-
-def _scene_kind(scene: SceneKind | str) -> SceneKind:
-    with suppress(ValueError):
-        return SceneKind(scene)
-    raise ValueError(f"scene is {scene!r}; choose one of {', '.join(SceneKind)}")

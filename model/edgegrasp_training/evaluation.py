@@ -136,7 +136,8 @@ def write_model_card(
         (f"{predicted:.3f}", f"{observed:.3f}", count)
         for predicted, observed, count in reliability(calibrated, evaluation.label)
     ]
-    lines = [f"# {metadata.name}", "", *table(("", ""), [(n, _cell(v)) for n, v in rows])]
+    plain = [(n, ", ".join(map(str, v)) if isinstance(v, tuple | list) else v) for n, v in rows]
+    lines = [f"# {metadata.name}", "", *table(("", ""), plain)]
     lines += ["", "Trained by:", "", "```", command, "```", ""]
     lines += ["Reliability of the score on the validation views:", ""]
     lines += [*table(("score", "held", "grasps"), bins), "", "During training:", "", *_curve(log)]
@@ -165,7 +166,3 @@ def _curve(log: Path) -> list[str]:
     every = max(1, len(body) // CURVE_ROWS)
     some = body[(len(body) - 1) % every :: every]
     return table(head, some)
-
-
-def _cell(value: object) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
