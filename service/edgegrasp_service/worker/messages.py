@@ -42,16 +42,14 @@ def read_request(method: Method, body: bytes) -> dict[str, Any]:
         InvalidRequest: It is no such message, has no cloud or two, a pose that is none, more parts
             than any request needs, or a field that this server does not know.
     """
-    kind = (
-        grasp_pb2.ScoreGraspsRequest if method == "ScoreGrasps" else grasp_pb2.DetectGraspsRequest
-    )
+    scores = method == "ScoreGrasps"
+    kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
     try:
         message: Any = kind.FromString(body)
     except DecodeError:
         value = f"{len(body)} bytes that are no message of this method"
-        raise InvalidRequest(
-            "request", value, "Send a message as the .proto file has it."
-        ) from None
+        fix = "Send a message as the .proto file has it."
+        raise InvalidRequest("request", value, fix) from None
     _check(message, "request")
     fields = _cloud(message)
     fields |= {name: getattr(message, name) for name in PER_POINT if message.HasField(name)}
