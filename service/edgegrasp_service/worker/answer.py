@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.settings import Settings
@@ -226,7 +226,8 @@ def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
         given = decode_array(name, given, limits.max_points)
-    _limit(name, len(given), limits.max_candidates)
+    if len(given) <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
+        _limit(name, len(given), limits.max_candidates)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}
