@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.admission import Admission, Place
 from edgegrasp_service.backend import Catalogue, Detector, Prepared
 from edgegrasp_service.batching import BatchPolicy

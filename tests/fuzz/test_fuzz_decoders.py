@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.schemas import PER_POINT
 from edgegrasp_service.worker.http_bodies import options_from_query, read_body
 from edgegrasp_service.worker.messages import read_request

@@ -18,8 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
 
 Array = NDArray[Any]

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import Answerer, describe, load_catalogue
 from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
@@ -124,15 +121,3 @@ def test_catalogues() -> None:
     assert isinstance(catalogue.get(), DummyDetector)
     (facts,) = describe(catalogue)
     assert grasp_pb2.Model(**facts).name == "dummy"
-
-
-def test_too_many_voxels_name_the_workspace() -> None:
-    detector = ModelCatalogue.load().get()
-    cloud = np.random.default_rng(0).uniform(-0.5, 0.5, (5000, 3)).astype(np.float32)
-    with pytest.raises(InvalidRequest) as caught:
-        detector.prepare(cloud, DetectOptions(), max_voxels=1000)
-    assert caught.value.field == "options.workspace"
-    assert "voxels" in caught.value.value
-    assert "1000" in caught.value.fix
-    workspace = {"min": (-0.1, -0.1, -0.1), "max": (0.1, 0.1, 0.1)}
-    detector.prepare(cloud, DetectOptions(workspace=workspace), max_voxels=1000)

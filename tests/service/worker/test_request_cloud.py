@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.errors import PayloadTooLarge
 from edgegrasp_service.worker.request_cloud import (
     POINT_TYPES,
