@@ -13,8 +13,8 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.option_messages import fill
 from edgegrasp_client.options import plain_options
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_service.grpc_messages import options_from_message
-from edgegrasp_service.options_text import options_from_query
+from edgegrasp_service.worker.http_bodies import options_from_query
+from edgegrasp_service.worker.messages import plain_options as options_from_message
 
 
 def numbers(low: float, high: float) -> st.SearchStrategy[float]:
