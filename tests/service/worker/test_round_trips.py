@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.option_messages import fill
-from edgegrasp_client.options import plain_options
+from edgegrasp_client.grpc_wire import fill
+from edgegrasp_client.requests import plain_options
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_service.worker.http_bodies import options_from_query
 from edgegrasp_service.worker.messages import plain_options as options_from_message
