@@ -155,7 +155,6 @@ class _Work:
         with self._stage("prepare"):
             prepared = detector.prepare(cloud, options)
             self._count(prepared.counts)
-        del cloud  # as JSON it takes many times its room
         with self._stage("network"):
             logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
         prepared.seconds["network"] = self.facts.seconds["network"]
@@ -223,8 +222,9 @@ def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
         given = decode_array(name, given, limits.max_points)
-    if len(given) <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
-        _limit(name, len(given), limits.max_candidates)
+    rows = given.shape[0] if given.ndim else 0
+    if rows <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
+        _limit(name, rows, limits.max_candidates)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}

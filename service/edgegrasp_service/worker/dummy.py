@@ -2,7 +2,6 @@
 
 import time
 import zlib
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,8 +36,8 @@ class DummyPrepared:
     options: DetectOptions
     points: Float32  # (N, 3)
     drawn: NDArray[np.int64]  # (A,) approach points, rows of `points`
-    batch: Float32  # (A,) scores, which the network gives back
-    counts: dict[str, int] = field(default_factory=dict)
+    batch: Float32  # (A,) scores, descending, which the network gives back
+    counts: dict[str, int]
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -60,20 +59,22 @@ class DummyDetector:
             options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
 
         Raises:
-            InvalidRequest: The cloud is none, as for a real detector.
+            InvalidRequest: The cloud cannot be used, as for a real detector.
         """
         points = check_cloud(cloud, options.num_approach_points).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), options.num_approach_points, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
-        return DummyPrepared(options, points, drawn, scores)
+        counts = {"points": len(points), "scored": len(drawn)}
+        counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
+        return DummyPrepared(options, points, drawn, scores, counts)
 
     def run(self, batch: Float32) -> Float32:
         """Take the time of a network."""
         time.sleep(self._seconds)
         return batch
 
-    def finish(self, prepared: DummyPrepared, logits: NDArray[Any]) -> Detection:
+    def finish(self, prepared: DummyPrepared, logits: Float32) -> Detection:
         """Put a grasp on each of the best approach points."""
         options, points, drawn = prepared.options, prepared.points, prepared.drawn
         grasps = [
@@ -81,15 +82,10 @@ class DummyDetector:
             for row, score in zip(drawn[:GRASPS], logits[:GRASPS], strict=True)
             if score >= options.min_score
         ][: options.top_k]
-        counts = {"points": len(points), "scored": len(drawn), "returned": len(grasps)}
-        return Detection(
-            grasps=grasps,
-            counts=counts | {"crc32": zlib.crc32(points.tobytes())},
-            seconds=prepared.seconds | {"total": sum(prepared.seconds.values())},
-            model=NAME,
-            warnings=[WARNING],
-            debug=_debug(points, drawn, logits) if options.debug else None,
-        )
+        counts = prepared.counts | {"returned": len(grasps)}
+        seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
+        debug = _debug(points, drawn, logits) if options.debug else None
+        return Detection(grasps, counts, seconds, NAME, [WARNING], debug)
 
     def score(
         self,
@@ -99,34 +95,29 @@ class DummyDetector:
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
     ) -> Scoring:
-        """Make up scores; an edge from a point to itself defines no grasp.
+        """Make up scores; an edge from a row to itself defines no grasp.
 
         Raises:
-            InvalidRequest: The cloud is none, an edge names a row that it does not have, or a pose
-                is none.
+            InvalidRequest: The cloud, an edge or a pose cannot be used, as for a real detector.
         """
-        start = time.perf_counter()
         checked = check_cloud(cloud)
-        random = np.random.default_rng(options.seed)
         if edges is not None:
-            contacts: list[Float32 | None] = [
-                None if approach == contact else _row(checked.points, checked.row, contact)
-                for approach, contact in check_edges(edges, checked.rows_sent)
-            ]
+            rows = check_edges(edges, checked.rows_sent)
+            nearest = np.searchsorted(checked.row, rows[:, 1]).clip(max=len(checked.row) - 1)
+            contacts, is_grasp = checked.points[nearest], rows[:, 0] != rows[:, 1]
         else:
             poses = check_hand_poses(hand_poses)
-            contacts = list((poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
-        scores = random.random(len(contacts), dtype=np.float32)
+            contacts = (poses @ np.array([0.0, 0.0, TCP_Z, 1.0], np.float32))[:, :3]
+            is_grasp = np.ones(len(poses), dtype=bool)
+        scores = np.random.default_rng(options.seed).random(len(contacts), dtype=np.float32)
         evaluations = [
-            Evaluation(None, NoGrasp.TOO_SHORT)
-            if contact is None
-            else Evaluation(_top_down(contact, float(score)), None)
-            for contact, score in zip(contacts, scores, strict=True)
+            Evaluation(_top_down(contact, float(score)), None)
+            if grasps
+            else Evaluation(None, NoGrasp.TOO_SHORT)
+            for contact, score, grasps in zip(contacts, scores, is_grasp, strict=True)
         ]
-        seconds = {"total": time.perf_counter() - start}
-        scored = len(contacts) - sum(contact is None for contact in contacts)
-        counts = {"points": len(checked.points), "scored": scored}
-        return Scoring(evaluations, counts, seconds, NAME, [WARNING])
+        counts = {"points": len(checked.points), "scored": int(is_grasp.sum())}
+        return Scoring(evaluations, counts, {"total": 0.0}, NAME, [WARNING])
 
 
 class DummyCatalogue:
@@ -141,7 +132,7 @@ class DummyCatalogue:
             raise UnknownModel(name, [NAME])
         return self._detector
 
-    def describe(self) -> Sequence[Mapping[str, Any]]:
+    def describe(self) -> list[dict[str, Any]]:
         """The facts of the dummy."""
         facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
         return [facts | {"device": "cpu"}]
@@ -152,38 +143,22 @@ class DummyCatalogue:
 
 def _top_down(point: Float32, score: float) -> Grasp:
     T_cloud_hand = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
-    T_cloud_hand[:3, 3] = point + np.array([0.0, 0.0, TCP_Z], dtype=np.float32)
     T_cloud_tcp = T_cloud_hand.copy()
     T_cloud_tcp[:3, 3] = point
-    return Grasp(
-        score=score,
-        T_cloud_hand=T_cloud_hand,
-        T_cloud_tcp=T_cloud_tcp,
-        width=0.08,
-        approach_point=point,
-        contact_point=point,
-        approach_direction=np.array([0.0, 0.0, -1.0], dtype=np.float32),
-        collision_free=True,
-        clearance=0.0,
-    )
-
-
-def _row(points: Float32, rows: NDArray[np.int64], row: int) -> Float32:
-    """A point by its row in the cloud as sent; the next one for a hole."""
-    point: Float32 = points[min(int(np.searchsorted(rows, row)), len(points) - 1)]
-    return point
+    T_cloud_hand[:3, 3] = point + np.array([0.0, 0.0, TCP_Z], dtype=np.float32)
+    down = np.array([0.0, 0.0, -1.0], dtype=np.float32)
+    return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, down, True, 0.0)
 
 
 def _debug(points: Float32, drawn: NDArray[np.int64], scores: Float32) -> DebugInfo:
-    outcome = [Outcome.RETURNED] * len(drawn[:GRASPS])
-    outcome += [Outcome.NOT_SCORED] * (len(drawn) - len(outcome))
+    returned = np.arange(len(drawn)) < GRASPS
     return DebugInfo(
         points=points,
         normals=np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(points), 1)),
         approach_index=drawn,
         contact_index=drawn,
         T_cloud_hand=np.stack([_top_down(points[row], 0.0).T_cloud_hand for row in drawn]),
-        score=np.where(np.arange(len(drawn)) < GRASPS, scores, np.float32(np.nan)),
-        outcome=outcome,
+        score=np.where(returned, scores, np.float32(np.nan)),
+        outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
         support_plane=None,
     )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import json
 
 import pytest
 
@@ -33,13 +34,27 @@ def test_clouds(schema: type, message: type, client: type | None) -> None:
 
 
 def test_requests() -> None:
-    """The client's methods take what either request has; the cloud under one name."""
+    """The same fields on both transports and in the client, but for the cloud itself."""
     detect, score = fields(grasp_pb2.DetectGraspsRequest), fields(grasp_pb2.ScoreGraspsRequest)
     assert score == [*detect, "edges", "hand_poses"]
+    for document, names in ((schemas.openapi_detect(), detect), (schemas.openapi_score(), score)):
+        content = document["requestBody"]["content"]
+        body = content["application/json"]["schema"]["properties"]
+        form = content["multipart/form-data"]["schema"]["properties"]
+        assert set(body) == set(names) - {"encoded"}
+        assert set(form) == set(names) - {"encoded", "points"} | {"cloud"}
+        assert list(body["options"]["properties"]) == fields(grasp_pb2.DetectOptions)
+        assert "$ref" not in json.dumps(document)
     client = edgegrasp_client.GraspClient
     for method, names in ((client.detect, detect), (client.score, score)):
         ours = set(inspect.signature(method).parameters) - {"self", "timeout"}
         assert ours == set(names) - {"points", "encoded", "point_cloud2"} | {"cloud"}
+
+
+def test_errors() -> None:
+    """ErrorDetail has the fields of a problem document that a gRPC status does not hold."""
+    ours = set(schemas.ProblemBody.model_fields) - {"type", "title", "status", "detail"}
+    assert ours == set(fields(grasp_pb2.ErrorDetail)) - {"kind"}
 
 
 @pytest.mark.parametrize(
