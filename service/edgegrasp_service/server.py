@@ -26,7 +26,7 @@ from edgegrasp_service.logs import LogWriter, start_logging, write_line
 from edgegrasp_service.metrics import Metrics
 from edgegrasp_service.observer import Observer
 from edgegrasp_service.observers import Observers
-from edgegrasp_service.reload import Reloader
+from edgegrasp_service.front.reload import Reloader
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.tls import load_tls
 from edgegrasp_service.tokens import load_tokens
