@@ -146,9 +146,18 @@ class GraspDetector:
             logits = self.run(prepared.batch) if prepared.batch is not None else np.empty(0)
         return self.finish(prepared, logits)
 
-    def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
-        """First stage: everything before the network, on the processor."""
-        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points), options)
+    def prepare(
+        self, cloud: object, options: DetectOptions, max_voxels: int | None = None
+    ) -> Prepared:
+        """First stage: everything before the network, on the processor.
+
+        Args:
+            cloud: As for `detect`.
+            options: As for `detect`.
+            max_voxels: Most voxels that the cloud may fill; None: any number.
+        """
+        sent = check_cloud(cloud, options.num_approach_points)
+        prepared = self._with_scene(sent, options, max_voxels)
         scene, gripper = prepared.scene, prepared.gripper
         if scene is None:
             return prepared
@@ -200,6 +209,7 @@ class GraspDetector:
         *,
         edges: object | None = None,
         hand_poses: object | None = None,
+        max_voxels: int | None = None,
     ) -> Scoring:
         """Score edges or hand poses of the caller's (the paper's grasp evaluation function).
 
@@ -214,6 +224,7 @@ class GraspDetector:
             edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. They
                 stand for the points of the processed cloud that they went into.
             hand_poses: (M, 4, 4) T_cloud_hand. Exactly one of the two is given.
+            max_voxels: As for `prepare`.
 
         Returns:
             One evaluation for each edge or pose, in order.
@@ -229,7 +240,7 @@ class GraspDetector:
             check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
         )
         no_region = {"approach_region": None, "contact_region": None}
-        prepared = self._with_scene(sent, options.model_copy(update=no_region))
+        prepared = self._with_scene(sent, options.model_copy(update=no_region), max_voxels)
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
@@ -252,12 +263,19 @@ class GraspDetector:
         seconds, name = prepared.total_seconds(), self.metadata.name
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
 
-    def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
+    def _with_scene(
+        self, sent: CheckedCloud, options: DetectOptions, max_voxels: int | None
+    ) -> Prepared:
         """Choose the gripper and build the scene, where enough of the cloud is left."""
         prepared = self._begun(sent, options)
         with prepared.timed("cloud"):
             prepared.scene = build_scene(
-                sent, options, self.metadata.voxel_size, prepared.counts, prepared.warnings
+                sent,
+                options,
+                self.metadata.voxel_size,
+                prepared.counts,
+                prepared.warnings,
+                max_voxels,
             )
         if prepared.scene is None:
             prepared.warn_of_few_points()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from edgegrasp_model.option_types import Direction, Strict
+from edgegrasp_model.option_types import Direction, Strict, numeric
 
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's way and straight down
 SIDE_ANGLE = math.radians(30)  # between the hand's way and the horizontal
@@ -21,7 +21,7 @@ class Cone(Strict):
     direction: Direction = Field(
         description="the way the hand moves toward the object, +z of the hand; any length but zero"
     )
-    max_angle: Annotated[float, Field(ge=0.0, le=math.pi)] = Field(
+    max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric] = Field(
         description="radians between it and the hand's way"
     )
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from edgegrasp_model.errors import InvalidGripper
-from edgegrasp_model.option_types import Strict, ordered
+from edgegrasp_model.option_types import Number, Strict, numeric, ordered
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
 
@@ -20,14 +20,14 @@ SAME = 1e-6  # metres below which two lengths of a file are the same
 
 Corner = Annotated[
     tuple[
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
     ],
     Field(description="x, y, z in the hand frame, metres"),
 ]
 Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
-Length = Annotated[float, Field(gt=0.0, le=1.0)]
+Length = Annotated[float, Field(gt=0.0, le=1.0), numeric]
 
 
 class HandPart(Strict):
@@ -42,11 +42,11 @@ class HandPart(Strict):
         return self
 
 
-class Swing(Strict):
+class Linkage(Strict):
     """A linkage that carries each finger along an arc: its tips come forward as it closes."""
 
     radius: Length = Field(description="length of the link that carries a finger, metres")
-    reach: float = Field(
+    reach: Number = Field(
         ge=-1.0, le=1.0, description="outward part (y) of that link in the open gripper, metres"
     )
 
@@ -60,10 +60,10 @@ class GripperGeometry(Strict):
     contact_z: Length = Field(
         description="where contacts are put, metres along z; between palm and fingertips"
     )
-    tcp_z: float = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
+    tcp_z: Number = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
     finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
-    swing: Swing | None = Field(
+    swing: Linkage | None = Field(
         default=None, description="how the fingers swing; null: they close in a straight line"
     )
 
@@ -103,7 +103,7 @@ class Gripper:
     pad_half_width: float  # half extent along x of the part of a finger that touches, metres
     hand_boxes: Boxes
     finger_boxes: Boxes  # one finger of the open gripper, its inner face at y = 0
-    swing: Swing | None = None
+    swing: Linkage | None = None
 
     @cached_property
     def T_hand_tcp(self) -> NDArray[np.float32]:  # noqa: N802
@@ -186,7 +186,7 @@ class Gripper:
         swing = self.swing
         if swing is not None:
             reach = swing.reach - (self.max_opening - opening) / 2
-            swing = Swing(radius=swing.radius, reach=reach)
+            swing = Linkage(radius=swing.radius, reach=reach)
         return replace(
             self,
             max_opening=opening,

@@ -3,9 +3,23 @@
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
+
+
+def _no_text_or_truth(value: object) -> object:
+    """Refuse what Python would convert to a number, such as true and "3"."""
+    if isinstance(value, bool | str | bytes):
+        raise ValueError("must be a number")
+    return value
+
+
+# Stands last in an annotation: pydantic writes wrong schemas for bounds that come after it.
+numeric = BeforeValidator(_no_text_or_truth)
+Integer = Annotated[int, numeric]
+Number = Annotated[float, numeric]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST, le=FARTHEST), numeric]
 Vector = Annotated[tuple[Finite, Finite, Finite], Field(description="x, y, z in the cloud's frame")]
 Row = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 

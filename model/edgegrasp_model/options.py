@@ -7,6 +7,7 @@ from pydantic import (
     BeforeValidator,
     Discriminator,
     Field,
+    StrictBool,
     Tag,
     ValidationError,
     model_validator,
@@ -15,7 +16,15 @@ from pydantic import (
 from edgegrasp_model.directions import ApproachDirection, Cone
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.gripper import GripperGeometry
-from edgegrasp_model.option_types import Direction, Strict, Vector, ordered
+from edgegrasp_model.option_types import (
+    Direction,
+    Integer,
+    Number,
+    Strict,
+    Vector,
+    numeric,
+    ordered,
+)
 from edgegrasp_model.regions import Box, OrientedBox, Region
 from edgegrasp_model.support import RansacPlane, SupportPlane
 
@@ -57,8 +66,8 @@ class Workspace(Strict):
 class Suppression(Strict):
     """Drop a grasp near a better one: nearer than both distances."""
 
-    translation: float = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
-    rotation: float = Field(
+    translation: Number = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
+    rotation: Number = Field(
         default=0.5,
         ge=0.0,
         le=3.2,
@@ -74,20 +83,20 @@ class Collision(Strict):
         description="grasps whose hand collides: left out, their scores worth half in the "
         "ranking, or not looked for",
     )
-    margin: float = Field(
+    margin: Number = Field(
         default=0.0,
         ge=0.0,
         le=0.1,
         description="metres kept free around the hand: its boxes are grown by this on every side",
     )
-    opening: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
+    opening: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
         default=None,
         description="metres between the fingers on the way in; null: the gripper's maximum",
     )
-    approach_length: float = Field(
+    approach_length: Number = Field(
         default=0.05, ge=0.0, le=1.0, description="metres of straight way in along the approach"
     )
-    retreat_length: float = Field(
+    retreat_length: Number = Field(
         default=0.0, ge=0.0, le=1.0, description="metres of straight way out"
     )
     retreat_direction: Literal["back", "up"] = Field(
@@ -140,16 +149,16 @@ class DetectOptions(Strict):
         default=None,
         description="name of a gripper, or a gripper; null: the one the weights were trained for",
     )
-    num_approach_points: int = Field(
+    num_approach_points: Integer = Field(
         default=32, ge=1, le=MAX_APPROACH_POINTS, description="approach points sampled"
     )
-    num_candidates: int = Field(
+    num_candidates: Integer = Field(
         default=2000, ge=1, le=MAX_CANDIDATES, description="candidates scored at most"
     )
     sampling: Literal["farthest", "uniform"] = Field(
         default="farthest", description="how approach points are sampled"
     )
-    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
+    seed: Integer = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
     viewpoint: (
         Annotated[
             Annotated[Vector, Tag("one")]
@@ -191,8 +200,10 @@ class DetectOptions(Strict):
         Collision,
         BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
     ] = Field(default=Collision(), description="what the hand must not meet; a bare mode will do")
-    min_score: float = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
-    top_k: int = Field(default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most")
+    min_score: Number = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
+    top_k: Integer = Field(
+        default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
+    )
     suppression: Suppression | None = Field(
         default=Suppression(), description="non-maximum suppression; null: none"
     )
@@ -201,7 +212,7 @@ class DetectOptions(Strict):
         description="what comes first: the score; the highest TCP along up among scores of 0.9 "
         "and more, then the others by score; or the clearance",
     )
-    debug: bool = Field(
+    debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"
     )
 

@@ -17,6 +17,7 @@ from edgegrasp_model.option_types import (
     Strict,
     UnitVector,
     Vector,
+    numeric,
     ordered,
 )
 
@@ -26,7 +27,7 @@ MAX_ROWS = 5_000_000
 HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
 
 Bools = NDArray[np.bool_]
-Length = Annotated[float, Field(gt=0.0, le=1000.0)]
+Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
 
 
 class Box(Strict):

@@ -52,6 +52,7 @@ def build_scene(
     voxel_size: float,
     counts: dict[str, int],
     warnings: list[str],
+    max_voxels: int | None = None,
 ) -> Scene | None:
     """Correct depths, crop, take the support away, voxelise, get normals, find the regions.
 
@@ -61,13 +62,15 @@ def build_scene(
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
         warnings: Gets what the caller should know.
+        max_voxels: Most voxels that the cloud may fill; None: any number.
 
     Returns:
         The scene, or None where too few points are left to make a surface.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints, or there are none to correct depths from.
+            views do not suit the viewpoints, or there are none to correct depths from, or the
+            cloud fills more than `max_voxels`.
     """
     viewpoints = check_viewpoints(sent, options)
     sent, support = cut_out(sent, viewpoints, options, counts, warnings)
@@ -80,6 +83,10 @@ def build_scene(
     voxels = clouds.voxelise(points, voxel_size)
     middles = voxels.mean(points)
     counts["voxels"] = len(middles)
+    if max_voxels is not None and len(middles) > max_voxels:
+        value = f"a cloud that fills {len(middles)} voxels of {voxel_size:g} m"
+        fix = f"Send a workspace around the objects that holds at most {max_voxels} of them."
+        raise InvalidRequest("options.workspace", value, fix)
     kept = clouds.inliers(middles)
     counts["kept"] = int(kept.sum())
     if counts["kept"] < MIN_POINTS:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from edgegrasp_model.option_types import Finite, Strict, UnitVector
+from edgegrasp_model.option_types import Finite, Strict, UnitVector, numeric
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -27,7 +27,7 @@ class SupportPlane(Strict):
     kind: Literal["plane"] = "plane"
     normal: UnitVector = Field(description="unit normal, away from the table")
     offset: Finite = Field(description="normal . x of its points, metres")
-    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3)] = Field(
+    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = Field(
         default=0.0,
         description="share by which a camera's depths may be wrong: each view is scaled about its "
         "viewpoint by up to this until the plane that it sees lies in place; 0: not at all",
@@ -47,13 +47,13 @@ class RansacPlane(Strict):
     """
 
     kind: Literal["ransac"] = "ransac"
-    distance: Annotated[float, Field(gt=0.0, le=0.1)] = Field(
+    distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
         default=0.005, description="metres from the plane within which points belong to it"
     )
-    max_tilt: Annotated[float, Field(ge=0.0, le=1.6)] = Field(
+    max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
         default=0.35, description="radians between its normal and up; a quarter turn: any plane"
     )
-    min_share: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+    min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
         default=0.1, description="share of the seen surface it must hold"
     )
 

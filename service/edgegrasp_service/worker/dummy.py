@@ -2,7 +2,7 @@
 
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.cloud_input import CloudInput, check_cloud
-from edgegrasp_model.errors import InvalidRequest, UnknownModel
+from edgegrasp_model.errors import UnknownModel
+from edgegrasp_model.given_grasps import check_edges, check_hand_poses
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,
@@ -30,36 +31,14 @@ WARNING = "The dummy detector made these grasps up."
 
 
 @dataclass(frozen=True)
-class DummyBatch:
-    """What the dummy network scores, of one request or of several."""
-
-    points: Float32  # (A, 3) approach points, each the only point of its ball
-    contact: Float32  # (A,) scores, which the network gives back
-    requests: int = 1
-
-    @property
-    def num_balls(self) -> int:
-        """Balls."""
-        return len(self.points)
-
-    @staticmethod
-    def concatenate(batches: Sequence["DummyBatch"]) -> "DummyBatch":
-        """Join batches into one."""
-        return DummyBatch(
-            np.concatenate([batch.points for batch in batches]),
-            np.concatenate([batch.contact for batch in batches]),
-            sum(batch.requests for batch in batches),
-        )
-
-
-@dataclass(frozen=True)
 class DummyPrepared:
     """A request between the stages."""
 
     options: DetectOptions
     points: Float32  # (N, 3)
     drawn: NDArray[np.int64]  # (A,) approach points, rows of `points`
-    batch: DummyBatch
+    batch: Float32  # (A,) scores, which the network gives back
+    counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -67,43 +46,38 @@ class DummyDetector:
     """Puts top-down grasps on points drawn by the seed; they hold nothing.
 
     Args:
-        seconds: What the network takes for one request; as much for each that share a pass.
-        begin: Called as "prepare", "run", "finish" and "score" begin, with what they work on. It
-            may wait, or raise: tests of the service do both.
+        seconds: What the network takes for one request.
     """
 
-    def __init__(
-        self, seconds: float = 0.0, begin: Callable[[str, object], None] | None = None
-    ) -> None:
+    def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
-        self._begin = begin or (lambda stage, subject: None)
 
-    def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
+    def prepare(
+        self, cloud: CloudInput, options: DetectOptions, max_voxels: int | None = None
+    ) -> DummyPrepared:
         """Draw approach points, the same ones for the same cloud and options.
 
         Args:
             cloud: As for a real detector.
             options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
+            max_voxels: Without effect: the dummy makes no voxels.
 
         Raises:
             InvalidRequest: The cloud is none, as for a real detector.
         """
-        self._begin("prepare", cloud)
         points = check_cloud(cloud, options.num_approach_points).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), options.num_approach_points, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
-        return DummyPrepared(options, points, drawn, DummyBatch(points[drawn], scores))
+        return DummyPrepared(options, points, drawn, scores)
 
-    def run(self, batch: DummyBatch) -> Float32:
+    def run(self, batch: Float32) -> Float32:
         """Take the time of a network."""
-        self._begin("run", batch)
-        time.sleep(self._seconds * batch.requests)
-        return batch.contact
+        time.sleep(self._seconds)
+        return batch
 
     def finish(self, prepared: DummyPrepared, logits: NDArray[Any]) -> Detection:
         """Put a grasp on each of the best approach points."""
-        self._begin("finish", prepared)
         options, points, drawn = prepared.options, prepared.points, prepared.drawn
         grasps = [
             _top_down(points[row], float(score))
@@ -127,52 +101,43 @@ class DummyDetector:
         *,
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
+        max_voxels: int | None = None,
     ) -> Scoring:
         """Make up scores; an edge from a point to itself defines no grasp.
 
         Raises:
-            InvalidRequest: The cloud is none, or an edge names a row that it does not have.
+            InvalidRequest: The cloud is none, an edge names a row that it does not have, or a pose
+                is none.
         """
         start = time.perf_counter()
-        self._begin("score", cloud)
         checked = check_cloud(cloud)
         random = np.random.default_rng(options.seed)
         if edges is not None:
-            outside = ((edges < 0) | (edges >= checked.rows_sent)).any(axis=1)
-            if outside.any():
-                bad = edges[int(np.argmax(outside))].tolist()
-                fix = f"Send rows of the cloud, 0 to {checked.rows_sent - 1}."
-                raise InvalidRequest("edges", str(bad), fix)
             contacts: list[Float32 | None] = [
                 None if approach == contact else _row(checked.points, checked.row, contact)
-                for approach, contact in edges
+                for approach, contact in check_edges(edges, checked.rows_sent)
             ]
         else:
-            assert hand_poses is not None
-            contacts = list((hand_poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
+            poses = check_hand_poses(hand_poses)
+            contacts = list((poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
+        scores = random.random(len(contacts), dtype=np.float32)
         evaluations = [
             Evaluation(None, NoGrasp.TOO_SHORT)
             if contact is None
             else Evaluation(_top_down(contact, float(score)), None)
-            for contact, score in zip(
-                contacts, random.random(len(contacts), dtype=np.float32), strict=True
-            )
+            for contact, score in zip(contacts, scores, strict=True)
         ]
         seconds = {"total": time.perf_counter() - start}
-        counts = {
-            "points": len(checked.points),
-            "scored": len(contacts) - sum(contact is None for contact in contacts),
-        }
+        scored = len(contacts) - sum(contact is None for contact in contacts)
+        counts = {"points": len(checked.points), "scored": scored}
         return Scoring(evaluations, counts, seconds, NAME, [WARNING])
 
 
 class DummyCatalogue:
     """The dummy detector as the only weights."""
 
-    def __init__(
-        self, seconds: float = 0.0, begin: Callable[[str, object], None] | None = None
-    ) -> None:
-        self._detector = DummyDetector(seconds, begin)
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._detector = DummyDetector(seconds)
 
     def get(self, name: str = "") -> DummyDetector:
         """The detector; raises UnknownModel for any name but its own."""
