@@ -27,6 +27,8 @@ def log_call(call: Call) -> None:
             "%s failed with %s\n%s", call.method, call.facts.options, call.facts.traceback
         )
     level = logging.DEBUG if call.method in PROBES else logging.INFO
+    if call.problem is not None and call.problem.status >= 500:
+        level = logging.WARNING
     if not requests.isEnabledFor(level):
         return
     milliseconds = {name: round(seconds * 1e3, 1) for name, seconds in call.stages.items()}
@@ -35,6 +37,7 @@ def log_call(call: Call) -> None:
         "method": call.method,
         "code": call.code,
         "error": "" if call.problem is None else call.problem.kind,
+        "detail": "" if call.problem is None else call.problem.detail,
         "seconds": round(call.seconds, 6),
         "peer": call.peer,
         "token": call.token,
@@ -93,6 +96,7 @@ class LogQueue(logging.handlers.QueueHandler):
         super().__init__(queue.Queue(MAX_WAITING))
         self.setFormatter(formatter)
         self.dropped = 0
+        self._closed = False
         self._stream = stream
         writer = logging.Handler()
         writer.handle = self._write  # type: ignore[method-assign, assignment]
@@ -112,6 +116,9 @@ class LogQueue(logging.handlers.QueueHandler):
 
     def close(self) -> None:
         """Write what is queued, unless nobody reads it."""
+        if self._closed:
+            return
+        self._closed = True
         stop = threading.Thread(target=self._stop, daemon=True)
         stop.start()
         stop.join(STOP_SECONDS)

@@ -1,7 +1,7 @@
 """What Prometheus reads at /metrics. Every label has few values, whatever callers send."""
 
 import http
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
@@ -9,8 +9,8 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
-from edgegrasp_service.errors import STATUS
 from edgegrasp_service.call import Call
+from edgegrasp_service.errors import STATUS
 
 OTHER = "other"
 SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
@@ -70,7 +70,7 @@ class Metrics:
         """Show a number that is asked for when metrics are read."""
         Gauge(f"edgegrasp_{name}", meaning, registry=self.registry).set_function(value)
 
-    def describe_models(self, models: Callable[[], Sequence[Mapping[str, Any]]]) -> None:
+    def describe_models(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
         """Show the loaded weights, whichever they are when metrics are read."""
         self.registry.register(_ModelCollector(models))
 
@@ -95,13 +95,14 @@ class Metrics:
 
 
 class _ModelCollector(Collector):
-    def __init__(self, models: Callable[[], Sequence[Mapping[str, Any]]]) -> None:
+    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
         self._models = models
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         labels = ("name", "digest", "architecture", "default", "device")
         family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
         for model in self._models():
-            facts = (str(model.get(label, "")) for label in labels)
-            family.add_metric([fact.lower() if fact in ("True", "False") else fact for fact in facts], 1.0)
+            default = str(model.get("default", False)).lower()
+            facts = [str((model | {"default": default}).get(label, "")) for label in labels]
+            family.add_metric(facts, 1.0)
         yield family

@@ -208,7 +208,6 @@ def load_settings_and_origins(
     config: Path | None = None, **given: object
 ) -> tuple[Settings, Origins]:
     """As `load_settings`, and where each setting came from; raises as it does."""
-
     origins = dict.fromkeys(Settings.model_fields, "default")
     try:
         path = config or _config_of_environment()
@@ -271,7 +270,9 @@ def _refuse_unknown(
         if name not in choices:
             nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
             shown = label(nearest).rpartition(": ")[2]
-            raise InvalidSettings(f"{one_line(label(name))}: no such setting. Did you mean {shown}?")
+            raise InvalidSettings(
+                f"{one_line(label(name))}: no such setting. Did you mean {shown}?"
+            )
 
 
 def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:

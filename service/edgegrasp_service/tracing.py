@@ -3,8 +3,8 @@
 import time
 from typing import Any
 
-from edgegrasp_service.errors import InvalidSettings
 from edgegrasp_service.call import Call
+from edgegrasp_service.errors import InvalidSettings
 
 NANOSECONDS = 1_000_000_000
 

@@ -14,17 +14,18 @@ from typing import Any, Literal
 import grpc
 from google.protobuf.message import DecodeError
 from grpc import aio
+from grpc.aio import EOF  # type: ignore[attr-defined]  # not in its stubs
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.errors import AddressInUse, Cancelled, Overloaded, report
 from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.errors import AddressInUse, Cancelled, Overloaded, report
 from edgegrasp_service.front.grpc_stream import answer_stream
 from edgegrasp_service.front.problems import abort
-from edgegrasp_service.front.service import GraspService, check_headers
 from edgegrasp_service.front.reload import Reloader
+from edgegrasp_service.front.service import GraspService, check_headers
 
 logger = logging.getLogger(__name__)
 
@@ -171,7 +172,7 @@ class _Methods:
                 message = await context.read()
         except TimeoutError:
             raise self._service.too_slow(0) from None
-        if message is aio.EOF:
+        if message is EOF:
             raise InvalidRequest("request", "nothing", "Send one message.")
         self._service.check_size(len(message))
         body: bytes = message
@@ -257,7 +258,7 @@ class _Interceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic 
                     await behaviour(messages, context)
                     call.code = "OK"
                 except EdgeGraspError as error:
-                    await _abort(context, error)
+                    await abort(context, report(error))
                 except BaseException as error:
                     call.code = call.code or _code(error, context)
                     raise
@@ -280,7 +281,7 @@ class _Interceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic 
             try:
                 async with self._small_reads, asyncio.timeout(SMALL_READ_SECONDS):
                     data = await context.read()
-                return None if data is aio.EOF else decode(data)
+                return None if data is EOF else decode(data)
             except TimeoutError:
                 raise Cancelled("The message did not arrive.") from None
             except DecodeError:
@@ -308,13 +309,6 @@ class _Interceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic 
 
 async def _unimplemented(messages: Any, context: Any) -> None:
     await context.abort(grpc.StatusCode.UNIMPLEMENTED, "Method not found!")
-
-
-async def _abort(context: Any, error: EdgeGraspError) -> None:
-    problem = report(error)
-    if problem.status >= 500:
-        logger.warning("gRPC: %s", problem.detail)
-    await abort(context, problem)
 
 
 def _headers(metadata: Any) -> dict[str, str]:

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
-from grpc import aio
+from grpc.aio import EOF  # type: ignore[attr-defined]  # not in its stubs
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.errors import NotReady, Problem, report
 from edgegrasp_service.call import Call
+from edgegrasp_service.errors import NotReady, Problem, report
 from edgegrasp_service.front.problems import error_detail
 from edgegrasp_service.front.service import STOPPING, GraspService
 
@@ -81,7 +81,7 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
 async def _read(context: Any) -> Any:
     """The next envelope; None: there are no more."""
     data = await context.read()
-    if data is aio.EOF:
+    if data is EOF:
         return None
     try:
         envelope = _RequestEnvelope.FromString(data)
@@ -143,7 +143,7 @@ def _envelope(name: str, **fields: int) -> Any:
     file = descriptor_pb2.FileDescriptorProto(name=f"{name}.proto", package="edgegrasp.envelopes")
     message = file.message_type.add(name=name)
     for number, (field, kind) in enumerate(fields.items(), 1):
-        message.field.add(name=field, number=number, type=kind, label=1)  # type: ignore[arg-type]
+        message.field.add(name=field, number=number, type=kind, label=1)
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return message_factory.GetMessageClass(

@@ -1,7 +1,6 @@
 """The HTTP transport: routes, and the middleware around every request."""
 
 import asyncio
-import logging
 import math
 from collections.abc import Coroutine
 from typing import Any, Literal
@@ -14,16 +13,24 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
-from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.problems import problem_response
+from edgegrasp_service.front.reload import Reloader
 from edgegrasp_service.front.service import GraspService, check_headers
 from edgegrasp_service.metrics import Metrics
-from edgegrasp_service.openapi import Document
-from edgegrasp_service.front.reload import Reloader
+from edgegrasp_service.schemas import (
+    TIMEOUT,
+    DetectionBody,
+    HealthBody,
+    ModelsBody,
+    ProblemBody,
+    ScoringBody,
+    openapi_detect,
+    openapi_score,
+)
 from edgegrasp_service.worker.job import Answer
 
-TIMEOUT = "X-Request-Timeout"
 ASSETS = "/docs/assets"
 PIECE = 2**18  # bytes of an answer given to the connection at a time
 
@@ -44,7 +51,30 @@ METHODS = {
 OPEN = ("Live", "Ready", "Docs")
 UNANSWERED = "499"  # the caller went away; as nginx logs it
 
-logger = logging.getLogger(__name__)
+DESCRIPTION = """Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
+
+Metres, radians, seconds. Positions and directions are in the frame of the cloud sent;
+`T_cloud_hand` maps hand coordinates to cloud coordinates. Errors are problem documents that name
+the field, the value received and the fix."""
+
+PROBLEM = {"content": {"application/problem+json": {"schema": ProblemBody.model_json_schema()}}}
+PROBLEMS = {
+    400: "The cloud or an option is wrong.",
+    401: "No token, or none that the server knows.",
+    403: "A token for detection, or a server without admin tokens.",
+    404: "No weights of that name.",
+    408: "The body arrives too slowly.",
+    409: "New weights cannot be used; the old ones still serve.",
+    413: "Over the server's limits.",
+    415: "A body the server does not read.",
+    429: "The server is full; Retry-After says for how long.",
+    431: "Headers over the server's limits.",
+    500: "The server failed; its log says why.",
+    501: "The format's reader is not installed on the server.",
+    503: "Weights are loading, the server is stopping, or the worker of the request died.",
+    504: "The deadline passed before there was an answer.",
+}
+OF_REQUESTS = (400, 401, 404, 408, 413, 415, 429, 431, 500, 501, 503, 504)
 
 
 class HttpMiddleware:
@@ -104,61 +134,93 @@ class HttpMiddleware:
             raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
 
 
-def create_app(
-    service: GraspService, metrics: Metrics, reloader: Reloader, document: Document
-) -> ASGIApp:
-    """The ASGI application.
+def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> FastAPI:
+    """The application, without its middleware.
 
     Args:
         service: What answers.
         metrics: What /metrics shows.
         reloader: What reloads.
-        document: The OpenAPI document.
     """
     app: FastAPI = FastAPIOffline(
-        title="EdgeGrasp", version="v1", redoc_url=None, static_url=ASSETS, redirect_slashes=False
+        title="EdgeGrasp",
+        version="v1",
+        description=DESCRIPTION,
+        redoc_url=None,
+        static_url=ASSETS,
+        redirect_slashes=False,
     )
-    app.openapi = document  # type: ignore[method-assign]
-    app.add_exception_handler(EdgeGraspError, _answer_error)
-    app.add_exception_handler(Exception, _answer_error)
+    for kind in (EdgeGraspError, Exception):
+        app.add_exception_handler(kind, _answer_error)
     app.add_exception_handler(HTTPException, _answer_http_error)
 
-    @app.post("/v1/grasps")
+    @app.post(
+        "/v1/grasps",
+        summary="Find grasps in one cloud",
+        response_model=DetectionBody,
+        responses=_problems(*OF_REQUESTS),
+        openapi_extra=openapi_detect(),
+    )
     async def detect_grasps() -> Response:
         return _GraspResponse(service, "DetectGrasps")
 
-    @app.post("/v1/grasps:score")
+    @app.post(
+        "/v1/grasps:score",
+        summary="Score edges or hand poses in one cloud",
+        response_model=ScoringBody,
+        responses=_problems(*OF_REQUESTS),
+        openapi_extra=openapi_score(),
+    )
     async def score_grasps() -> Response:
         return _GraspResponse(service, "ScoreGrasps")
 
-    @app.get("/v1/models")
+    @app.get(
+        "/v1/models",
+        summary="List the loaded weights",
+        response_model=ModelsBody,
+        responses=_problems(401, 503),
+    )
     async def list_models() -> JSONResponse:
         return JSONResponse({"models": [vars(model) for model in service.models()]})
 
-    @app.post("/v1/models:reload")
+    @app.post(
+        "/v1/models:reload",
+        summary="Load weights, tokens and certificates anew; needs an admin token",
+        response_model=ModelsBody,
+        responses=_problems(401, 403, 409, 503),
+    )
     async def reload() -> JSONResponse:
         models = await reloader.reload(current_call())
         return JSONResponse({"models": [vars(model) for model in models]})
 
-    @app.get("/health/live")
+    @app.get("/health/live", summary="Does the process answer?", response_model=HealthBody)
     async def live() -> JSONResponse:
         return JSONResponse({"status": "live"})
 
-    @app.get("/health/ready")
+    @app.get(
+        "/health/ready",
+        summary="Are weights loaded and warmed up?",
+        response_model=HealthBody,
+        responses={503: {"description": "Not yet, or no longer.", "model": HealthBody}},
+    )
     async def ready() -> JSONResponse:
         status = "ready" if service.ready else "not ready"
         return JSONResponse({"status": status}, status_code=200 if service.ready else 503)
 
-    @app.get("/metrics")
+    @app.get("/metrics", include_in_schema=False)
     async def read_metrics(request: Request) -> Response:
         body, content_type = metrics.page(request.headers.get("accept", ""))
         return PlainTextResponse(body, headers={"content-type": content_type})
 
-    @app.get("/")
+    @app.get("/", include_in_schema=False)
     async def index() -> Response:
         return RedirectResponse("/docs")
 
-    return HttpMiddleware(app, service)
+    return app
+
+
+def _problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    return {status: {"description": PROBLEMS[status], **PROBLEM} for status in statuses}
 
 
 class _GraspResponse(Response):
@@ -272,8 +334,6 @@ def _timeout(headers: Headers) -> float:
 
 def _problem(call: Call, problem: Problem) -> Response:
     call.problem = problem
-    if problem.status >= 500:
-        logger.warning("%s: %s", call.method, problem.detail)
     return problem_response(problem)
 
 

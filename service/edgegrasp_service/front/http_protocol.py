@@ -1,4 +1,4 @@
-"""HTTP/1.1 as uvicorn speaks it with httptools, bounded: what uvicorn leaves open is closed here."""
+"""HTTP/1.1 as uvicorn speaks it with httptools, with the bounds that uvicorn leaves open."""
 
 import asyncio
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import Any
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.errors import HeadersTooLarge, Overloaded, Problem, RequestTimeout, report
+from edgegrasp_service.errors import HeadersTooLarge, Overloaded, RequestTimeout, report
 from edgegrasp_service.front.problems import problem_document
 from edgegrasp_service.settings import Settings
 

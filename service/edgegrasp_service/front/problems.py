@@ -7,16 +7,19 @@ import grpc
 import orjson
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.protobuf.duration_pb2 import Duration
-from google.protobuf.message import Message
-from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
-from google.rpc.status_pb2 import Status
+from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
+    BadRequest,
+    ErrorInfo,
+    RetryInfo,
+)
+from google.rpc.status_pb2 import Status  # type: ignore[import-untyped]
 from starlette.responses import Response
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.errors import Problem
 from edgegrasp_service.call import REQUEST_ID_HEADER, current_call
+from edgegrasp_service.errors import Problem
+from edgegrasp_service.schemas import KIND_PREFIX
 
-KIND_PREFIX = "urn:edgegrasp:error:"
 CHALLENGE = 'Bearer realm="edgegrasp"'
 DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
@@ -78,7 +81,7 @@ def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
 
 def _details(problem: Problem) -> list[AnyMessage]:
     reason = problem.kind.upper().replace("-", "_")
-    details: list[Message] = [ErrorInfo(reason=reason, domain=DOMAIN)]
+    details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
     if problem.retry_after is not None:
         delay = Duration()
         delay.FromMilliseconds(int(problem.retry_after * 1000))

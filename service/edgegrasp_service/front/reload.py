@@ -5,8 +5,8 @@ import logging
 from collections.abc import Callable
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import PermissionDenied, ReloadFailed
 from edgegrasp_service.call import Call
+from edgegrasp_service.errors import PermissionDenied, ReloadFailed
 from edgegrasp_service.front.service import GraspService, ModelInfo
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 

@@ -8,6 +8,7 @@ from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
+from edgegrasp_service.call import CALL, REQUEST_ID_HEADER, Call
 from edgegrasp_service.errors import (
     Cancelled,
     HeadersTooLarge,
@@ -17,7 +18,6 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front.admission import Admission, Ticket
-from edgegrasp_service.call import CALL, REQUEST_ID_HEADER, Call
 from edgegrasp_service.security import Tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job, Transport

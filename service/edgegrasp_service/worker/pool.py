@@ -21,7 +21,9 @@ from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.process import HEADER, LOST, Failed, Ready, pack, receive, send
 
 # -P: nothing is imported from the folder the server was started in.
-NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
+NURSERY = (
+    sys.executable, "-P", "-c", "from edgegrasp_service.worker.process import main; main()"
+)  # fmt: skip
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 WORKER_LOST = kind_of(WorkerLost)
@@ -141,7 +143,7 @@ class WorkerPool:
     async def _take(self) -> "_Worker":
         if self._idle:
             return self._idle.pop()
-        waiting = asyncio.get_running_loop().create_future()
+        waiting: asyncio.Future[_Worker] = asyncio.get_running_loop().create_future()
         self._waiting.append(waiting)
         try:
             return await waiting
@@ -223,7 +225,7 @@ class _Nursery:
         control, theirs = socket.socketpair()
         with theirs:
             environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-            process = subprocess.Popen(command, stdin=theirs, env=environment)
+            process = subprocess.Popen(command, stdin=theirs.fileno(), env=environment)
         nursery = cls(process, control)
         try:
             secretless = settings.model_copy(update={"tokens": (), "admin_tokens": ()})

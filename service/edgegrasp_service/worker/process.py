@@ -1,8 +1,8 @@
 """The processes that work: one that loads everything once, and those that fork from it.
 
-`python -m edgegrasp_service.worker.process` is the nursery. It imports and loads what a worker
-needs, and then forks a worker whenever the pool asks for one: there in milliseconds, its memory
-shared with all others until it is written to. The nursery never has a second thread.
+`main` is the nursery's. It imports and loads what a worker needs, and then forks a worker whenever
+the pool asks for one: there in milliseconds, its memory shared with all others until it is written
+to. The nursery never has a second thread.
 """
 
 import contextlib
@@ -161,7 +161,3 @@ def _read(source: socket.socket, size: int) -> bytearray:
             return bytearray()
         done += count
     return data
-
-
-if __name__ == "__main__":
-    main()
