@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from grpc import aio
 from grpc.aio import EOF  # type: ignore[attr-defined]  # not in its stubs
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from grpc_reflection.v1alpha import reflection
+from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
@@ -31,13 +31,13 @@ logger = logging.getLogger(__name__)
 
 SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
 HEALTH = health.SERVICE_NAME
-REFLECTION = ("grpc.reflection.v1", "grpc.reflection.v1alpha")
+REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
 # Values of the label `method`.
 METHODS = {
     **{f"/{SERVICE.full_name}/{name}": name for name in SERVICE.methods_by_name},
     **{f"/{HEALTH}/{name}": f"Health{name}" for name in ("Check", "Watch", "List")},
-    **{f"/{name}.ServerReflection/ServerReflectionInfo": "Reflection" for name in REFLECTION},
+    **{f"/{name}/ServerReflectionInfo": "Reflection" for name in REFLECTION},
 }
 LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
 SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
@@ -89,7 +89,13 @@ class GrpcServer:
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
-        reflection.enable_server_reflection(names, self._server)
+        reflect = grpc.stream_stream_rpc_method_handler(
+            reflection.aio.ReflectionServicer(names).ServerReflectionInfo,  # type: ignore[attr-defined]
+            reflection_pb2.ServerReflectionRequest.FromString,
+            reflection_pb2.ServerReflectionResponse.SerializeToString,
+        )
+        for name in REFLECTION:  # the same messages under both names
+            self._add(name, {"ServerReflectionInfo": reflect})
         host = settings.host
         address = f"[{host}]" if ":" in host else host
         try:
@@ -228,9 +234,6 @@ class _Interceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic 
     ) -> Handler:
         """The method's handler, named, counted and logged."""
         path: str = handler_call_details.method
-        if path.startswith("/grpc.reflection.v1."):  # the same messages under the name of today
-            alpha = path.replace("reflection.v1.", "reflection.v1alpha.")
-            handler_call_details = handler_call_details._replace(method=alpha)  # type: ignore[attr-defined]
         handler = await continuation(handler_call_details) or _handler(_unimplemented)
         known, around = self._around.get(path, (None, None))
         if known is not handler:
