@@ -18,8 +18,8 @@ import torch
 from benchmarks.scenes import detector, observe, request
 from benchmarks.timing import interleaved, machine
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 from edgegrasp_model.options import Collision
 from edgegrasp_sim.observation import Observation
 

@@ -26,8 +26,8 @@ class InProcess:
 
     def seconds(self) -> tuple[float, float]:
         """What one detection takes, by the clock and of processors."""
-        from edgegrasp_model.cloud_input import CloudInput
         from edgegrasp_model.options import parse_options
+        from edgegrasp_model.scene.cloud import CloudInput
 
         parsed = parse_options(dict(OPTIONS))
         start, cpu = time.perf_counter(), time.process_time()
@@ -45,7 +45,7 @@ def _detector(kind: str) -> Any:
         return DummyDetector(float(kind) / 1000)
     import torch
 
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
 
     torch.set_num_threads(1)
     return ModelCatalogue.load((), default="", grippers=()).get("")

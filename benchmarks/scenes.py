@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.observation import Observation

@@ -23,17 +23,12 @@ from benchmarks.textbook.edge_grasp import edge_grasp_logits
 from benchmarks.textbook.pipeline import detect
 from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
 from benchmarks.timing import interleaved, machine, summary
-
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.int8_network import INT8, quantise
-from edgegrasp_model.network import EdgeGraspNet
-from edgegrasp_model.network_config import (
-    EDGEGRASP,
-    EDGEGRASP_SMALL,
-    VN_EDGEGRASP,
-    NetworkConfig,
-)
+
+from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, VN_EDGEGRASP, NetworkConfig
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.simulation import ClutterSimulation

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse, Polygon, Rectangle, Wedge
 from numpy.typing import NDArray
 
-from edgegrasp_model.directions import SIDE_ANGLE, TOP_DOWN_ANGLE
+from edgegrasp_model.candidates.sample import SIDE_ANGLE, TOP_DOWN_ANGLE
 from edgegrasp_model.gripper import Gripper, gripper_names, load_gripper
 
 Float64 = NDArray[np.float64]
@@ -83,9 +83,9 @@ def frame(ax: Axes, origin: Float64, name: str, length: float, axes: Float64 = D
 
 def grippers() -> Figure:
     """Every gripper that ships: boxes, hand frame, TCP frame and heights along z."""
-    shown = sorted((load_gripper(name) for name in gripper_names()), key=lambda g: g.foremost_z)
+    shown = sorted((load_gripper(name) for name in gripper_names()), key=lambda g: g.max_tip_z)
     rows = [shown[start : start + 2] for start in range(0, len(shown), 2)]
-    reach = [max(gripper.foremost_z for gripper in row) + 0.07 for row in rows]
+    reach = [max(gripper.max_tip_z for gripper in row) + 0.07 for row in rows]
     figure, panels = plt.subplots(
         len(rows),
         2,
@@ -128,7 +128,7 @@ def _gripper_panel(ax: Axes, gripper: Gripper) -> None:
     if gripper.swing is not None:
         heights.append((gripper.tip_z + float(gripper.tip_advance(0.0)), "fingertips, closed"))
     _heights(ax, heights)
-    half, below = gripper.max_opening / 2, -gripper.foremost_z - 0.042
+    half, below = gripper.max_opening / 2, -gripper.max_tip_z - 0.042
     dimension(
         ax,
         np.array([-half, below]),

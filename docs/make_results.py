@@ -18,7 +18,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from edgegrasp_model.network import build_network
+from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_sim.experiment_report import experiment_table, percent, title_of
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.published import published

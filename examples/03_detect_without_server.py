@@ -7,7 +7,7 @@ Needs the extra `service`. The cloud is a made-up box of 5 x 8 x 6 cm on a table
 
 import numpy as np
 
-from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions, SupportPlane
 
 

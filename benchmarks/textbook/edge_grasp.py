@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import EdgeGraspNet, GlobalFeature, PointNetConv
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet, GlobalFeature, PointNetConv
 
 
 def edge_grasp_logits(network: EdgeGraspNet, batch: BallBatch) -> Tensor:

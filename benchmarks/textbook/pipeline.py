@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from edgegrasp_model.ball_batch import BallBatch
+from edgegrasp_model.networks.balls import BallBatch
 
 Float32 = NDArray[np.float32]
 

@@ -3,13 +3,15 @@
 import torch
 from torch import Tensor, nn
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.vn_layers import VNLinearReLU, VNReLU, VNSharedLinearReLU
-from edgegrasp_model.vn_network import (
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.vn_edgegrasp import (
     VNBallMaximum,
     VNEdgeGraspNet,
     VNGlobalFeature,
+    VNLinearReLU,
     VNPointNetConv,
+    VNReLU,
+    VNSharedLinearReLU,
 )
 
 # Features are (..., C, 3), the vector last, as in the Vector Neurons paper.

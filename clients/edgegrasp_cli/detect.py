@@ -145,8 +145,7 @@ def _in_this_process(
         data = file.read_bytes()
         cloud = decode_file(file.suffix[1:].lower(), data, max_points=sys.maxsize)
 
-        from edgegrasp_model.catalogue import ModelCatalogue  # after what fails fast
-        from edgegrasp_model.on_device.choice import choose_device
+        from edgegrasp_model.detector import ModelCatalogue, choose_device
 
         catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
         return catalogue.get(parsed.model).detect(cloud, parsed)

@@ -19,10 +19,10 @@ def import_checkpoint(
     gripper: Annotated[str, Option(help="Gripper it was trained for.")] = "panda",
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""
-    from edgegrasp_model.checkpoint import save_checkpoint
     from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.gripper import load_gripper
-    from edgegrasp_model.import_checkpoint import import_checkpoint as convert
+    from edgegrasp_model.networks.checkpoint import save_checkpoint
+    from edgegrasp_model.networks.import_checkpoint import import_checkpoint as convert
 
     try:
         load_gripper(gripper)

@@ -66,7 +66,7 @@ def _of_server(address: str, connection: tuple[Any, ...]) -> "list[Model]":
 
 def _of_this_process(weights: list[Path]) -> "list[Model]":
     from edgegrasp_client import Model
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.errors import EdgeGraspError
 
     try:

@@ -86,7 +86,7 @@ def train(
         training_views = part_of(training_views, training_share, seed)
         metadata = recipe(model)
         taught = run.parent / "taught"
-        guide = None if teacher is None else Teacher(teacher, metadata.crop_radius, taught)
+        guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
         if crop_radius is not None:
             metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
         trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)

@@ -32,6 +32,7 @@ from edgegrasp_client.options import (
     HalfSpace,
     HandPart,
     Indices,
+    Linkage,
     Mask,
     OrientedBox,
     RansacPlane,
@@ -40,7 +41,6 @@ from edgegrasp_client.options import (
     Sphere,
     SupportPlane,
     Suppression,
-    Swing,
     Workspace,
 )
 from edgegrasp_client.point_cloud2 import PointCloud2, PointField
@@ -70,6 +70,7 @@ __all__ = [
     "Indices",
     "Intrinsics",
     "InvalidRequestError",
+    "Linkage",
     "Mask",
     "Model",
     "OrientedBox",
@@ -89,7 +90,6 @@ __all__ = [
     "StreamRequest",
     "SupportPlane",
     "Suppression",
-    "Swing",
     "Tls",
     "UnknownModelError",
     "Workspace",

@@ -132,7 +132,7 @@ class HandPart(TypedDict):
     boxes: Sequence[Sequence[Vector]]  # [min corner, max corner] each, metres
 
 
-class Swing(TypedDict):
+class Linkage(TypedDict):
     """A linkage that carries each finger along an arc."""
 
     radius: float  # length of the link that carries a finger, metres
@@ -149,7 +149,7 @@ class GripperGeometry(TypedDict):
     tcp_z: float  # origin of the TCP frame, metres along z
     hand: HandPart
     finger: HandPart  # one finger, its inner face at y = 0
-    swing: NotRequired[Swing | None]  # None: the fingers close in a straight line
+    swing: NotRequired[Linkage | None]  # None: the fingers close in a straight line
 
 
 class Suppression(TypedDict, total=False):

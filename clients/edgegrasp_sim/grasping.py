@@ -213,7 +213,7 @@ def _holds_when_shaken(
     held: SceneObject,
     objects: Mapping[int, SceneObject],
 ) -> bool:
-    """Swing the lifted hand from side to side; whether it still holds the object then."""
+    """Linkage the lifted hand from side to side; whether it still holds the object then."""
     T_world_lifted = retreat_pose(T_world_hand)
     gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
     for along in np.eye(3)[:2]:

@@ -1,47 +1,58 @@
-"""The pipeline: a point cloud in, ranked grasps out."""
+"""The pipeline: a point cloud in, ranked grasps out; and the catalogue of detectors by name."""
 
+import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edgegrasp_model.assembly import debug_info, grasps_in_cloud
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
-from edgegrasp_model.cloud_input import CheckedCloud, check_cloud
-from edgegrasp_model.collision import clearances, widths_needed
-from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.evaluation import Scorer, evaluate, hand_batch
-from edgegrasp_model.given_grasps import check_edges, check_hand_poses, from_edges, from_hand_poses
-from edgegrasp_model.gripper import Gripper, load_gripper
-from edgegrasp_model.gripper_choice import chosen_gripper
-from edgegrasp_model.hand_batch import HandBatch
+from edgegrasp_model.candidates.collision import clearances, required_openings
+from edgegrasp_model.candidates.sample import Sample, sample_candidates
+from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
+from edgegrasp_model.given import (
+    Scorer,
+    check_edges,
+    check_hand_poses,
+    evaluate,
+    from_edges,
+    from_hand_poses,
+)
+from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.preparation import Sample, sample_candidates
+from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
-from edgegrasp_model.scene import Scene, build_scene
-from edgegrasp_model.selection import select
+from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud
+from edgegrasp_model.scene.scene import MAX_VOXELS, Scene, build_scene
 
 Float32 = NDArray[np.float32]
-Batch = BallBatch | HandBatch
 
 NO_APPROACH_POINT = (
     "the approach region holds no point of the processed cloud. Rows hold a voxel by "
     "half of its points: around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
+WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
+DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
+
+
+Batch = BallBatch | HandBatch
 
 
 @dataclass
 class Prepared:
-    """A request between the stages: what to score, and what to make of the scores."""
+    """A request between the stages: what to score, and what turns scores into grasps."""
 
     options: DetectOptions
     gripper: Gripper
@@ -82,6 +93,7 @@ class GraspDetector:
         gripper: Gripper,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
+        max_voxels: int = MAX_VOXELS,
     ) -> None:
         """Wrap a network.
 
@@ -91,7 +103,9 @@ class GraspDetector:
             gripper: The one it was trained for, used where a request names none.
             device: Where it runs.
             grippers: A user's own that requests may name, beside those that ship.
+            max_voxels: Most voxels that a request's cloud may have.
         """
+        self.max_voxels = max_voxels
         self.network = network.to(device).eval()
         self.metadata = metadata
         self.gripper = gripper
@@ -104,28 +118,22 @@ class GraspDetector:
         path: Path,
         device: torch.device | str = "cpu",
         grippers: Mapping[str, Gripper] | None = None,
+        max_voxels: int = MAX_VOXELS,
     ) -> "GraspDetector":
         """Load a checkpoint and the gripper it was trained for.
 
         Args:
             path: The file.
-            device: The processor, or a GPU: there the whole pipeline runs, in `on_device`.
-                Weights in int8 stay on the processor.
+            device: Where the network runs; everything else runs on the processor.
             grippers: A user's own that requests may name, beside those that ship.
+            max_voxels: As for the constructor.
 
         Raises:
             InvalidCheckpoint: The file cannot be used.
             InvalidGripper: Its gripper is not known here.
         """
         network, metadata = load_checkpoint(path)
-        if metadata.network.architecture == "edgegrasp-int8":
-            device = "cpu"  # its layers are there for the processor only
-        kind: type[GraspDetector] = cls
-        if torch.device(device).type != "cpu":
-            from edgegrasp_model.on_device.detector import DeviceDetector  # it imports this file
-
-            kind = DeviceDetector
-        return kind(network, metadata, load_gripper(metadata.gripper), device, grippers)
+        return cls(network, metadata, load_gripper(metadata.gripper), device, grippers, max_voxels)
 
     def detect(self, cloud: object, options: DetectOptions | None = None) -> Detection:
         """Detect grasps in a cloud.
@@ -146,18 +154,9 @@ class GraspDetector:
             logits = self.run(prepared.batch) if prepared.batch is not None else np.empty(0)
         return self.finish(prepared, logits)
 
-    def prepare(
-        self, cloud: object, options: DetectOptions, max_voxels: int | None = None
-    ) -> Prepared:
-        """First stage: everything before the network, on the processor.
-
-        Args:
-            cloud: As for `detect`.
-            options: As for `detect`.
-            max_voxels: Most voxels that the cloud may fill; None: any number.
-        """
-        sent = check_cloud(cloud, options.num_approach_points)
-        prepared = self._with_scene(sent, options, max_voxels)
+    def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
+        """First stage: everything before the network."""
+        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points), options)
         scene, gripper = prepared.scene, prepared.gripper
         if scene is None:
             return prepared
@@ -172,7 +171,7 @@ class GraspDetector:
             prepared.warnings.append(NO_CANDIDATE)
             return prepared
         with prepared.timed("description"):
-            prepared.width = widths_needed(sample.view, gripper)
+            prepared.width = required_openings(sample.view, gripper)
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
@@ -209,14 +208,13 @@ class GraspDetector:
         *,
         edges: object | None = None,
         hand_poses: object | None = None,
-        max_voxels: int | None = None,
     ) -> Scoring:
         """Score edges or hand poses of the caller's (the paper's grasp evaluation function).
 
-        Options say what the scene is, which hand it is and what it must not meet. Regions,
+        Options describe the scene, the hand and what it must not collide with. Regions,
         directions and what concerns sampling and selection have no effect. The hand of an edge
-        that would cut into the support plane is drawn back where that helps, as in `detect`;
-        given hand poses stay.
+        that would cut into the support plane is retracted where that helps, as in `detect`; given
+        hand poses stay as they are.
 
         Args:
             cloud: As for `detect`.
@@ -224,7 +222,6 @@ class GraspDetector:
             edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. They
                 stand for the points of the processed cloud that they went into.
             hand_poses: (M, 4, 4) T_cloud_hand. Exactly one of the two is given.
-            max_voxels: As for `prepare`.
 
         Returns:
             One evaluation for each edge or pose, in order.
@@ -240,7 +237,7 @@ class GraspDetector:
             check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
         )
         no_region = {"approach_region": None, "contact_region": None}
-        prepared = self._with_scene(sent, options.model_copy(update=no_region), max_voxels)
+        prepared = self._with_scene(sent, options.model_copy(update=no_region))
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
@@ -263,11 +260,9 @@ class GraspDetector:
         seconds, name = prepared.total_seconds(), self.metadata.name
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
 
-    def _with_scene(
-        self, sent: CheckedCloud, options: DetectOptions, max_voxels: int | None
-    ) -> Prepared:
+    def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
         """Choose the gripper and build the scene, where enough of the cloud is left."""
-        prepared = self._begun(sent, options)
+        prepared = self._start(sent, options)
         with prepared.timed("cloud"):
             prepared.scene = build_scene(
                 sent,
@@ -275,16 +270,16 @@ class GraspDetector:
                 self.metadata.voxel_size,
                 prepared.counts,
                 prepared.warnings,
-                max_voxels,
+                self.max_voxels,
             )
         if prepared.scene is None:
             prepared.warn_of_few_points()
         return prepared
 
-    def _begun(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
-        """Choose the gripper and the balls, and warn of what is not known."""
-        gripper = chosen_gripper(options, self.gripper, self.grippers)
-        radius = self.metadata.crop_radius
+    def _start(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
+        """Choose the gripper and the crop radius; warn of what is unknown."""
+        gripper = choose_gripper(options, self.gripper, self.grippers)
+        radius = self.metadata.network.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
             radius = max(radius, gripper.max_opening / 2)
         prepared = Prepared(options, gripper, radius)
@@ -324,3 +319,134 @@ class GraspDetector:
             candidates.depth,
             network.k,
         )
+
+
+class ModelCatalogue:
+    """Named detectors, one of them the default."""
+
+    def __init__(self, detectors: Mapping[str, GraspDetector], default: str = "") -> None:
+        """Collect detectors.
+
+        Args:
+            detectors: By name; at least one.
+            default: Name to use where a request names none; empty: the best that is there.
+
+        Raises:
+            UnknownModel: There is no detector of the default's name.
+            InvalidCheckpoint: There is no detector at all.
+        """
+        if not detectors:
+            raise InvalidCheckpoint("weights: found none. Give a folder with .safetensors files.")
+        self._detectors = dict(detectors)
+        preferred = [name for name in PREFERRED if name in detectors] or sorted(detectors)
+        self.default = default or preferred[0]
+        self.get(self.default)
+
+    @classmethod
+    def load(
+        cls,
+        weights: Sequence[Path] = (),
+        default: str = "",
+        device: torch.device | str = "cpu",
+        grippers: Sequence[Path] = (),
+        max_voxels: int = MAX_VOXELS,
+    ) -> Self:
+        """Load the weights that ship with the package, then a user's own, which win by name.
+
+        Args:
+            weights: `.safetensors` files, or folders of them; a model is named as its file.
+            default: As for the constructor.
+            device: Where the networks run.
+            grippers: Gripper files that requests may name by their stem.
+            max_voxels: Most voxels that a request's cloud may have.
+
+        Raises:
+            InvalidCheckpoint: A file cannot be used, or there is none.
+            UnknownModel: There are no weights of the default's name.
+            InvalidGripper: A gripper file cannot be used.
+        """
+        own = {file.stem: load_gripper(file) for file in grippers}
+        files: dict[str, Path] = {}
+        for source in (WEIGHTS_FOLDER, *weights):
+            found = sorted(source.glob("*.safetensors")) if source.is_dir() else [source]
+            files |= {
+                file.stem: file for file in found if source != WEIGHTS_FOLDER or file.exists()
+            }
+        detectors = {
+            name: GraspDetector.load(file, device, own, max_voxels) for name, file in files.items()
+        }
+        return cls(detectors, default)
+
+    def names(self) -> list[str]:
+        """Names of the models, sorted."""
+        return sorted(self._detectors)
+
+    def get(self, name: str = "") -> GraspDetector:
+        """The detector of a name; of the default for an empty one.
+
+        Raises:
+            UnknownModel: There is none.
+        """
+        try:
+            return self._detectors[name or self.default]
+        except KeyError:
+            raise UnknownModel(name or self.default, self._detectors) from None
+
+    def describe(self) -> list[dict[str, Any]]:
+        """What each model is, as plain JSON values."""
+        return [
+            {
+                "name": name,
+                "default": name == self.default,
+                "architecture": detector.metadata.network.architecture,
+                "parameters": sum(p.numel() for p in detector.network.parameters()),
+                "digest": detector.metadata.digest,
+                "crop_radius": detector.metadata.network.crop_radius,
+                "voxel_size": detector.metadata.voxel_size,
+                "gripper": detector.metadata.gripper,
+                "hand_description": detector.sees_hands,
+                "device": str(detector.device),
+            }
+            for name, detector in sorted(self._detectors.items())
+        ]
+
+    def warm_up(self) -> None:
+        """Run every model once on a small made-up cloud, so that the first request is not slow.
+
+        A few candidates take every path that a request takes, in a tenth of the time.
+        """
+        rng = np.random.default_rng(0)
+        box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
+        options = DetectOptions(
+            viewpoint=(0.0, 0.0, 0.5), num_approach_points=4, num_candidates=100
+        )
+        for detector in self._detectors.values():
+            detector.detect(box, options)
+
+
+def choose_device(name: str = "auto") -> torch.device:
+    """The device of a name, if it is there.
+
+    Args:
+        name: `cpu`; `cuda`, the first GPU; `cuda:1` the second, and so on; `auto`: the first GPU
+            where there is one, else the processor.
+
+    Raises:
+        InvalidDevice: It is no device's name, or there is no such device here.
+    """
+    if not DEVICE_NAMES.fullmatch(name):
+        raise InvalidDevice(name, "Use auto, cpu, cuda, or cuda:N for one GPU of several.")
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        return torch.device("cuda:0" if gpus else "cpu")
+    device = torch.device(name)
+    if device.type == "cpu":
+        return device
+    number = device.index or 0
+    if number < gpus:
+        return torch.device("cuda", number)
+    if gpus:
+        here = "cuda:0" if gpus == 1 else f"cuda:0 to cuda:{gpus - 1}"
+        raise InvalidDevice(name, f"PyTorch sees {here} here: use one of them, auto or cpu.")
+    built = "sees no GPU" if torch.version.cuda else "is built without CUDA"
+    raise InvalidDevice(name, f"PyTorch {torch.__version__} {built} here: use cpu or auto.")

@@ -1,93 +1,20 @@
-"""A parallel-jaw gripper as a small data file, or as the same fields in a request."""
+"""A parallel-jaw gripper: a small data file, or the same fields in a request."""
 
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import ValidationError
 
-from edgegrasp_model.errors import InvalidGripper
-from edgegrasp_model.option_types import Number, Strict, numeric, ordered
+from edgegrasp_model.errors import InvalidGripper, InvalidRequest
+from edgegrasp_model.options import Boxes, DetectOptions, GripperGeometry, Linkage
 
 GRIPPER_FOLDER = Path(__file__).parent / "grippers"
-
-SAME = 1e-6  # metres below which two lengths of a file are the same
-
-Corner = Annotated[
-    tuple[
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-    ],
-    Field(description="x, y, z in the hand frame, metres"),
-]
-Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
-Length = Annotated[float, Field(gt=0.0, le=1.0), numeric]
-
-
-class HandPart(Strict):
-    """Boxes of the hand or of one finger, hand frame."""
-
-    boxes: Boxes = Field(min_length=1, max_length=16, description="[min corner, max corner] each")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        for low, high in self.boxes:
-            ordered(low, high)
-        return self
-
-
-class Linkage(Strict):
-    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
-
-    radius: Length = Field(description="length of the link that carries a finger, metres")
-    reach: Number = Field(
-        ge=-1.0, le=1.0, description="outward part (y) of that link in the open gripper, metres"
-    )
-
-
-class GripperGeometry(Strict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
-
-    name: str = Field(default="custom", max_length=100, description="shown in results")
-    max_opening: Length = Field(description="metres between the open fingers' inner faces")
-    tip_z: Length = Field(description="fingertips of the open gripper, metres along z")
-    contact_z: Length = Field(
-        description="where contacts are put, metres along z; between palm and fingertips"
-    )
-    tcp_z: Number = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
-    hand: HandPart = Field(description="the hand without its fingers")
-    finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
-    swing: Linkage | None = Field(
-        default=None, description="how the fingers swing; null: they close in a straight line"
-    )
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if any(low[1] < 0 for low, _ in self.finger.boxes):
-            raise ValueError("finger.boxes lie outside of the inner face: no y below 0")
-        if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME:
-            raise ValueError("tip_z must be the highest z of finger.boxes")
-        if _pad(self.finger.boxes, self.contact_z) is None:
-            raise ValueError(
-                "one of finger.boxes must hold the contact: its y from 0, its x on both sides of "
-                "0, contact_z within its z"
-            )
-        if self.swing is not None:
-            reach, radius = self.swing.reach, self.swing.radius
-            if max(abs(reach), abs(reach - self.max_opening / 2)) >= radius:
-                raise ValueError("swing.radius must exceed the reach, open and closed")
-        palm = _palm_z(self)
-        if palm is None:
-            raise ValueError("one of hand.boxes must lie behind the space between the fingers")
-        if not palm < self.contact_z < self.tip_z:
-            raise ValueError(f"contact_z must lie between the palm's z, {palm:g}, and tip_z")
-        return self
 
 
 @dataclass(frozen=True)
@@ -103,7 +30,7 @@ class Gripper:
     pad_half_width: float  # half extent along x of the part of a finger that touches, metres
     hand_boxes: Boxes
     finger_boxes: Boxes  # one finger of the open gripper, its inner face at y = 0
-    swing: Linkage | None = None
+    linkage: Linkage | None = None
 
     @cached_property
     def T_hand_tcp(self) -> NDArray[np.float32]:  # noqa: N802
@@ -118,11 +45,11 @@ class Gripper:
         return self.contact_z - self.palm_z
 
     @cached_property
-    def foremost_z(self) -> float:
+    def max_tip_z(self) -> float:
         """The furthest the fingertips come as they close, metres along z."""
-        if self.swing is None:
+        if self.linkage is None:
             return self.tip_z
-        upright = self.max_opening - 2 * self.swing.reach  # opening at which the links point ahead
+        upright = self.max_opening - 2 * self.linkage.reach  # links point straight ahead there
         return self.tip_z + float(self.tip_advance(upright))
 
     def tip_advance(self, opening: ArrayLike) -> NDArray[np.floating]:
@@ -135,9 +62,9 @@ class Gripper:
             (...) metres along z; 0 for fingers that close in a straight line.
         """
         opening = np.asarray(opening)
-        if self.swing is None:
+        if self.linkage is None:
             return np.zeros_like(opening, dtype=np.float64)
-        radius, reach = self.swing.radius, self.swing.reach
+        radius, reach = self.linkage.radius, self.linkage.reach
         outward = reach - (self.max_opening - np.clip(opening, 0.0, self.max_opening)) / 2
         advance: NDArray[np.floating] = np.sqrt(radius**2 - outward**2) - np.sqrt(
             radius**2 - reach**2
@@ -183,17 +110,17 @@ class Gripper:
             ((low[0], low[1], low[2] + ahead), (high[0], high[1], high[2] + ahead))
             for low, high in self.finger_boxes
         )
-        swing = self.swing
-        if swing is not None:
-            reach = swing.reach - (self.max_opening - opening) / 2
-            swing = Linkage(radius=swing.radius, reach=reach)
+        linkage = self.linkage
+        if linkage is not None:
+            reach = linkage.reach - (self.max_opening - opening) / 2
+            linkage = Linkage(radius=linkage.radius, reach=reach)
         return replace(
             self,
             max_opening=opening,
             tip_z=self.tip_z + ahead,
             contact_z=self.contact_z + ahead,
             finger_boxes=forward,
-            swing=swing,
+            linkage=linkage,
         )
 
     @property
@@ -211,7 +138,7 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
         geometry = GripperGeometry.model_validate(fields)
     except ValidationError as error:
         raise InvalidGripper(f"gripper{_first_fault(error)}; see grippers/panda.toml.") from None
-    palm_z, pad = _palm_z(geometry), _pad(geometry.finger.boxes, geometry.contact_z)
+    palm_z, pad = geometry.palm_z, geometry.pad
     assert palm_z is not None
     assert pad is not None
     return Gripper(
@@ -224,7 +151,7 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
         pad_half_width=max(-pad[0][0], pad[1][0]),
         hand_boxes=geometry.hand.boxes,
         finger_boxes=geometry.finger.boxes,
-        swing=geometry.swing,
+        linkage=geometry.swing,
     )
 
 
@@ -252,29 +179,6 @@ def gripper_names() -> list[str]:
     return sorted(file.stem for file in GRIPPER_FOLDER.glob("*.toml"))
 
 
-def _pad(boxes: Boxes, contact_z: float) -> tuple[Corner, Corner] | None:
-    """The box of a finger that touches the object."""
-    for low, high in boxes:
-        if low[1] == 0.0 and low[0] < 0.0 < high[0] and low[2] < contact_z < high[2]:
-            return low, high
-    return None
-
-
-def _palm_z(geometry: GripperGeometry) -> float | None:
-    """Highest z of the boxes behind the space between the fingers; a bracket beside it is none."""
-    pad = _pad(geometry.finger.boxes, geometry.contact_z)
-    half = geometry.max_opening / 2
-    return max(
-        (
-            high[2]
-            for low, high in geometry.hand.boxes
-            if pad is not None and low[0] < pad[1][0] and high[0] > pad[0][0]
-            if low[1] < half and high[1] > -half
-        ),
-        default=None,
-    )
-
-
 def _first_fault(error: ValidationError) -> str:
     first = error.errors(include_url=False)[0]
     path = "".join(f".{part}" for part in first["loc"])
@@ -282,3 +186,36 @@ def _first_fault(error: ValidationError) -> str:
     if first["type"] in ("missing", "extra_forbidden") or not path:
         return f"{path}: {message}"
     return f"{path}: got {repr(first['input'])[:80]}. {message}"
+
+
+def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
+    """The gripper a request asks for, opened as far as it asks for.
+
+    Args:
+        options: gripper and collision.opening.
+        default: Used where the request names none.
+        own: A user's own, by name; they win over those that ship.
+
+    Raises:
+        InvalidRequest: There is none of that name, or it does not open that far.
+    """
+    asked = options.gripper
+    if asked is None:
+        gripper = default
+    elif isinstance(asked, GripperGeometry):
+        gripper = gripper_from_fields(asked)
+    elif asked in own:
+        gripper = own[asked]
+    elif asked in gripper_names():  # a request must not name a file
+        gripper = load_gripper(asked)
+    else:
+        known = ", ".join(sorted({*own, *gripper_names()}))
+        fix = f"Use one of: {known}; or send the gripper itself."
+        raise InvalidRequest("options.gripper", repr(asked), fix)
+    opening = options.collision.opening
+    if opening is None:
+        return gripper
+    if opening > gripper.max_opening:
+        fix = f"Send at most {gripper.max_opening:g} for the gripper {gripper.name!r}."
+        raise InvalidRequest("options.collision.opening", f"{opening:g} m", fix)
+    return gripper.opened_to(opening)

@@ -5,18 +5,16 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.compiled import point_kernels
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.kernels import points_in_hand_boxes
+from edgegrasp_model.scene.cloud import Cloud
 
 Float32 = NDArray[np.float32]
 
 NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
-CHUNK = 128  # hands at a time, so that the work stays in cache
 
 
 class Reach(NamedTuple):
@@ -41,7 +39,7 @@ def reach_of(
     around, back = max(around, NEAR) + lift, max(back, APPROACH_LENGTH)
     low = boxes[:, 0].min(axis=0) - np.array([around, around, back + around - NEAR])
     high = boxes[:, 1].max(axis=0) + np.array([around, around, around + NEAR])
-    high[2] += gripper.foremost_z - gripper.tip_z
+    high[2] += gripper.max_tip_z - gripper.tip_z
     return Reach(tuple(low.tolist()), tuple(high.tolist()))
 
 
@@ -103,23 +101,73 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
         T_cloud_hand: (E, 4, 4).
         reach: What is kept.
     """
-    if (kernels := point_kernels()) is not None:
-        low, high = np.asarray(reach, dtype=np.float32)
-        hand, seen, at = kernels.seen_from(cloud.points, T_cloud_hand, low, high)
-        return HandView(hand, seen, at, len(T_cloud_hand), reach)
-    points = torch.from_numpy(np.ascontiguousarray(cloud.points.T))  # (3, N)
-    pose = torch.from_numpy(T_cloud_hand)
-    turn = pose[:, :3, :3].transpose(1, 2)  # (E, 3, 3) cloud to hand
-    shift = -turn @ pose[:, :3, 3:]  # (E, 3, 1)
-    found = [(torch.empty(0, dtype=torch.int64),) * 2 + (torch.empty(0, 3),)]
-    for start in range(0, len(pose), CHUNK):
-        part = slice(start, start + CHUNK)
-        position = torch.baddbmm(shift[part], turn[part], points.expand(len(turn[part]), -1, -1))
-        inside = torch.ones_like(position[:, 0], dtype=torch.bool)  # (chunk, N)
-        for axis in range(3):
-            along = position[:, axis]
-            inside &= (along > reach.low[axis]) & (along < reach.high[axis])
-        candidate, row = inside.nonzero(as_tuple=True)
-        found.append((candidate + start, row, position.transpose(1, 2)[candidate, row]))
-    candidates, rows, positions = (torch.cat(parts).numpy() for parts in zip(*found, strict=True))
-    return HandView(candidates, rows, positions, len(T_cloud_hand), reach)
+    low, high = np.asarray(reach, dtype=np.float32)
+    hand, row, position = points_in_hand_boxes(cloud.points, T_cloud_hand, low, high)
+    return HandView(hand, row, position, len(T_cloud_hand), reach)
+
+
+# Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
+BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
+
+
+def mirror_sides(T_cloud_hand: Float32, viewpoint: Float32 | None) -> Float32:
+    """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
+
+    1 for all where the viewpoint is not known.
+    """
+    if viewpoint is None:
+        return np.ones(len(T_cloud_hand), dtype=np.float32)
+    toward = viewpoint - T_cloud_hand[:, :3, 3]
+    along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+    return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
+
+
+def points_around_fingers(
+    normals: Float32,
+    T_cloud_hand: Float32,
+    gripper: Gripper,
+    viewpoint: Float32 | None,
+    view: HandView,
+    limit: int,
+) -> tuple[Float32, NDArray[np.int64]]:
+    """What each hand sees of the cloud around its fingers.
+
+    Args:
+        normals: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        gripper: Fingers open to its maximum.
+        viewpoint: (3,) the only camera; where it is known, x points to its side.
+        view: `hand_views` of the same hands, reaching at least `hand_view.reach_of` the gripper.
+        limit: Points kept of each hand, spread evenly over the cloud's order.
+
+    Returns:
+        (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
+        zeros behind the last; and their number (E,).
+    """
+    x, y, z = view.columns
+    near = (
+        (np.abs(x) < gripper.pad_half_width + BESIDE)
+        & (np.abs(y) < gripper.max_opening / 2 + OUTSIDE)
+        & (z > gripper.palm_z - BEHIND)
+        & (z < gripper.tip_z + BEYOND)
+    )
+    candidate, row, position = view.candidate[near], view.row[near], view.position[near]
+    found = np.bincount(candidate, minlength=view.num_candidates)
+    rank = np.arange(len(candidate)) - (np.cumsum(found) - found)[candidate]
+    kept_before = _kept(rank, found[candidate], limit)
+    kept = _kept(rank + 1, found[candidate], limit) > kept_before
+    candidate, slot = candidate[kept], kept_before[kept]
+    side = mirror_sides(T_cloud_hand, viewpoint)[candidate, None]  # (Q, 1)
+    turn = T_cloud_hand[candidate, :3, :3]
+    points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
+    points[candidate, slot, :3] = position[kept] - np.array(
+        [0.0, 0.0, gripper.tip_z], dtype=np.float32
+    )
+    points[candidate, slot, 3:] = np.einsum("pd,pdk->pk", normals[row[kept]], turn)
+    points[candidate, slot, 0::3] *= side
+    return points, np.minimum(found, limit)
+
+
+def _kept(rank: NDArray[np.int64], found: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
+    """How many of the first `rank` of `found` points are kept."""
+    return np.where(found > limit, rank * limit // np.maximum(found, 1), rank)

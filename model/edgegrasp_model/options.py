@@ -1,10 +1,20 @@
-"""What a caller may ask of one detection; the same names on every transport."""
+"""What a caller may ask of one detection: the one definition of every option.
 
+The gRPC message, the client's types, the command line's flags and the table in the documentation
+are made from these models (`make proto`).
+"""
+
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
+    BaseModel,
     BeforeValidator,
+    ConfigDict,
     Discriminator,
     Field,
     StrictBool,
@@ -13,42 +23,321 @@ from pydantic import (
     model_validator,
 )
 
-from edgegrasp_model.directions import ApproachDirection, Cone
 from edgegrasp_model.errors import InvalidRequest, brief
-from edgegrasp_model.gripper import GripperGeometry
-from edgegrasp_model.option_types import (
-    Direction,
-    Integer,
-    Number,
-    Strict,
-    Vector,
-    numeric,
-    ordered,
-)
-from edgegrasp_model.regions import Box, OrientedBox, Region
-from edgegrasp_model.support import RansacPlane, SupportPlane
 
-__all__ = [
-    "ApproachDirection",
-    "Box",
-    "Collision",
-    "Cone",
-    "DetectOptions",
-    "GripperGeometry",
-    "OrientedBox",
-    "RansacPlane",
-    "Region",
-    "SupportPlane",
-    "Suppression",
-    "Workspace",
-    "parse_options",
+FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
+
+
+def _no_text_or_truth(value: object) -> object:
+    """Refuse what Python would convert to a number, such as true and "3"."""
+    if isinstance(value, bool | str | bytes):
+        raise ValueError("must be a number")
+    return value
+
+
+# Stands last in an annotation: pydantic writes wrong schemas for bounds that come after it.
+numeric = BeforeValidator(_no_text_or_truth)
+Integer = Annotated[int, numeric]
+Number = Annotated[float, numeric]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST, le=FARTHEST), numeric]
+Vector = Annotated[tuple[Finite, Finite, Finite], Field(description="x, y, z in the cloud's frame")]
+Row = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+MAX_SHAPES = 64
+MAX_ROWS = 5_000_000
+Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
+HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
+SAME = 1e-6  # metres below which two lengths of a gripper are the same
+Corner = Annotated[
+    tuple[
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+    ],
+    Field(description="x, y, z in the hand frame, metres"),
 ]
-
+Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
-
 CollisionMode = Literal["avoid", "penalise", "ignore"]
+
+
+def _of_length_one(value: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(float(np.linalg.norm(value)) - 1.0) > 1e-3:
+        raise ValueError("must have length 1")
+    return value
+
+
+def _not_zero(value: tuple[float, ...]) -> tuple[float, ...]:
+    if float(np.linalg.norm(value)) < 1e-6:
+        raise ValueError("must not be the zero vector")
+    return value
+
+
+UnitVector = Annotated[Vector, AfterValidator(_of_length_one)]
+
+
+Direction = Annotated[Vector, AfterValidator(_not_zero)]
+
+
+Quaternion = Annotated[
+    tuple[Finite, Finite, Finite, Finite],
+    AfterValidator(_of_length_one),
+    Field(description="x, y, z, w; length 1"),
+]
+
+
+class Strict(BaseModel):
+    """Base of every option object: unknown fields are refused, values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def ordered(low: tuple[float, ...], high: tuple[float, ...]) -> None:
+    """Raise ValueError unless every coordinate of `low` is below that of `high`."""
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise ValueError("every coordinate of min must be below that of max")
+
+
+class Box(Strict):
+    """An axis-aligned box in the cloud's frame."""
+
+    kind: Literal["box"] = "box"
+    min: Vector = Field(description="lower corner, metres")
+    max: Vector = Field(description="upper corner, metres")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        ordered(self.min, self.max)
+        return self
+
+
+class OrientedBox(Strict):
+    """A box in any orientation."""
+
+    kind: Literal["oriented_box"] = "oriented_box"
+    center: Vector = Field(description="its middle, metres")
+    half_extents: tuple[Length, Length, Length] = Field(
+        description="half its lengths along its own axes, metres"
+    )
+    quaternion: Quaternion = Field(
+        default=(0.0, 0.0, 0.0, 1.0),
+        description="x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)",
+    )
+
+
+class Sphere(Strict):
+    """A ball."""
+
+    kind: Literal["sphere"] = "sphere"
+    center: Vector = Field(description="its middle, metres")
+    radius: Length = Field(description="metres")
+
+
+class HalfSpace(Strict):
+    """Everything on one side of a plane: the points x with normal . x >= offset."""
+
+    kind: Literal["half_space"] = "half_space"
+    normal: UnitVector = Field(description="unit, into the region")
+    offset: Finite = Field(description="normal . x on the plane, metres")
+
+
+class Indices(Strict):
+    """Points by their row in the cloud as it was sent."""
+
+    kind: Literal["indices"] = "indices"
+    indices: tuple[Row, ...] = Field(
+        max_length=MAX_ROWS, description="rows of the cloud as sent; row-major where organised"
+    )
+
+
+class Mask(Strict):
+    """Points by one truth value for each row of the cloud as it was sent."""
+
+    kind: Literal["mask"] = "mask"
+    mask: tuple[StrictBool, ...] = Field(
+        max_length=MAX_ROWS, description="as many values as the cloud has rows"
+    )
+
+
+class Segments(Strict):
+    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+
+    kind: Literal["segments"] = "segments"
+    ids: tuple[Annotated[int, Field(strict=True, ge=-(2**31), lt=2**31)], ...] = Field(
+        min_length=1, max_length=4096, description="values of segment_ids"
+    )
+
+
+Rows = Indices | Mask | Segments
+
+
+Shape = Annotated[Box | OrientedBox | Sphere | HalfSpace | Rows, Field(discriminator="kind")]
+
+
+class Region(Strict):
+    """What lies in any of `include` and in none of `exclude`.
+
+    Shapes see each voxel of the processed cloud as its mean point. Rows (indices, mask, segments)
+    hold a voxel where they hold at least half of the points in it.
+    """
+
+    include: tuple[Shape, ...] = Field(
+        default=(), max_length=MAX_SHAPES, description="union of shapes; empty: everywhere"
+    )
+    exclude: tuple[Shape, ...] = Field(
+        default=(), max_length=MAX_SHAPES, description="union of shapes taken away"
+    )
+
+
+class Cone(Strict):
+    """Directions within an angle of one."""
+
+    direction: Direction = Field(
+        description="the way the hand moves toward the object, +z of the hand; any length but zero"
+    )
+    max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric] = Field(
+        description="radians between it and the hand's way"
+    )
+
+
+class ApproachDirection(Strict):
+    """Directions in which the hand may move: those in any cone or in the preset.
+
+    `top-down` is within 30 degrees of straight down, `side` within 30 degrees of the horizontal,
+    both by `up`. Where no approach direction is asked for, every hand is allowed that does not
+    come from more than 6 degrees below the horizontal.
+    """
+
+    cones: tuple[Cone, ...] = Field(default=(), max_length=64, description="any of these")
+    preset: Literal["top-down", "side"] | None = Field(
+        default=None, description="or this, relative to up"
+    )
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if not self.cones and self.preset is None:
+            raise ValueError("give at least one cone or a preset, or leave approach_direction out")
+        return self
+
+
+class SupportPlane(Strict):
+    """The plane objects rest on: the points x with normal . x = offset; the normal points up."""
+
+    kind: Literal["plane"] = "plane"
+    normal: UnitVector = Field(description="unit normal, away from the table")
+    offset: Finite = Field(description="normal . x of its points, metres")
+    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = Field(
+        default=0.0,
+        description="share by which a camera's depths may be wrong: each view is scaled about its "
+        "viewpoint by up to this until the plane that it sees lies in place; 0: not at all",
+    )
+
+    def heights(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Heights (N,) of points (N, 3) over the plane, metres."""
+        heights: NDArray[np.floating] = points @ np.asarray(self.normal) - self.offset
+        return heights
+
+
+class RansacPlane(Strict):
+    """Look for the plane in the cloud: the largest of those near the level.
+
+    Found by RANSAC from the request's seed, within the workspace. Its points are removed before
+    anything else; the plane stays as an obstacle. None found: a warning, and no support plane.
+    """
+
+    kind: Literal["ransac"] = "ransac"
+    distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
+        default=0.005, description="metres from the plane within which points belong to it"
+    )
+    max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
+        default=0.35, description="radians between its normal and up; a quarter turn: any plane"
+    )
+    min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
+        default=0.1, description="share of the seen surface it must hold"
+    )
+
+
+class HandPart(Strict):
+    """Boxes of the hand or of one finger, hand frame."""
+
+    boxes: Boxes = Field(min_length=1, max_length=16, description="[min corner, max corner] each")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for low, high in self.boxes:
+            ordered(low, high)
+        return self
+
+
+class Linkage(Strict):
+    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+
+    radius: HandLength = Field(description="length of the link that carries a finger, metres")
+    reach: Number = Field(
+        ge=-1.0, le=1.0, description="outward part (y) of that link in the open gripper, metres"
+    )
+
+
+class GripperGeometry(Strict):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    name: str = Field(default="custom", max_length=100, description="shown in results")
+    max_opening: HandLength = Field(description="metres between the open fingers' inner faces")
+    tip_z: HandLength = Field(description="fingertips of the open gripper, metres along z")
+    contact_z: HandLength = Field(
+        description="where contacts are put, metres along z; between palm and fingertips"
+    )
+    tcp_z: Number = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
+    hand: HandPart = Field(description="the hand without its fingers")
+    finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
+    swing: Linkage | None = Field(
+        default=None, description="how the fingers swing; null: they close in a straight line"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if any(low[1] < 0 for low, _ in self.finger.boxes):
+            raise ValueError("finger.boxes lie outside of the inner face: no y below 0")
+        if abs(max(high[2] for _, high in self.finger.boxes) - self.tip_z) > SAME:
+            raise ValueError("tip_z must be the highest z of finger.boxes")
+        if self.pad is None:
+            raise ValueError(
+                "one of finger.boxes must hold the contact: its y from 0, its x on both sides of "
+                "0, contact_z within its z"
+            )
+        if self.swing is not None:
+            reach, radius = self.swing.reach, self.swing.radius
+            if max(abs(reach), abs(reach - self.max_opening / 2)) >= radius:
+                raise ValueError("swing.radius must exceed the reach, open and closed")
+        palm = self.palm_z
+        if palm is None:
+            raise ValueError("one of hand.boxes must lie behind the space between the fingers")
+        if not palm < self.contact_z < self.tip_z:
+            raise ValueError(f"contact_z must lie between the palm's z, {palm:g}, and tip_z")
+        return self
+
+    @property
+    def pad(self) -> tuple[Corner, Corner] | None:
+        """The box of a finger that touches the object."""
+        for low, high in self.finger.boxes:
+            if low[1] == 0.0 and low[0] < 0.0 < high[0] and low[2] < self.contact_z < high[2]:
+                return low, high
+        return None
+
+    @property
+    def palm_z(self) -> float | None:
+        """Highest z of the hand right behind the space between the fingers."""
+        pad, half = self.pad, self.max_opening / 2
+        return max(
+            (
+                high[2]
+                for low, high in self.hand.boxes
+                if pad is not None and low[0] < pad[1][0] and high[0] > pad[0][0]
+                if low[1] < half and high[1] > -half
+            ),
+            default=None,
+        )
 
 
 class Workspace(Strict):

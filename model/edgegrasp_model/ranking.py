@@ -1,16 +1,65 @@
-"""Order scored grasps and thin out near duplicates."""
+"""From scored candidates to ranked grasps in the caller's frame."""
 
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.options import Suppression
+from edgegrasp_model.candidates.collision import clearances
+from edgegrasp_model.candidates.edge_grasps import Candidates
+from edgegrasp_model.candidates.sample import CODE, Sample
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.options import DetectOptions, Suppression
+from edgegrasp_model.results import DebugInfo, Grasp, Outcome
+from edgegrasp_model.scene.cloud import UP
+from edgegrasp_model.scene.scene import Scene
 
+Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
 
-COLLIDING = 0.5  # a score is worth this share where the hand meets something, as far as one sees
+COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
+OUTCOMES = list(Outcome)
+
+
+def select(
+    scene: Scene,
+    sample: Sample,
+    score: NDArray[np.floating],
+    gripper: Gripper,
+    options: DetectOptions,
+    counts: dict[str, int],
+) -> tuple[Int64, NDArray[np.int8]]:
+    """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
+
+    Args:
+        scene: The scene.
+        sample: E scored candidates.
+        score: (E,) probabilities.
+        gripper: The hand.
+        options: min_score, order, suppression and top_k.
+        counts: Gets the number of candidates left after each step.
+
+    Returns:
+        The rows to return, best first, and what became of each candidate: (E,) codes.
+    """
+    hands = sample.candidates.T_cloud_hand
+    T_cloud_tcp = hands @ gripper.T_hand_tcp
+    clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
+    free = sample.collision_free | (options.collision.mode == "ignore")
+    order = ranked(score, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
+
+    outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
+    good = score[order] >= options.min_score
+    outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
+    order, dropped = order[good], order[:0]
+    counts["above_min_score"] = len(order)
+    if options.suppression is not None:
+        order, dropped = non_max_suppression(T_cloud_tcp, order, options.suppression, options.top_k)
+    order = order[: options.top_k]
+    outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
+    counts["suppressed"], counts["returned"] = len(dropped), len(order)
+    return order, outcome
 
 
 def ranked(
@@ -40,7 +89,7 @@ def ranked(
     return np.lexsort(keys).astype(np.int64)
 
 
-def suppress(
+def non_max_suppression(
     T_cloud_tcp: Float32, order: NDArray[np.int64], suppression: Suppression, top_k: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keep the best of each group of near duplicates.
@@ -85,3 +134,71 @@ def rotation_distance(rotations: Float32, rotation: Float32) -> Float32:
     trace = along[:, 2] + np.abs(along[:, 0] + along[:, 1])
     angle: Float32 = np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0))
     return angle
+
+
+def grasps_in_cloud(
+    scene: Scene,
+    candidates: Candidates,
+    gripper: Gripper,
+    score: NDArray[np.floating],
+    width: Float32,
+    collision_free: NDArray[np.bool_],
+    clearance: Float32,
+) -> list[Grasp]:
+    """Candidates E, all arrays (E,), as grasps in the frame of the cloud."""
+    T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
+    return [
+        Grasp(
+            score=float(np.float32(score[row])),
+            T_cloud_hand=T_cloud_hand[row],
+            T_cloud_tcp=T_cloud_tcp[row],
+            width=float(width[row]),
+            approach_point=scene.points_in_cloud[candidates.approach_index[row]],
+            contact_point=scene.points_in_cloud[candidates.contact_index[row]],
+            approach_direction=T_cloud_hand[row, :3, 2],
+            collision_free=bool(collision_free[row]),
+            clearance=float(clearance[row]),
+        )
+        for row in range(len(candidates))
+    ]
+
+
+def debug_info(
+    scene: Scene,
+    sample: Sample | None,
+    score: NDArray[np.floating],
+    outcome: NDArray[np.int8],
+) -> DebugInfo:
+    """The processed cloud and every candidate of a request.
+
+    Args:
+        scene: The scene.
+        sample: All candidates and which of them (E) were scored; None: there are none.
+        score: (E,) probabilities.
+        outcome: (E,) codes of what became of them.
+    """
+    attempts = [] if sample is None else sample.attempts
+    candidates = Candidates.concatenate(
+        [Candidates.none(), *(part.candidates for part in attempts)]
+    )
+    codes = np.concatenate([outcome[:0], *(part.outcome for part in attempts)])
+    scores = np.full(len(candidates), np.nan, dtype=np.float32)
+    if sample is not None and len(outcome):
+        place = len(candidates) - len(attempts[-1].candidates) + sample.row
+        scores[place], codes[place] = score, outcome
+    plane = None
+    if scene.support is not None:
+        normal = scene.frame.directions_in_cloud(scene.support.normal)
+        foot = scene.frame.points_in_cloud(np.multiply(scene.support.normal, scene.support.offset))
+        plane = np.append(normal, normal @ foot).astype(np.float32)
+    return DebugInfo(
+        points=scene.points_in_cloud,
+        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
+        approach_index=candidates.approach_index,
+        contact_index=candidates.contact_index,
+        T_cloud_hand=scene.frame.poses_in_cloud(candidates.T_cloud_hand),
+        score=scores,
+        outcome=[OUTCOMES[code] for code in codes.tolist()],
+        support_plane=plane,
+    )

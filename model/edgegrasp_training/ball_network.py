@@ -5,8 +5,8 @@ from copy import deepcopy
 import torch
 from torch import Tensor, nn
 
-from edgegrasp_model.network import EdgeGraspNet
-from edgegrasp_model.vn_network import VNEdgeGraspNet
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 # Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
 # power of two, so that weights come back to metres exactly.

@@ -11,16 +11,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls
-from edgegrasp_model.candidates import Candidates, edge_grasps
-from edgegrasp_model.canonical_frame import CanonicalFrame
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_description import without_support
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane, Workspace
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, LabelledView
 
@@ -128,7 +127,7 @@ def tried_grasps(
             UP,
             SUPPORT,
             view.camera_position if viewpoint_known else None,
-            at_workspace_side(view.points, WORKSPACE, UP),
+            near_workspace_side(view.points, WORKSPACE, UP),
             SPARE_POINTS * config.hand_points,
         )
         description, points = batch.description.numpy(), batch.points.numpy()
@@ -253,7 +252,6 @@ def pack_hands(
         torch.from_numpy(seen.description[rows].astype(np.float32)),
         torch.from_numpy(chosen.astype(np.float32)),
         torch.from_numpy(np.minimum(count, limit)),
-        len(balls),
     )
     return Packed(batch, torch.from_numpy(grasps.label[rows]), torch.ones(len(rows)))
 

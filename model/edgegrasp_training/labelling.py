@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import check_cloud
+from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.preparation import Sample, sample_candidates
-from edgegrasp_model.scene import Scene, build_scene
+from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_model.scene.scene import Scene, build_scene
 from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.views import LabelledView

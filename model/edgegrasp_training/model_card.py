@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.metrics import Evaluation, reliability
 
 CURVE_ROWS = 20

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
-from edgegrasp_model.network_config import (
+from edgegrasp_model.networks.config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     HAND,
     VN_EDGEGRASP,
+    CheckpointMetadata,
     NetworkConfig,
 )
 

@@ -7,13 +7,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from edgegrasp_model.ball_batch import crop_balls
-from edgegrasp_model.candidates import Candidates, drawn_back, edge_grasps, level_grasps
-from edgegrasp_model.checkpoint import load_checkpoint
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.edge_grasps import (
+    Candidates,
+    crop_balls,
+    edge_grasps,
+    retract,
+    top_down_grasps,
+)
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import SUPPORT, UP, WORKSPACE, Lessons
 from edgegrasp_training.views import LabelledView, load_view
 
@@ -82,7 +87,7 @@ class Teacher:
             UP,
             SUPPORT,
             view.camera_position,
-            at_workspace_side(view.points, WORKSPACE, UP),
+            near_workspace_side(view.points, WORKSPACE, UP),
             self.metadata.network.hand_points,
         )
         with torch.inference_mode():
@@ -101,9 +106,9 @@ class Teacher:
         """Candidates in balls (A,), as the detector makes them; so many of each."""
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
-        level = level_grasps(cloud, *pairs, SUPPORT, self.gripper)
+        level = top_down_grasps(cloud, *pairs, SUPPORT, self.gripper)
         both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), level])
-        both, clear = drawn_back(both, SUPPORT, self.gripper)
+        both, clear = retract(both, SUPPORT, self.gripper)
         both = both.take(rng.permutation(np.flatnonzero(clear)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))
         _, first = np.unique(both.approach_index, return_index=True)

@@ -16,12 +16,11 @@ import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.hand_network import HandNet
-from edgegrasp_model.network import build_network
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.networks.hand import HandBatch, HandNet
 from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
 from edgegrasp_training.examples import (
     Lessons,

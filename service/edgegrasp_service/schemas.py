@@ -7,8 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
 
-from edgegrasp_model.option_types import FARTHEST, Finite, Integer, Strict, numeric
-from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.options import FARTHEST, DetectOptions, Finite, Integer, Strict, numeric
 from edgegrasp_model.results import NoGrasp, Outcome
 
 KIND_PREFIX = "urn:edgegrasp:error:"

@@ -10,9 +10,10 @@ from benchmarks.textbook.edge_grasp import edge_grasp_logits
 from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
 from benchmarks.timing import interleaved, summary
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.candidates.edge_grasps import crop_balls
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import NetworkConfig
 
 WIDTHS = {"conv_widths": (8, 8, 16), "global_widths_2": (24, 24), "classifier_widths": (16,)}
 

@@ -12,8 +12,8 @@ from edgegrasp_cli.planners.oracle import OraclePlanner
 from edgegrasp_cli.planners.own_candidates import OwnCandidates
 from edgegrasp_cli.planners.paper_candidates import PaperCandidates, clean_cloud, paper_grasps
 from edgegrasp_cli.planners.requests import choose, request_options
-from edgegrasp_model.catalogue import WEIGHTS_FOLDER
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.detector import WEIGHTS_FOLDER
+from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_sim.gripper import FINGERTIP
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.observation import Observation

@@ -9,9 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli.main import app
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL, CheckpointMetadata
 from edgegrasp_training.recipes import recipe
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.catalogue import WEIGHTS_FOLDER, ModelCatalogue
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 
 pytest.importorskip("pybullet")

@@ -4,25 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model.cloud_input import check_cloud
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_service.grpc_messages import request_from_message, score_request_from_message
-from edgegrasp_service.options_text import options_from_query
-from edgegrasp_service.sent_arrays import PER_POINT, ListArray, NpyArray, PackedArray
-from edgegrasp_service.sent_cloud import (
-    DepthCloud,
-    FileCloud,
-    ListCloud,
-    PackedCloud,
-    RosCloud,
-    SentCloud,
-    decode_cloud,
-)
+from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_service.schemas import PER_POINT
+from edgegrasp_service.worker.http_bodies import options_from_query, read_body
+from edgegrasp_service.worker.messages import read_request
+from edgegrasp_service.worker.request_cloud import File, decode_cloud
 
 from .conftest import (
     DEPTH_IMAGE,
@@ -47,9 +38,9 @@ def open3d_is_loaded() -> None:
     pytest.importorskip("open3d")
 
 
-def decode(source: Any, size: int, **beside: Any) -> None:
+def decode(size: int, **fields: Any) -> None:
     def work() -> None:
-        cloud, _ = decode_cloud(SentCloud(source, beside), DetectOptions(), MAX_POINTS)
+        cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         check_cloud(cloud, 32)
 
     decodes_or_refuses(work, size, MAX_POINTS)
@@ -59,44 +50,43 @@ def decode(source: Any, size: int, **beside: Any) -> None:
 @given(st.data())
 def test_files(file_format: str, data: st.DataObject) -> None:
     content = data.draw(files(file_format))
-    decode(FileCloud(file_format, content), len(content))
+    decode(len(content), cloud=File(file_format, content))
 
 
 @pytest.mark.parametrize("file_format", FILES)
 def test_the_files_that_are_mutated_are_good(file_format: str) -> None:
     for content in FILES[file_format]:
-        cloud, _ = decode_cloud(
-            SentCloud(FileCloud(file_format, content)), DetectOptions(), MAX_POINTS
-        )
+        fields = {"cloud": File(file_format, content)}
+        cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         assert cloud.points is not None
 
 
 @given(st.binary(max_size=100), st.sampled_from(sorted(PER_POINT)), st.binary(max_size=600))
 def test_packed(points: bytes, name: str, beside: bytes) -> None:
-    decode(PackedCloud(points), len(points))
-    decode(PackedCloud(POINTS.tobytes()), len(beside), **{name: PackedArray(beside)})
+    decode(len(points), points=points)
+    decode(len(beside), points=POINTS.tobytes(), **{name: beside})
 
 
 @given(LISTS, st.sampled_from(sorted(PER_POINT)))
 def test_lists(values: object, name: str) -> None:
     size = len(repr(values))
-    decode(ListCloud(values), size)
-    decode(PackedCloud(POINTS.tobytes()), size, **{name: ListArray(values)})
+    decode(size, points=values)
+    decode(size, points=POINTS.tobytes(), **{name: values})
 
 
 @given(mutated(FILES["npy"]), st.sampled_from(sorted(PER_POINT)))
 def test_npy_beside(content: bytes, name: str) -> None:
-    decode(PackedCloud(POINTS.tobytes()), len(content), **{name: NpyArray(content)})
+    decode(len(content), points=POINTS.tobytes(), **{name: File("npy", content)})
 
 
 @given(changed(POINT_CLOUD2) | VALUES)
 def test_point_cloud2(fields: object) -> None:
-    decode(RosCloud(fields), len(repr(fields)))
+    decode(len(repr(fields)), point_cloud2=fields)
 
 
 @given(st.lists(changed(DEPTH_IMAGE) | changed(DEPTH_ROWS), min_size=1, max_size=2) | VALUES)
 def test_depth_images(images: object) -> None:
-    decode(DepthCloud(images), len(repr(images)))
+    decode(len(repr(images)), depth_images=images)
 
 
 MESSAGES = [
@@ -121,19 +111,31 @@ MESSAGES = [
 @given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
 def test_messages(content: bytes, scores: bool) -> None:
     def work() -> None:
-        try:
-            if scores:
-                request: Any = score_request_from_message(
-                    grasp_pb2.ScoreGraspsRequest.FromString(content)
-                )
-                request.given.check()
-            else:
-                request = request_from_message(grasp_pb2.DetectGraspsRequest.FromString(content))
-        except DecodeError:
-            return
-        options = parse_options(dict(request.options))
-        cloud, _ = decode_cloud(request.cloud, options, MAX_POINTS)
+        fields = read_request("ScoreGrasps" if scores else "DetectGrasps", content)
+        options = parse_options(fields["options"])
+        cloud, options = decode_cloud(fields, options, MAX_POINTS)
         check_cloud(cloud, options.num_approach_points)
+
+    decodes_or_refuses(work, len(content), MAX_POINTS)
+
+
+FORM = b"".join(
+    b'--b\r\nContent-Disposition: form-data; name="%s"%s\r\n\r\n%s\r\n' % part
+    for part in [
+        (b"cloud", b'; filename="c.npy"\r\nContent-Type: application/x-npy', FILES["npy"][0]),
+        (b"options", b"\r\nContent-Type: application/json", b'{"seed": 3}'),
+        (b"segment_ids", b"", b"[%s0]" % (b"0, " * 39)),
+    ]
+) + (b"--b--\r\n")
+
+
+@given(mutated([FORM]), st.sampled_from(["b", '"b"', "b; x=y", "x", '"', "b'\ud800"]))
+def test_forms(content: bytes, boundary: str) -> None:
+    media_type = f"multipart/form-data; boundary={boundary}"
+
+    def work() -> None:
+        fields = read_body("DetectGrasps", media_type, "", content)
+        decode_cloud(fields, parse_options(fields["options"]), MAX_POINTS)
 
     decodes_or_refuses(work, len(content), MAX_POINTS)
 

@@ -24,7 +24,7 @@ from .conftest import (
     changed,
     mutated,
 )
-from .test_fuzz_decoders import MESSAGES, OPTIONS
+from .test_fuzz_decoders import FORM, MESSAGES, OPTIONS
 
 MAX_GROWTH = 100  # MB; a request here is a few kB
 PATIENCE = 20
@@ -126,16 +126,6 @@ def test_json(target: Target, document: object, path: str) -> None:
 @given(st.binary(max_size=300) | mutated([json.dumps({"points": [[0, 0, 0]] * 40}).encode()]))
 def test_broken_json(target: Target, content: bytes) -> None:
     target.post(content, "application/json")
-
-
-FORM = b"".join(
-    b'--b\r\nContent-Disposition: form-data; name="%s"%s\r\n\r\n%s\r\n' % part
-    for part in [
-        (b"cloud", b'; filename="c.npy"\r\nContent-Type: application/x-npy', FILES["npy"][0]),
-        (b"options", b"\r\nContent-Type: application/json", b'{"seed": 3}'),
-        (b"segment_ids", b"", json.dumps([0] * 40).encode()),
-    ]
-) + (b"--b--\r\n")
 
 
 def test_the_form_that_is_mutated_is_good(target: Target) -> None:

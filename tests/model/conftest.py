@@ -8,12 +8,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls, nearest_in_ball
-from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 
 RADIUS = 0.05
 

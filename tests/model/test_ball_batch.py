@@ -4,7 +4,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls, nearest_in_ball
+from edgegrasp_model.candidates.edge_grasps import crop_balls
+from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
 
 
 def cloud(seed: int, count: int = 120) -> np.ndarray:

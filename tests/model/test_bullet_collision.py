@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.canonical_frame import CanonicalFrame
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import clearances, collides
+from edgegrasp_model.candidates.collision import clearances, collides
 from edgegrasp_model.gripper import Gripper, load_gripper
-from edgegrasp_model.obstacles import SolidBoxes
-from edgegrasp_model.options import Collision
-from edgegrasp_model.regions import OrientedBox
-from edgegrasp_model.scene import Scene
-from edgegrasp_model.support import SupportPlane
+from edgegrasp_model.options import Collision, OrientedBox, SupportPlane
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.obstacles import SolidBoxes
+from edgegrasp_model.scene.scene import Scene
 
 bullet = pytest.importorskip("pybullet")
 

@@ -2,15 +2,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.candidates import (
+from edgegrasp_model.candidates.edge_grasps import (
     TIP_MARGIN,
-    drawn_back,
     edge_grasps,
+    retract,
     support_clearance,
 )
-from edgegrasp_model.cloud import Cloud
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.support import SupportPlane
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
 
 PANDA = load_gripper()
 TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
@@ -79,7 +79,7 @@ def test_support_clearance_is_the_lowest_point_of_any_box(seed: int) -> None:
 def test_hands_are_drawn_back_just_out_of_the_table(seed: int) -> None:
     _, candidates, _, _ = random_pairs(seed)
     before = support_clearance(candidates.T_cloud_hand, TABLE, PANDA)
-    drawn, kept = drawn_back(candidates, TABLE, PANDA)
+    drawn, kept = retract(candidates, TABLE, PANDA)
     clear = drawn.take(kept)
     np.testing.assert_array_equal(drawn.T_cloud_hand[~kept], candidates.T_cloud_hand[~kept])
     after = support_clearance(clear.T_cloud_hand, TABLE, PANDA)

@@ -1,16 +1,22 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
-
-from edgegrasp_model.ball_batch import BallCrop, crop_balls
-from edgegrasp_model.candidates import Candidates, edge_grasps
-from edgegrasp_model.centred import LEAST_SHIFT, MOST_SHIFT, centred_grasps
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.on_device.balls import DeviceCrop
 from edgegrasp_model.on_device.candidates import DeviceCandidates
 from edgegrasp_model.on_device.centred import centred_grasps as on_device
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.edge_grasps import (
+    MAX_SHIFT,
+    MIN_SHIFT,
+    BallCrop,
+    Candidates,
+    centred_grasps,
+    crop_balls,
+    edge_grasps,
+)
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.scene.cloud import Cloud
 
 HAND = load_gripper("panda")
 RADIUS = 0.045
@@ -57,11 +63,11 @@ def test_a_hand_on_a_wide_can_is_moved_to_its_middle() -> None:
         np.testing.assert_array_equal(moved[:3, :3], original[:3, :3])
         shift = original[:3, :3].T @ (moved[:3, 3] - original[:3, 3])
         np.testing.assert_allclose(shift[[0, 2]], 0.0, atol=1e-6)
-        assert LEAST_SHIFT < abs(shift[1]) < MOST_SHIFT
+        assert MIN_SHIFT < abs(shift[1]) < MAX_SHIFT
         low, high = extents(cloud, moved)
         assert low == pytest.approx(-high, abs=0.002)  # the pads' surroundings count too
         low, high = extents(cloud, original)
-        assert abs(low + high) / 2 > LEAST_SHIFT - 0.001
+        assert abs(low + high) / 2 > MIN_SHIFT - 0.001
 
 
 def test_nothing_is_moved_where_the_middle_does_not_matter() -> None:

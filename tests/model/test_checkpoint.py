@@ -8,11 +8,10 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import HAND
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import HAND, CheckpointMetadata
 
 
 @pytest.fixture

@@ -3,10 +3,10 @@ import pickle
 import pytest
 import torch
 
-from edgegrasp_model.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_model.errors import InvalidCheckpoint
-from edgegrasp_model.import_checkpoint import import_checkpoint
-from edgegrasp_model.network_config import EDGEGRASP, VN_EDGEGRASP
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import EDGEGRASP, VN_EDGEGRASP
+from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
 PARTS = ("local_emd_model", "global_emd_model", "classifier_model")
 
@@ -36,7 +36,11 @@ def test_radius_voxel_and_gripper_are_noted(shared_dir):
         gripper="other",
     )
     assert metadata.network.conv_widths == EDGEGRASP.conv_widths
-    assert (metadata.voxel_size, metadata.crop_radius, metadata.gripper) == (0.004, 0.04, "other")
+    assert (metadata.voxel_size, metadata.network.crop_radius, metadata.gripper) == (
+        0.004,
+        0.04,
+        "other",
+    )
 
 
 def test_an_empty_directory_is_refused(tmp_path):

@@ -3,14 +3,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.cloud import (
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.scene.cloud import (
     estimate_normals,
-    inliers,
     orient_normals,
+    statistical_outlier_removal,
     validate_cloud,
     voxelise,
 )
-from edgegrasp_model.errors import InvalidRequest
 
 GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (100, 3)).astype(np.float32)
 
@@ -73,7 +73,7 @@ def test_voxels_are_means_of_the_points_in_them_whatever_their_order(
 def test_a_far_point_is_an_outlier_and_a_surface_is_not() -> None:
     surface = voxel_means(sphere(), 0.005)
     cloud = np.vstack([surface, [[0.3, 0.3, 0.3]]]).astype(np.float32)
-    kept = cloud[inliers(cloud)]
+    kept = cloud[statistical_outlier_removal(cloud)]
     assert not (kept == 0.3).any()
     assert len(kept) > 0.9 * len(surface)
 

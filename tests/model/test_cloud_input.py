@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from edgegrasp_model.cloud_input import CloudInput, check_cloud
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 
 GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (12, 3)).astype(np.float32)
 

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import FINGER_CLEARANCE, meets_cloud, widths_needed
+from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, hits_cloud, required_openings
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
 from edgegrasp_model.options import Collision
+from edgegrasp_model.scene.cloud import Cloud
 
 PANDA = load_gripper()
 HAND = np.eye(4, dtype=np.float32)[None]
@@ -35,13 +35,15 @@ def seen(*points: tuple[float, float, float]):
     ],
 )
 def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hits: bool) -> None:
-    assert meets_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
+    assert hits_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
 
 
 def test_the_width_is_what_lies_between_the_fingers_and_clearance() -> None:
-    width = widths_needed(seen((0.0, 0.012, 0.10), (0.0, -0.02, 0.09), (0.0, 0.03, 0.12)), PANDA)
+    width = required_openings(
+        seen((0.0, 0.012, 0.10), (0.0, -0.02, 0.09), (0.0, 0.03, 0.12)), PANDA
+    )
     np.testing.assert_allclose(width, 2 * (0.02 + FINGER_CLEARANCE), atol=1e-6)
-    assert widths_needed(seen((0.0, 0.039, 0.10)), PANDA)[0] == np.float32(PANDA.max_opening)
+    assert required_openings(seen((0.0, 0.039, 0.10)), PANDA)[0] == np.float32(PANDA.max_opening)
 
 
 def test_views_of_some_hands_are_those_of_all_taken() -> None:

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Grasp
+from edgegrasp_model.scene.cloud import CloudInput
 
 CASES = 500
 ROWS = 1500  # of the cloud
@@ -275,7 +275,7 @@ def check_pose(fields: dict, grasp: Grasp, gripper: Gripper) -> None:
     )
     assert abs(c[1] - a[1]) < gripper.max_opening / 2
     assert a[2] > gripper.palm_z - 0.006  # drawn back at most to the tips
-    assert gripper.palm_z < c[2] < gripper.foremost_z
+    assert gripper.palm_z < c[2] < gripper.max_tip_z
 
 
 def ways(fields: dict, grasp: Grasp) -> list[np.ndarray]:

@@ -4,12 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.cloud_input import CloudInput, check_cloud
-from edgegrasp_model.depth_scale import depth_scale, depths_corrected
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import parse_options
-from edgegrasp_model.scene import build_scene
-from edgegrasp_model.support import SupportPlane
+from edgegrasp_model.options import SupportPlane, parse_options
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.scene import build_scene
+from edgegrasp_model.scene.support import correct_depth_scale, depth_scale
 
 CAMERA = np.array([0.0, -0.5, 0.4])
 PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}
@@ -79,7 +78,7 @@ def test_every_view_has_a_factor_of_its_own() -> None:
     cloud = check_cloud(CloudInput(np.concatenate(sent), view_ids=ids))
     options = parse_options({"support": PLANE, "viewpoint": cameras.tolist()})
     warnings: list[str] = []
-    corrected = depths_corrected(cloud, options, cameras, warnings)
+    corrected = correct_depth_scale(cloud, options, cameras, warnings)
     np.testing.assert_allclose(corrected.points, np.concatenate(clean), atol=0.003)
     assert [text[:24] for text in warnings] == [
         "the depths of view 0 wer",
@@ -116,7 +115,7 @@ def test_a_table_that_was_cut_away_is_missed() -> None:
     warnings: list[str] = []
     options = parse_options({"support": PLANE, "viewpoint": CAMERA.tolist()})
     cloud = check_cloud(points[points[:, 2] > 0.08].astype(np.float32))
-    assert depths_corrected(cloud, options, CAMERA[None], warnings).points is not None
+    assert correct_depth_scale(cloud, options, CAMERA[None], warnings).points is not None
     assert len(warnings) == 1
     assert "options.support.max_depth_error (0.12)" in warnings[0]
 
@@ -127,7 +126,7 @@ def test_depths_are_left_alone_unless_asked() -> None:
     plane = {"normal": PLANE["normal"], "offset": PLANE["offset"]}
     warnings: list[str] = []
     options = parse_options({"support": plane, "viewpoint": CAMERA.tolist()})
-    assert depths_corrected(cloud, options, CAMERA[None], warnings) is cloud
+    assert correct_depth_scale(cloud, options, CAMERA[None], warnings) is cloud
     assert warnings == []
 
 

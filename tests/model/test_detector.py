@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
-from edgegrasp_model.cloud_input import CloudInput
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidRequest, UnknownModel
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.options import DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.results import Detection, Outcome
+from edgegrasp_model.scene.cloud import CloudInput
 
 TINY = NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (8, 8), crop_radius=0.04)
 PLUS = NetworkConfig("hand", hand_widths=(8, 8), classifier_widths=(8, 8), crop_radius=0.04)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.directions import ApproachDirection, Cone, allowed_ways
+from edgegrasp_model.candidates.sample import allowed_directions
+from edgegrasp_model.options import ApproachDirection, Cone
 
 DOWN, UP = np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 0.0, 1.0])
 
@@ -39,7 +40,7 @@ def test_directions_are_ways_the_hand_moves(
     request_: ApproachDirection | None, angles: list[float], allowed: list[int]
 ) -> None:
     ways = np.concatenate([tilted(angle) for angle in angles])
-    assert allowed_ways(ways, request_, UP).tolist() == [bool(value) for value in allowed]
+    assert allowed_directions(ways, request_, UP).tolist() == [bool(value) for value in allowed]
 
 
 def test_cones_are_given_in_the_frame_of_the_cloud_and_presets_by_up() -> None:
@@ -47,7 +48,7 @@ def test_cones_are_given_in_the_frame_of_the_cloud_and_presets_by_up() -> None:
     cone = ApproachDirection(
         cones=(Cone(direction=tuple(turn.inv().apply([0, 0, -1])), max_angle=0.01),)
     )
-    assert allowed_ways(DOWN, cone, UP, turn.apply).tolist() == [True]
-    assert allowed_ways(DOWN, cone, UP).tolist() == [False]
+    assert allowed_directions(DOWN, cone, UP, turn.apply).tolist() == [True]
+    assert allowed_directions(DOWN, cone, UP).tolist() == [False]
     sideways = ApproachDirection(preset="side")
-    assert allowed_ways(DOWN, sideways, [1.0, 0.0, 0.0]).tolist() == [True]
+    assert allowed_directions(DOWN, sideways, [1.0, 0.0, 0.0]).tolist() == [True]

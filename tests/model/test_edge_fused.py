@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from edgegrasp_model import compiled
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 
 pytest.importorskip("numba", reason="the extra `fast` is not installed")
 

@@ -7,20 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.candidates import EDGE_MARGIN, edge_grasps, level_grasps, support_clearance
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import meets_cloud, widths_needed
-from edgegrasp_model.errors import InvalidGripper
-from edgegrasp_model.gripper import (
-    GRIPPER_FOLDER,
-    GripperGeometry,
-    gripper_from_fields,
-    gripper_names,
-    load_gripper,
+from edgegrasp_model.candidates.collision import hits_cloud, required_openings
+from edgegrasp_model.candidates.edge_grasps import (
+    EDGE_MARGIN,
+    edge_grasps,
+    support_clearance,
+    top_down_grasps,
 )
+from edgegrasp_model.errors import InvalidGripper
+from edgegrasp_model.gripper import GRIPPER_FOLDER, gripper_from_fields, gripper_names, load_gripper
 from edgegrasp_model.hand_description import describe_hands
 from edgegrasp_model.hand_view import hand_views, reach_of
-from edgegrasp_model.options import Collision, SupportPlane
+from edgegrasp_model.options import Collision, GripperGeometry, SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
 
 GRIPPERS = [load_gripper(name) for name in gripper_names()]
 SWINGING = [gripper for gripper in GRIPPERS if gripper.swing is not None]
@@ -72,7 +71,7 @@ def test_each_gripper_that_ships_has_its_published_dimensions(
 def test_the_tcp_lies_ahead_of_the_palm_among_the_fingers(gripper: Any) -> None:
     np.testing.assert_allclose(gripper.T_hand_tcp[:3, :3], np.eye(3))
     np.testing.assert_allclose(gripper.T_hand_tcp[:3, 3], [0, 0, gripper.tcp_z])
-    assert gripper.palm_z < gripper.tcp_z <= gripper.foremost_z + 1e-6
+    assert gripper.palm_z < gripper.tcp_z <= gripper.max_tip_z + 1e-6
 
 
 @by_name
@@ -97,7 +96,7 @@ def test_swinging_fingers_stay_on_their_link_and_come_forward(gripper: Any) -> N
     ahead = np.sqrt(gripper.swing.radius**2 - gripper.swing.reach**2) + advance
     np.testing.assert_allclose(np.hypot(outward, ahead), gripper.swing.radius)
     assert gripper.tip_advance(gripper.max_opening) == pytest.approx(0.0)
-    assert gripper.foremost_z == pytest.approx(gripper.tip_z + advance.max(), abs=1e-5)
+    assert gripper.max_tip_z == pytest.approx(gripper.tip_z + advance.max(), abs=1e-5)
     tips = gripper.boxes(opening)[:, :, 1, 2].max(axis=1)
     np.testing.assert_allclose(tips, gripper.tip_z + advance)
 
@@ -143,7 +142,7 @@ def test_a_wider_gripper_takes_edges_that_a_narrow_one_cannot() -> None:
 def test_a_level_grasp_puts_its_contact_inside_the_fingertips(gripper: Any) -> None:
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.28)
     cloud = edge_cloud(0.02, 0.005)
-    grasps = level_grasps(cloud, np.array([0]), np.array([1]), floor, gripper)
+    grasps = top_down_grasps(cloud, np.array([0]), np.array([1]), floor, gripper)
     assert len(grasps) == 1
     pose = grasps.T_cloud_hand[0]
     contact = (cloud.points[1] - pose[:3, 3]) @ pose[:3, :3]
@@ -157,7 +156,7 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
     between = np.array([[0.0, 0.0, gripper.contact_z]], np.float32)
     for point, hits in [(c[None], True) for c in centres] + [(between, False)]:
         cloud = Cloud(point, np.zeros_like(point))
-        assert meets_cloud(cloud, HAND, gripper, Collision()).tolist() == [hits]
+        assert hits_cloud(cloud, HAND, gripper, Collision()).tolist() == [hits]
     cloud = edge_cloud(0.02, 0.01)
     pose = edge_grasps(cloud, np.array([0]), np.array([1]), gripper)
     points = centres @ pose.T_cloud_hand[0, :3, :3].T + pose.T_cloud_hand[0, :3, 3]
@@ -174,7 +173,7 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
 def test_the_width_needed_reaches_past_what_stands_between_the_fingers(gripper: Any) -> None:
     point = np.array([[0.0, 0.01, gripper.contact_z]], np.float32)
     view = hand_views(Cloud(point, point), HAND, reach_of(gripper))
-    assert 0.02 < widths_needed(view, gripper)[0] <= gripper.max_opening
+    assert 0.02 < required_openings(view, gripper)[0] <= gripper.max_opening
 
 
 def test_a_bracket_beside_the_fingers_is_no_palm() -> None:

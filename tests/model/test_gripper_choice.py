@@ -5,15 +5,14 @@ import pytest
 
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.gripper import gripper_names, load_gripper
-from edgegrasp_model.gripper_choice import chosen_gripper
+from edgegrasp_model.gripper import choose_gripper, gripper_names, load_gripper
 from edgegrasp_model.options import DetectOptions
 
 PANDA = load_gripper("panda")
 
 
 def choose(own: dict[str, object] | None = None, **fields: object) -> object:
-    return chosen_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
+    return choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
 
 
 def test_none_is_the_default_a_name_a_file_and_an_object_itself() -> None:

@@ -3,11 +3,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates import edge_grasps
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands, without_support
 from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
 
 PANDA = load_gripper()
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)

@@ -8,15 +8,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates import Candidates, edge_grasps
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE as SIZE
-from edgegrasp_model.hand_network import PIECE
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import HAND, NetworkConfig
-from edgegrasp_model.support import SupportPlane
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import HAND, NetworkConfig
+from edgegrasp_model.networks.hand import PIECE, HandBatch
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
 
 PANDA = load_gripper()
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)

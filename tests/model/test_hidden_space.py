@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hidden_space import BEHIND, DEEP, DepthMap, hidden_shares, probes
+from edgegrasp_model.hand_description import BEHIND, DEEP, DepthMap, occlusion_fractions, probes
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 CAMERA = np.array([0.0, 0.0, 0.6], dtype=np.float32)
@@ -58,11 +58,11 @@ def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
     hand = np.eye(4, dtype=np.float32)
     hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     hand[:3, 3] = [-0.1, 0.0, 0.1]
-    parts = hidden_shares(plate(), hand[None], CAMERA, UP, PANDA)
+    parts = occlusion_fractions(plate(), hand[None], CAMERA, UP, PANDA)
     above, below = parts[0][0], parts[1][0]
     assert above == 0.0
     assert below > 0.9
-    unknown = hidden_shares(plate(), hand[None], None, UP, PANDA)
+    unknown = occlusion_fractions(plate(), hand[None], None, UP, PANDA)
     assert len(unknown) == len(parts)
     assert not np.any(unknown)
 

@@ -7,9 +7,10 @@ import torch.nn.functional as F  # noqa: N812
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import EdgeGraspNet, build_network
-from edgegrasp_model.network_config import EDGEGRASP, EDGEGRASP_SMALL, VN_EDGEGRASP
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, VN_EDGEGRASP
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
 
 SEEDS = st.integers(0, 2**32 - 1)
 ARCHITECTURES = ["edgegrasp", "vn-edgegrasp"]

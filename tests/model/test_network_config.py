@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from edgegrasp_model.network_config import (
+from edgegrasp_model.networks.config import (
     EDGEGRASP,
     EDGEGRASP_SMALL,
     HAND,

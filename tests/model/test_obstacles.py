@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.canonical_frame import CanonicalFrame
-from edgegrasp_model.obstacles import SolidBoxes, separation, signed_distance
-from edgegrasp_model.regions import Box, OrientedBox
+from edgegrasp_model.options import Box, OrientedBox
+from edgegrasp_model.scene.cloud import CanonicalFrame
+from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 
 
 def random_boxes(rng: np.random.Generator, count: int) -> SolidBoxes:

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from edgegrasp_model.on_device.scoring import ScoringNetwork
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.ball_batch import BallBatch, crop_balls
-from edgegrasp_model.import_checkpoint import import_checkpoint
-from edgegrasp_model.on_device.scoring import ScoringNetwork
+from edgegrasp_model.candidates.edge_grasps import crop_balls
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
 SCENES = ["packed_00", "packed_03", "pile_04", "pile_07", "pile_09"]
 REFERENCE_RADIUS = 0.05

@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
+from edgegrasp_model.collision import _cloud_clearance
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model import compiled
-from edgegrasp_model.ball_batch import crop_balls, nearest_in_ball
-from edgegrasp_model.cloud import Cloud
-from edgegrasp_model.collision import _cloud_clearance, meets_cloud
+from edgegrasp_model.candidates.collision import hits_cloud
+from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.networks.balls import nearest_in_ball
 from edgegrasp_model.options import Collision
+from edgegrasp_model.scene.cloud import Cloud
 
 pytest.importorskip("numba", reason="the extra `fast` is not installed")
 
@@ -58,8 +60,8 @@ def test_the_same_hands_meet_the_cloud(plain, name, direction, seed):
     cloud, hands = scene(seed, count=30)
     request = Collision(margin=0.004, retreat_direction=direction, retreat_length=0.08)
     gripper = load_gripper(name)
-    expected = plain(meets_cloud, cloud, hands, gripper, request)
-    np.testing.assert_array_equal(meets_cloud(cloud, hands, gripper, request), expected)
+    expected = plain(hits_cloud, cloud, hands, gripper, request)
+    np.testing.assert_array_equal(hits_cloud(cloud, hands, gripper, request), expected)
     assert 0 < expected.sum() < len(hands)
 
 
@@ -68,8 +70,8 @@ def test_points_beyond_the_first_block_are_met_too(plain):
     far = np.full((2000, 3), 3.0, dtype=np.float32)
     far[-1] = 0.0
     cloud, gripper = Cloud(far, far), load_gripper()
-    hits = meets_cloud(cloud, hands, gripper, Collision())
-    np.testing.assert_array_equal(hits, plain(meets_cloud, cloud, hands, gripper, Collision()))
+    hits = hits_cloud(cloud, hands, gripper, Collision())
+    np.testing.assert_array_equal(hits, plain(hits_cloud, cloud, hands, gripper, Collision()))
     assert hits.any()
 
 
@@ -107,5 +109,5 @@ def test_no_point_and_no_hand():
     reach = reach_of(gripper)
     assert len(hand_views(nothing, hands, reach).row) == 0
     assert len(hand_views(cloud, hands[:0], reach).row) == 0
-    assert not meets_cloud(nothing, hands, gripper, Collision()).any()
-    assert len(meets_cloud(cloud, hands[:0], gripper, Collision())) == 0
+    assert not hits_cloud(nothing, hands, gripper, Collision()).any()
+    assert len(hits_cloud(cloud, hands[:0], gripper, Collision())) == 0

@@ -7,11 +7,17 @@ import torch.nn.functional as F  # noqa: N812
 from torch import nn
 
 from edgegrasp_model import products
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import EDGEGRASP_SMALL
-from edgegrasp_model.pieces import BallMaximum, ball_pieces, by_pieces, in_pieces
-from edgegrasp_model.products import MlpProducts, Product
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
+from edgegrasp_model.networks.layers import (
+    BallMaximum,
+    PackedLinear,
+    PackedMlp,
+    ball_chunks,
+    by_chunks,
+    in_chunks,
+)
 
 pytestmark = pytest.mark.skipif(
     not hasattr(torch.ops.mkldnn, "_reorder_linear_weight"), reason="PyTorch has no oneDNN here"
@@ -35,7 +41,7 @@ def test_a_product_is_the_linear_layer(monkeypatch, onednn, rectified, outputs):
     weight, bias, values = random(1, outputs, 40), random(2, outputs), random(3, 70, 40)
     own = weight[:, 3:30]  # a part of a matrix, as shared layers have
     with torch.inference_mode():
-        product = Product(own, bias, rectified=rectified)
+        product = PackedLinear(own, bias, rectified=rectified)
         assert (product._packed is not None) == (onednn and outputs > 1)
         found = product(values[:, 3:30])
     expected = F.linear(values[:, 3:30], own, bias)
@@ -45,13 +51,13 @@ def test_a_product_is_the_linear_layer(monkeypatch, onednn, rectified, outputs):
 def test_gradients_doubles_and_autocast_take_the_plain_product(monkeypatch):
     choose(monkeypatch, onednn=True)
     weight = random(1, 8, 8)
-    assert Product(weight)._packed is None  # gradients are recorded
+    assert PackedLinear(weight)._packed is None  # gradients are recorded
     with torch.no_grad():
-        assert Product(weight)._packed is not None
-        assert Product(weight.double())._packed is None
-        assert Product(weight.to("meta"))._packed is None
+        assert PackedLinear(weight)._packed is not None
+        assert PackedLinear(weight.double())._packed is None
+        assert PackedLinear(weight.to("meta"))._packed is None
         with torch.autocast("cpu", torch.bfloat16):
-            assert Product(weight)._packed is None
+            assert PackedLinear(weight)._packed is None
 
 
 @LIBRARIES
@@ -64,7 +70,7 @@ def test_a_row_is_the_same_wherever_it_is_in_a_piece(monkeypatch, onednn, thread
     try:
         with torch.inference_mode():
             for inputs, outputs in ((3, 32), (138, 512), (224, 256), (512, 1024)):
-                product = Product(random(1, outputs, inputs), random(2, outputs))
+                product = PackedLinear(random(1, outputs, inputs), random(2, outputs))
                 values = random(3, rows, inputs)
                 whole = product(values)
                 for shift in (1, 7, 100):
@@ -79,7 +85,7 @@ def test_an_mlp_by_pieces_is_the_mlp(gradients):
     mlp = nn.Sequential(nn.Linear(6, 16), nn.ReLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 3))
     values = random(1, 75, 6)
     with torch.set_grad_enabled(gradients):
-        found = by_pieces(MlpProducts(mlp), values, rows=32)
+        found = by_chunks(PackedMlp(mlp), values, rows=32)
     torch.testing.assert_close(found, mlp(values))
     assert found.requires_grad == gradients
 
@@ -90,7 +96,7 @@ def test_pieces_hold_every_row_and_the_maxima_are_those_of_the_balls(random_scen
     values = random(1, len(batch.points), 5)
     expected = torch.stack([ball.amax(0) for ball in torch.split(values, batch.ball_sizes)])
     with torch.no_grad():
-        pieces, found = ball_pieces(values, batch, rows), BallMaximum(batch.num_balls)
+        pieces, found = ball_chunks(values, batch, rows), BallMaximum(batch.num_balls)
         for piece in pieces:
             assert len(piece.values) == len(piece.ball_of_point) == sum(piece.sizes) == rows
             found.add(piece.values, piece)
@@ -100,10 +106,10 @@ def test_pieces_hold_every_row_and_the_maxima_are_those_of_the_balls(random_scen
 
 def test_only_inference_fills_pieces_up():
     values = random(1, 10, 2)
-    assert [len(part) for (part,) in in_pieces(4, values)] == [4, 4, 2]
+    assert [len(part) for (part,) in in_chunks(4, values)] == [4, 4, 2]
     with torch.no_grad():
-        assert [len(part) for (part,) in in_pieces(4, values)] == [4, 4, 4]
-        assert [len(part) for (part,) in in_pieces(4, values.to("meta"))] == [10]
+        assert [len(part) for (part,) in in_chunks(4, values)] == [4, 4, 4]
+        assert [len(part) for (part,) in in_chunks(4, values.to("meta"))] == [10]
 
 
 def test_both_libraries_give_the_same_scores(random_scene, monkeypatch):

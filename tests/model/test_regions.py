@@ -4,10 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.cloud import voxelise
-from edgegrasp_model.cloud_input import CheckedCloud, CloudInput, check_cloud
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.regions import (
+from edgegrasp_model.options import (
     Box,
     HalfSpace,
     Indices,
@@ -16,10 +14,9 @@ from edgegrasp_model.regions import (
     Region,
     Segments,
     Sphere,
-    check_region,
-    inside_region,
-    inside_shape,
 )
+from edgegrasp_model.scene.cloud import CheckedCloud, CloudInput, check_cloud, voxelise
+from edgegrasp_model.scene.regions import check_region, inside_region, inside_shape
 
 SIZE = 0.01  # edge of a voxel, metres
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edgegrasp_model.sampling import sample_approach_points
+from edgegrasp_model.candidates.edge_grasps import sample_approach_points
 
 
 @pytest.mark.parametrize("method", ["farthest", "uniform"])

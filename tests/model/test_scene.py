@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from edgegrasp_model.cloud_input import CloudInput, check_cloud
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.scene import Scene, build_scene
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.scene import Scene, build_scene
 
 VOXEL = 0.004
 

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.given_grasps import FLIP
+from edgegrasp_model.given import FLIP
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.scene.cloud import CloudInput
 
 ASKED = {
     "viewpoint": (0.3, 0.2, 0.5),

@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.support import RansacPlane, SupportPlane, find_support_plane
+from edgegrasp_model.options import RansacPlane, SupportPlane
+from edgegrasp_model.scene.support import find_support_plane
 
 
 def table(rng: np.random.Generator, share: float = 0.5, count: int = 3000) -> np.ndarray:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.canonical_frame import CanonicalFrame
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.scene.cloud import CanonicalFrame, CloudInput
 
 VIEW = np.array([0.4, 0.15, 0.45])
 

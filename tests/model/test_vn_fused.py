@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp_model import compiled
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.network import build_network
-from edgegrasp_model.vn_layers import vector_maximum, vector_relu
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.vn_edgegrasp import vector_maximum, vector_relu
 
 pytest.importorskip("numba", reason="the extra `fast` is not installed")
 vn_fused = pytest.importorskip("edgegrasp_model.vn_fused")

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.network import build_network
-from edgegrasp_model.vn_layers import vector_maximum, vector_relu
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.vn_edgegrasp import vector_maximum, vector_relu
 
 SEEDS = st.integers(0, 2**32 - 1)
 

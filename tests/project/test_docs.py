@@ -8,7 +8,8 @@ from types import ModuleType
 import pytest
 
 from edgegrasp_client import conversions
-from edgegrasp_model.gripper import GripperGeometry, gripper_names
+from edgegrasp_model.gripper import gripper_names
+from edgegrasp_model.options import GripperGeometry
 
 DOCS = Path(__file__).parents[2] / "docs"
 FRAMES = (DOCS / "frames.md").read_text()

@@ -118,7 +118,7 @@ def test_names_and_types_are_those_of_the_grpc_messages(owner: str) -> None:
 LENGTHS = {
     "viewpoint",
     *(f"GripperGeometry.{name}" for name in ("max_opening", "tip_z", "contact_z", "tcp_z")),
-    *(f"Swing.{name}" for name in ("radius", "reach")),
+    *(f"Linkage.{name}" for name in ("radius", "reach")),
     *(f"{owner}.{corner}" for owner in ("Workspace", "Box") for corner in ("min", "max")),
     *(f"OrientedBox.{name}" for name in ("center", "half_extents")),
     *(f"Sphere.{name}" for name in ("center", "radius")),

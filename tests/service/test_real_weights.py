@@ -19,9 +19,8 @@ OPTIONS: dict[str, Any] = {"seed": 7, "num_approach_points": 8, "num_candidates"
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import torch
 
-    from edgegrasp_model.checkpoint import CheckpointMetadata, save_checkpoint
-    from edgegrasp_model.network import build_network
-    from edgegrasp_model.network_config import EDGEGRASP_SMALL
+    from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+    from edgegrasp_model.networks.config import EDGEGRASP_SMALL, CheckpointMetadata
 
     network = build_network(EDGEGRASP_SMALL, torch.Generator().manual_seed(0))
     path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
@@ -51,7 +50,7 @@ def as_lists(detection: Any) -> list[list[Any]]:
 def test_every_way_in_gives_the_detectors_grasps(
     weights: Path, box: np.ndarray, start_server, tmp_path: Path
 ) -> None:
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.options import DetectOptions
 
     catalogue = ModelCatalogue.load([weights], default="untrained")
@@ -145,9 +144,9 @@ def scene(box: np.ndarray) -> dict[str, np.ndarray]:
 def test_many_options_give_the_same_grasps_everywhere(
     scene: dict[str, np.ndarray], start_server, tmp_path: Path
 ) -> None:
-    from edgegrasp_model.catalogue import ModelCatalogue
-    from edgegrasp_model.cloud_input import CloudInput
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.options import parse_options
+    from edgegrasp_model.scene.cloud import CloudInput
 
     expected = ModelCatalogue.load().get().detect(CloudInput(**scene), parse_options(MANY))
     assert expected.grasps
@@ -188,7 +187,7 @@ def test_many_options_give_the_same_grasps_everywhere(
 
 
 def test_wrong_depths_are_put_right_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.options import parse_options
 
     camera = np.array([0.3, 0.1, 0.6])
@@ -212,7 +211,7 @@ def test_wrong_depths_are_put_right_everywhere(scene: dict[str, np.ndarray], sta
 
 
 def test_scores_are_the_same_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.options import parse_options
 
     options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}

@@ -13,7 +13,7 @@ from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient, GraspClient
-from edgegrasp_model.catalogue import WEIGHTS_FOLDER
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.errors import InvalidCheckpoint
 from edgegrasp_service.core import GraspService
 from edgegrasp_service.dummy import DummyCatalogue

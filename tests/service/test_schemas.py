@@ -61,7 +61,7 @@ NESTED = {
     directions.Cone: grasp_pb2.Cone,
     gripper.GripperGeometry: grasp_pb2.GripperGeometry,
     gripper.HandPart: grasp_pb2.HandPart,
-    gripper.Swing: grasp_pb2.Swing,
+    gripper.Linkage: grasp_pb2.Linkage,
 }
 IN_MESSAGES_ONLY = {"disabled", "ransac"}  # `null` and `"kind": "ransac"` in JSON
 

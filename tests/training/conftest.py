@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_model.candidates import edge_grasps
-from edgegrasp_model.cloud import Cloud
+from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_training.views import LabelledView, find_views
 
 MakeView = Callable[[int], LabelledView]

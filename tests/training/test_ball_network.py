@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_training.ball_network import LENGTH_UNIT, in_metres, in_units, prepare_to_train
 from edgegrasp_training.examples import pack_balls, tried_grasps
 from edgegrasp_training.views import LabelledView

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from edgegrasp_model.checkpoint import CheckpointMetadata
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_training.data_card import CARD_FILE, write_data_card
 from edgegrasp_training.recipes import RECIPES

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.candidates import support_clearance
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint, save_checkpoint
+from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.network import build_network
-from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (
     SUPPORT,
     TRIED_WEIGHT,
@@ -71,7 +70,7 @@ def test_lessons_hold_what_the_teacher_says_of_candidates_above_the_table(
         UP,
         SUPPORT,
         view.camera_position,
-        at_workspace_side(view.points, WORKSPACE, UP),
+        near_workspace_side(view.points, WORKSPACE, UP),
         HAND.hand_points,
     )
     with torch.inference_mode():

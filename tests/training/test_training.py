@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.checkpoint import CheckpointMetadata, load_checkpoint
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_batch import HandBatch
-from edgegrasp_model.network_config import NetworkConfig
-from edgegrasp_model.scene import at_workspace_side
+from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.ball_network import LENGTH_UNIT
 from edgegrasp_training.examples import (
     SUPPORT,
@@ -149,7 +149,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
         UP,
         SUPPORT,
         view.camera_position,
-        at_workspace_side(view.points, WORKSPACE, UP),
+        near_workspace_side(view.points, WORKSPACE, UP),
         HAND.hand_points,
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)

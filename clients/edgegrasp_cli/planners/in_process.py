@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from edgegrasp_cli.planners.requests import choose, request_options
-from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.cloud_input import CloudInput
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trials import PlannedGrasp

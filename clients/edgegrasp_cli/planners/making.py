@@ -180,7 +180,7 @@ def _oracle_own(choice: PlannerChoice, rules: PlanningRules) -> MadePlanner:
 
 def _metadata(weights: tuple[Path, ...], model: str) -> Any:
     """What the weights say of themselves."""
-    from edgegrasp_model.catalogue import ModelCatalogue
+    from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_model.errors import EdgeGraspError
 
     try:

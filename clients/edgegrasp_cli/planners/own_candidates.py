@@ -9,10 +9,9 @@ import numpy as np
 
 from edgegrasp_cli.planners.paper_candidates import Float32
 from edgegrasp_cli.planners.requests import request_options
-from edgegrasp_model.catalogue import ModelCatalogue
-from edgegrasp_model.cloud_input import CloudInput
-from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_sim.observation import Observation
 from edgegrasp_sim.protocol import PlanningRules
 

@@ -7,9 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from edgegrasp_model.candidates import edge_grasp_poses, measure_edges
-from edgegrasp_model.cloud import Cloud, Voxels
-from edgegrasp_model.sampling import sample_approach_points
+from edgegrasp_model.candidates.edge_grasps import (
+    edge_grasp_poses,
+    measure_edges,
+    sample_approach_points,
+)
+from edgegrasp_model.scene.cloud import Cloud, Voxels
 from edgegrasp_sim.observation import Observation, crop
 
 Float32 = NDArray[np.float32]

@@ -13,10 +13,10 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
@@ -34,9 +34,7 @@ MODEL_FACTS = (
 class Detector(Protocol):
     """Finds grasps in a cloud with one set of weights."""
 
-    def prepare(
-        self, cloud: CloudInput, options: DetectOptions, max_voxels: int | None = None
-    ) -> Any:
+    def prepare(self, cloud: CloudInput, options: DetectOptions) -> Any:
         """Everything before the network; its `batch` is None where there is nothing to score."""
 
     def run(self, batch: Any) -> NDArray[Any]:
@@ -52,7 +50,6 @@ class Detector(Protocol):
         *,
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
-        max_voxels: int | None = None,
     ) -> Scoring:
         """Score edges (M, 2) or hand poses (M, 4, 4)."""
 
@@ -81,14 +78,14 @@ def load_catalogue(settings: Settings) -> Catalogue:
 
         return DummyCatalogue(settings.dummy_seconds)
     # Torch takes seconds to import, and the dummy does without.
-    from edgegrasp_model.catalogue import ModelCatalogue
-    from edgegrasp_model.on_device.choice import choose_device
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     catalogue: Catalogue = ModelCatalogue.load(
         settings.weights,
         settings.default_model,
         choose_device(settings.device),
         settings.grippers,
+        settings.max_voxels,
     )
     catalogue.warm_up()
     return catalogue
@@ -156,7 +153,7 @@ class _Work:
         with self._stage("decode"):
             detector, cloud, options, _ = self._decode()
         with self._stage("prepare"):
-            prepared = detector.prepare(cloud, options, self._limits.max_voxels)
+            prepared = detector.prepare(cloud, options)
             self._count(prepared.counts)
         del cloud  # as JSON it takes many times its room
         with self._stage("network"):
@@ -171,7 +168,7 @@ class _Work:
         with self._stage("decode"):
             detector, cloud, options, given = self._decode()
         with self._stage("score"):
-            scoring = detector.score(cloud, options, **given, max_voxels=self._limits.max_voxels)
+            scoring = detector.score(cloud, options, **given)
         self.facts.grasps = len(scoring.evaluations)
         return scoring
 
@@ -226,7 +223,8 @@ def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
         given = decode_array(name, given, limits.max_points)
-    _limit(name, len(given), limits.max_candidates)
+    if len(given) <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
+        _limit(name, len(given), limits.max_candidates)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}

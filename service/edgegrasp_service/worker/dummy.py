@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput, check_cloud
 from edgegrasp_model.errors import UnknownModel
-from edgegrasp_model.given_grasps import check_edges, check_hand_poses
+from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,
@@ -23,6 +22,7 @@ from edgegrasp_model.results import (
     Outcome,
     Scoring,
 )
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
@@ -52,15 +52,12 @@ class DummyDetector:
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
 
-    def prepare(
-        self, cloud: CloudInput, options: DetectOptions, max_voxels: int | None = None
-    ) -> DummyPrepared:
+    def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
         """Draw approach points, the same ones for the same cloud and options.
 
         Args:
             cloud: As for a real detector.
             options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
-            max_voxels: Without effect: the dummy makes no voxels.
 
         Raises:
             InvalidRequest: The cloud is none, as for a real detector.
@@ -101,7 +98,6 @@ class DummyDetector:
         *,
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
-        max_voxels: int | None = None,
     ) -> Scoring:
         """Make up scores; an edge from a point to itself defines no grasp.
 

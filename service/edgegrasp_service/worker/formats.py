@@ -18,8 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
 
 Array = NDArray[Any]
@@ -105,7 +105,7 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
     if not sizes_are_counts or len(shape) > MAX_AXES:
         raise InvalidRequest(field, f"shape {brief(shape)}", fix)
     if dtype.hasobject or dtype.itemsize == 0 or dtype.subdtype is not None:
-        raise InvalidRequest(field, f"dtype {brief(dtype)}", "Send an array of numbers.")
+        raise InvalidRequest(field, f"dtype {str(dtype)[:60]}", "Send an array of numbers.")
     # NumPy cannot make an array of such a shape, even where one of its sizes is 0.
     if math.prod(max(size, 1) for size in shape) * dtype.itemsize >= 2**63:
         raise InvalidRequest(field, f"shape {brief(shape)}", fix)

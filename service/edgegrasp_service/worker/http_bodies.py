@@ -229,7 +229,8 @@ def _no_form(fault: str) -> InvalidRequest:
 
 
 def _header(text: str) -> Message:
-    return HeaderParser().parsestr(text, headersonly=True)
+    whole_characters = text.encode("utf-8", "replace").decode()
+    return HeaderParser().parsestr(whole_characters, headersonly=True)
 
 
 def _format_of(header: Message) -> str:

@@ -50,6 +50,5 @@ class Limits:
     """The settings that bound one request."""
 
     max_points: int = 2_000_000  # in a cloud, before downsampling
-    max_voxels: int = 300_000  # in a cloud, after downsampling
     max_approach_points: int = 256
     max_candidates: int = 16_000

@@ -15,8 +15,7 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import MAX_CANDIDATES
-from edgegrasp_model.regions import MAX_ROWS
+from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
 from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
 from edgegrasp_service.schemas import PER_POINT
 from edgegrasp_service.worker.job import Method

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from edgegrasp_model.cloud_input import CloudInput
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
     PCL_COLORS,

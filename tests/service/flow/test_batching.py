@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 
-from edgegrasp_model.ball_batch import BallBatch
-from edgegrasp_model.catalogue import ModelCatalogue
+from edgegrasp_model.detector import ModelCatalogue
+from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection
 from edgegrasp_service.batching import BatchPolicy, Choice, Size

@@ -1,0 +1,1 @@
+"""From a scene to the hands that the network scores."""

@@ -1,0 +1,177 @@
+"""Where the hand would hit something, how near it comes, and how far its fingers must open."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.edge_grasps import support_clearance
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
+from edgegrasp_model.kernels import any_point_in_boxes, signed_distance_to_boxes
+from edgegrasp_model.options import Collision, SupportPlane
+from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
+from edgegrasp_model.scene.scene import Scene
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
+TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
+
+
+def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+    """Which open hands meet the cloud, the support plane or an obstacle.
+
+    Checked at the grasp, on the straight way in and on the way out, with each box of the hand
+    grown by the margin on every side.
+
+    Args:
+        scene: Cloud, support plane and obstacles, canonical frame.
+        T_cloud_hand: (E, 4, 4), canonical frame.
+        gripper: Its boxes, fingers open to the maximum.
+        request: Margin and ways.
+
+    Returns:
+        (E,)
+    """
+    hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
+    if scene.support is not None:
+        hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
+    if len(scene.obstacles):
+        hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+    return hit
+
+
+def reach_of_motion(gripper: Gripper, request: Collision) -> Reach:
+    """The part of the hand frame that the hand sweeps on its way in and out."""
+    lift = request.retreat_length if request.retreat_direction == "up" else 0.0
+    return reach_of(gripper, around=request.margin, back=approach_sweep_length(request), lift=lift)
+
+
+def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+    """Which open hands meet a point of the cloud.  # (E,)."""
+    boxes = inflated_boxes(gripper, request)
+    swept = swept_boxes(boxes, request)
+    hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        free = np.flatnonzero(~hit)
+        view = hand_views(cloud, T_cloud_hand[free], reach_of_motion(gripper, request))
+        lift = request.retreat_length * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
+        for low, high in boxes:
+            hit[free[view.candidate[_swept_over(view.position, lift, low, high)]]] = True
+    return hit
+
+
+def hits_support(
+    T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which hands come closer to the support plane than the margin.  # (E,)."""
+    normal = np.asarray(support.normal)
+    height = support_clearance(T_cloud_hand, support, gripper)
+    rise = -T_cloud_hand[:, :3, 2] @ normal  # per metre of way back
+    lowest = np.minimum(height, height + approach_sweep_length(request) * rise)
+    if request.retreat_direction == "up":
+        lowest = np.minimum(lowest, height + request.retreat_length * (UP @ normal))
+    return np.asarray(lowest < request.margin - TOUCH)
+
+
+def hits_obstacles(
+    T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
+) -> Bools:
+    """Which open hands meet a box.  # (E,)."""
+    grown = inflated_boxes(gripper, request)
+    at_rest = SolidBoxes.of_hands(T_cloud_hand, swept_boxes(grown, request))
+    hit = _hits_any(at_rest, obstacles, None)
+    if request.retreat_direction == "up" and request.retreat_length > 0:
+        hands = SolidBoxes.of_hands(T_cloud_hand, grown)
+        hit |= _hits_any(hands, obstacles, request.retreat_length * UP.astype(np.float64))
+    return np.asarray(hit.reshape(len(T_cloud_hand), len(grown)).any(axis=1))
+
+
+def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Distance of each open hand at the grasp to what is nearest: cloud, support or obstacle.
+
+    Args:
+        scene: Canonical frame.
+        T_cloud_hand: (E, 4, 4), canonical frame.
+        gripper: Its boxes, fingers open to the maximum.
+
+    Returns:
+        (E,) metres. Negative where something lies within a box of the hand: its depth below the
+        box's surface, the deepest.
+    """
+    boxes = gripper.boxes(gripper.max_opening)
+    nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
+    if scene.support is not None:
+        nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
+    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
+    for place in range(len(scene.obstacles)):
+        box = scene.obstacles.take(np.full(len(hands), place))
+        # A bound that costs little leaves few boxes to measure exactly.
+        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
+        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
+        distance = np.full(len(hands), np.inf)
+        distance[near] = signed_distance(hands.take(near), box.take(near))
+        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
+    return nearest.astype(np.float32)
+
+
+def approach_sweep_length(request: Collision) -> float:
+    """Metres behind the grasp that the straight way in or out sweeps."""
+    out = request.retreat_length if request.retreat_direction == "back" else 0.0
+    return max(request.approach_length, out)
+
+
+def inflated_boxes(gripper: Gripper, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) of the open hand with the margin around them."""
+    boxes = gripper.boxes(gripper.max_opening)
+    boxes[:, 0] -= request.margin
+    boxes[:, 1] += request.margin
+    return boxes
+
+
+def swept_boxes(boxes: Float64, request: Collision) -> Float64:
+    """Boxes (B, 2, 3) that also cover the straight ways along the hand's z."""
+    swept = boxes.copy()
+    swept[:, 0, 2] -= approach_sweep_length(request)
+    return swept
+
+
+def _swept_over(position: Float32, lift: Float32, low: Float64, high: Float64) -> Bools:
+    """Which points (P, 3) a box (3,), (3,) passes over while it moves by `lift` (P, 3)."""
+    step = np.where(np.abs(lift) < 1e-12, 1e-12, lift)
+    one, other = (position - high) / step, (position - low) / step  # shares of the way
+    enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
+    return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
+
+
+def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:
+    """Which boxes (M,), moved along `sweep` (3,), meet an obstacle."""
+    hit = np.zeros(len(boxes), dtype=bool)
+    way = np.zeros(3) if sweep is None else sweep
+    for center, half in zip(obstacles.center, obstacles.half, strict=True):
+        apart = np.linalg.norm(center - boxes.center - way / 2, axis=1)
+        bound = boxes.radius + np.linalg.norm(half) + np.linalg.norm(way) / 2
+        near = np.flatnonzero(~hit & (apart < bound))
+        theirs = SolidBoxes(np.tile(center, (len(near), 1)), np.tile(half, (len(near), 1, 1)))
+        moved = None if sweep is None else np.tile(sweep, (len(near), 1))
+        hit[near] = separation(boxes.take(near), theirs, moved) < 0
+    return hit
+
+
+def required_openings(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
+    """Opening that clears what lies between the fingers, with FINGER_CLEARANCE on each side.
+
+    Returns:
+        (E,) metres, at most the gripper's maximum.
+    """
+    half = gripper.pad_half_width
+    x, y, z = view.columns
+    inner = gripper.max_opening / 2
+    ahead = (z > gripper.palm_z) & (z < gripper.max_tip_z)
+    between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
+    reach = np.zeros(view.num_candidates, dtype=np.float32)
+    np.maximum.at(reach, view.candidate[between], np.abs(y[between]))
+    width: NDArray[np.float32] = np.minimum(2 * (reach + FINGER_CLEARANCE), gripper.max_opening)
+    return width

@@ -1,0 +1,394 @@
+"""Approach points, the edge grasps around them, and their top-down and centred variants."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+MIN_EDGE = 0.003  # metres between approach and contact point
+EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
+MIN_DEPTH = 1e-4  # metres; a shallower edge has no approach direction
+TIP_MARGIN = 0.002  # metres a contact stays inside the fingertips when the hand retracts
+LOW = 0.03  # metres over the support plane up to which contacts get a top-down grasp too
+MIN_LEVEL = 0.3  # horizontal part of a normal from which its heading can be trusted
+OUTLINE_RADIUS = 0.012  # metres of surface that say where the outline of a flat top runs
+MIN_OUTWARD = 0.003  # metres from a neighbourhood's mean to a point on the outline
+MAX_SIDEWAYS = 0.006  # metres between approach and contact point across a top-down grasp
+MIN_DROP = -0.002  # metres a contact may lie above the approach point of a top-down grasp
+WIDE = 0.75  # share of the opening from which an object counts as wide
+BESIDE_PADS = 0.004  # metres beside the finger pads in which points count
+
+
+def sample_approach_points(
+    points: Float32,
+    count: int,
+    method: Literal["farthest", "uniform"],
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Rows of `count` different points, or of all where there are fewer.
+
+    Args:
+        points: (N, 3).
+        count: How many to choose.
+        method: `farthest` spreads them over the cloud from a random start; `uniform` takes any.
+        rng: Source of the random choice.
+
+    Returns:
+        (min(count, N),) rows of `points`.
+    """
+    count = min(count, len(points))
+    if method == "uniform":
+        return rng.choice(len(points), count, replace=False).astype(np.int64)
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = rng.integers(len(points))
+    nearest = np.full(len(points), np.inf, dtype=np.float32)
+    for i in range(1, count):
+        nearest = np.minimum(nearest, ((points - points[chosen[i - 1]]) ** 2).sum(axis=1))
+        chosen[i] = int(nearest.argmax())
+    return chosen
+
+
+class BallCrop(NamedTuple):
+    """Balls as rows of their cloud. P ball points in all, ball after ball."""
+
+    ball_rows: NDArray[np.int64]  # (P,) rows of the cloud, ascending within each ball
+    ball_of_point: NDArray[np.int64]  # (P,) ascending, 0..A-1
+    radius: float  # metres
+
+
+def crop_balls(
+    points: NDArray[np.float32],  # (N, 3)
+    approach_index: NDArray[np.integer],  # (A,)
+    radius: float,
+) -> BallCrop:
+    """Crops a ball around each approach point.
+
+    A cloud point within two balls counts twice, once for each.
+
+    Args:
+        points: The cloud (N, 3), metres, any frame.
+        approach_index: Rows (A,) of `points`; one ball each, in this order.
+        radius: Ball radius, metres.
+
+    Source: paper section (the ball of radius G_w / 2).
+    """
+    approach_index = np.asarray(approach_index, dtype=np.int64)
+    members = cKDTree(points).query_ball_point(points[approach_index], radius, return_sorted=True)
+    ball_of_point = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
+    ball_rows = np.concatenate([np.empty(0), *members]).astype(np.int64)
+    return BallCrop(ball_rows, ball_of_point, radius)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Edge grasps of one cloud (paper section III)."""
+
+    pair: Int64  # (E,) which of the given pairs of points
+    approach_index: Int64  # (E,) p_a, rows of the cloud
+    contact_index: Int64  # (E,) p_c, rows of the cloud
+    approach: Float32  # (E, 3) unit, outward: from the object back to the hand
+    depth: Float32  # (E,) d, metres the contact lies ahead of the approach point
+    T_cloud_hand: Float32  # (E, 4, 4)
+
+    def __len__(self) -> int:
+        return len(self.pair)
+
+    @staticmethod
+    def none() -> "Candidates":
+        """No candidate."""
+        rows, numbers = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+        vectors = np.empty((0, 3), dtype=np.float32)
+        return Candidates(rows, rows, rows, vectors, numbers, np.empty((0, 4, 4), np.float32))
+
+    @staticmethod
+    def concatenate(parts: Sequence["Candidates"]) -> "Candidates":
+        """All candidates of several sets, in order."""
+        arrays = [
+            np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])
+        ]
+        return Candidates(*arrays)
+
+    def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Candidates":
+        """The candidates of the given rows, in their order."""
+        return Candidates(
+            self.pair[rows],
+            self.approach_index[rows],
+            self.contact_index[rows],
+            self.approach[rows],
+            self.depth[rows],
+            self.T_cloud_hand[rows],
+        )
+
+
+def edge_grasps(
+    cloud: Cloud, approach_index: Int64, contact_index: Int64, gripper: Gripper
+) -> Candidates:
+    """The candidates among pairs of approach and contact points.
+
+    r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
+    III-A). The contact ends up at the gripper's contact_z, the approach point on the hand's axis.
+
+    Args:
+        cloud: The cloud with its normals.
+        approach_index: (M,) rows of the cloud.
+        contact_index: (M,) rows of the cloud.
+        gripper: Gives the opening, the fingers' depth and where the contact lies in the hand.
+
+    Returns:
+        The pairs that define an edge grasp which fits the gripper.
+    """
+    edge = measure_edges(cloud, approach_index, contact_index)
+    pair = np.flatnonzero(
+        (edge.length > MIN_EDGE)
+        & (edge.length < gripper.max_opening / 2 - EDGE_MARGIN)
+        & (edge.depth > MIN_DEPTH)
+        & (edge.depth < gripper.finger_depth)
+    )
+    ahead, normal, depth = edge.ahead[pair], edge.normal[pair], edge.depth[pair]
+    contact_z = gripper.contact_z_at(2 * np.abs(edge.along[pair]))
+    pose = edge_grasp_poses(cloud.points[approach_index[pair]], ahead, normal, depth, contact_z)
+    return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
+
+
+class EdgeMeasures(NamedTuple):
+    """Edges r = p_c - p_a, decomposed along the normal at the contact."""
+
+    normal: Float32  # (M, 3) unit n_c
+    along: Float32  # (M,) r . n_c, metres
+    ahead: Float32  # (M, 3) r_perp, the part of r orthogonal to n_c
+    length: Float32  # (M,) |r|, metres
+    depth: Float32  # (M,) |r_perp|, metres
+
+
+def measure_edges(cloud: Cloud, approach_index: Int64, contact_index: Int64) -> EdgeMeasures:
+    """Measure the edges of pairs (M,), (M,) of points, rows of the cloud."""
+    normal = cloud.normals[contact_index]
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    edge = cloud.points[contact_index] - cloud.points[approach_index]  # (M, 3) r
+    along = np.einsum("md,md->m", edge, normal)
+    ahead = edge - along[:, None] * normal
+    length, depth = np.linalg.norm(edge, axis=1), np.linalg.norm(ahead, axis=1)
+    return EdgeMeasures(normal, along, ahead, length, depth)
+
+
+def edge_grasp_poses(
+    approach_point: Float32, ahead: Float32, normal: Float32, depth: Float32, contact_z: Float32
+) -> Float32:
+    """Hand poses of edge grasps.
+
+    Args:
+        approach_point: (E, 3) p_a.
+        ahead: (E, 3) r_perp, the part of p_c - p_a orthogonal to n_c.
+        normal: (E, 3) unit n_c.
+        depth: (E,) |r_perp|.
+        contact_z: (E,) where the contact lies along the hand's z.
+
+    Returns:
+        (E, 4, 4) T_cloud_hand: z = r_perp / d, y = n_c, x = y x z; the contact point lies at
+        z = contact_z.
+    """
+    z = ahead / depth[:, None]
+    y = normal - np.einsum("ed,ed->e", normal, z)[:, None] * z
+    y = y / np.linalg.norm(y, axis=1, keepdims=True)
+    pose = np.zeros((len(z), 4, 4), dtype=np.float32)
+    pose[:, :3, 0] = np.cross(y, z)
+    pose[:, :3, 1] = y
+    pose[:, :3, 2] = z
+    pose[:, :3, 3] = approach_point + (depth - contact_z)[:, None] * z
+    pose[:, 3, 3] = 1.0
+    return pose
+
+
+def retract(
+    candidates: Candidates, support: SupportPlane, gripper: Gripper, margin: float = 0.0
+) -> tuple[Candidates, NDArray[np.bool_]]:
+    """Retract hands that would cut into the support plane along their approach, where that helps.
+
+    The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: flat
+    objects on a table are held by the tips.
+
+    Args:
+        candidates: E of them.
+        support: The plane.
+        gripper: Its boxes.
+        margin: Metres that the hand stays above the plane.
+
+    Returns:
+        The candidates, and which of their hands (E,) are above the plane now; the others are
+        unchanged.
+    """
+    clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+    rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        back = np.where(clearance >= 0, 0.0, -clearance / rise)
+    clear = (back >= 0) & (back <= gripper.tip_z - gripper.contact_z - TIP_MARGIN)
+    pose = candidates.T_cloud_hand.copy()
+    pose[clear, :3, 3] += back[clear, None] * candidates.approach[clear]
+    return replace(candidates, T_cloud_hand=pose), clear
+
+
+def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
+    """Height of the lowest corner of each hand, fingers open, over the support plane.
+
+    Fingers on a linkage count at their most forward position on the way to closed.
+
+    Args:
+        T_cloud_hand: (E, 4, 4).
+        support: The plane.
+        gripper: Its boxes.
+
+    Returns:
+        (E,) metres; negative below the plane.
+    """
+    boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
+    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
+    normal = np.asarray(support.normal)
+    normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)
+    origin_height = T_cloud_hand[:, :3, 3] @ normal - support.offset  # (E,)
+    lowest = (normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T).min(axis=1)
+    clearance: Float32 = origin_height + lowest
+    return clearance.astype(np.float32)
+
+
+class Headings(NamedTuple):
+    """The horizontal heading of the surface at each of a cloud's N points."""
+
+    direction: Float32  # (N, 3) unit, along the support plane
+    certain: NDArray[np.bool_]  # (N,) which can be trusted
+
+
+def top_down_grasps(
+    cloud: Cloud,
+    approach_index: Int64,
+    contact_index: Int64,
+    support: SupportPlane,
+    gripper: Gripper,
+    headings: Headings | None = None,
+) -> Candidates:
+    """Candidates that come straight down onto low contacts and close horizontally.
+
+    Near a flat object's top edge the estimated normals tilt upward, and a hand that closes along
+    them would cut into the table: here only their horizontal heading counts. Of a very flat
+    object only the top is seen; there the heading is that of the outline seen from above.
+
+    Args:
+        cloud: The cloud with its normals.
+        approach_index: (M,) rows of the cloud.
+        contact_index: (M,) rows of the cloud.
+        support: The plane that contacts are low over.
+        gripper: Gives the opening and contact_z.
+        headings: `closing_headings` of the same cloud, where the caller has them already.
+
+    Returns:
+        The pairs that allow such a grasp.
+    """
+    up = np.asarray(support.normal, dtype=np.float32)
+    contact = cloud.points[contact_index]
+    edge = contact - cloud.points[approach_index]  # (M, 3)
+    heading, certain = headings or closing_headings(cloud, support)
+    y = heading[contact_index]
+    along, sideways = np.einsum("md,md->m", edge, y), np.einsum("md,md->m", edge, np.cross(y, -up))
+    pair = np.flatnonzero(
+        certain[contact_index]
+        & (along > MIN_EDGE)
+        & (along < gripper.max_opening / 2 - EDGE_MARGIN)
+        & (np.abs(sideways) < MAX_SIDEWAYS)
+        & (-edge @ up > MIN_DROP)
+    )
+    y, along = y[pair], along[pair, None]
+    pose = np.zeros((len(pair), 4, 4), dtype=np.float32)
+    pose[:, :3, 0] = np.cross(y, -up)
+    pose[:, :3, 1] = y
+    pose[:, :3, 2] = -up
+    contact_z = gripper.contact_z_at(2 * along)
+    pose[:, :3, 3] = contact[pair] - along * y + contact_z * up
+    pose[:, 3, 3] = 1.0
+    depth = np.maximum(-edge[pair] @ up, 0.0)
+    return Candidates(pair, approach_index[pair], contact_index[pair], -pose[:, :3, 2], depth, pose)
+
+
+def closing_headings(cloud: Cloud, support: SupportPlane) -> Headings:
+    """The horizontal heading of the surface at each point low over the support.
+
+    Args:
+        cloud: N points.
+        support: The plane; of unit normal.
+    """
+    up = np.asarray(support.normal, dtype=np.float32)
+    low = cloud.points @ up - support.offset < LOW
+    level = cloud.normals - (cloud.normals @ up)[:, None] * up
+    certain = low & (np.linalg.norm(level, axis=1) > MIN_LEVEL)
+    flat = np.flatnonzero(low & ~certain)
+    if len(flat):
+        tree = cKDTree(cloud.points)
+        around: Any = tree.query_ball_point(cloud.points[flat], OUTLINE_RADIUS, return_sorted=True)
+        count = np.array([len(rows) for rows in around])  # the point itself at least
+        sums = np.add.reduceat(cloud.points[np.concatenate(around)], np.cumsum(count) - count)
+        outward = cloud.points[flat] - sums / count[:, None]
+        outward -= (outward @ up)[:, None] * up
+        level[flat] = outward
+        certain[flat] = np.linalg.norm(outward, axis=1) > MIN_OUTWARD
+    length = np.linalg.norm(level, axis=1, keepdims=True)
+    return Headings((level / np.maximum(length, 1e-9)).astype(np.float32), certain)
+
+
+MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; beyond, another approach point does better
+
+
+def centred_grasps(
+    points: Float32, crop: BallCrop, candidates: Candidates, gripper: Gripper
+) -> Candidates:
+    """Candidates for wide objects: hands moved along their closing direction.
+
+    The hand of an edge grasp is centred on its approach point, and few sampled points lie in the
+    middle of an object almost as wide as the hand opens. Its extent is taken from the points of
+    the ball between the fingers; whether the hand fits is left to the collision check.
+
+    Args:
+        points: (N, 3) the cloud.
+        crop: Balls around the approach points.
+        candidates: E of them; `pair` is their contact's row in `crop`.
+        gripper: Gives the opening and the pads.
+
+    Returns:
+        One for each candidate with a wide object off centre between its fingers.
+    """
+    axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
+    outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
+    wide = np.flatnonzero(np.abs(outward) > min_contact_offset(gripper))
+    ball = crop.ball_of_point[candidates.pair[wide]]
+    first = np.searchsorted(crop.ball_of_point, np.arange(ball.max(initial=-1) + 2))
+    low, high = np.full((2, len(wide)), np.nan, dtype=np.float32)
+    for number in np.unique(ball):
+        here = np.flatnonzero(ball == number)
+        near = points[crop.ball_rows[first[number] : first[number + 1]]]  # (P, 3)
+        turn, shift = axes[wide[here]], origin[wide[here]]
+        x, y, z = (
+            near @ turn[:, :, axis].T - np.einsum("kd,kd->k", shift, turn[:, :, axis])
+            for axis in range(3)
+        )  # (P, K) each, hand frame
+        between = np.abs(x) < gripper.pad_half_width + BESIDE_PADS
+        between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
+        low[here] = np.where(between, y, np.inf).min(axis=0)
+        high[here] = np.where(between, y, -np.inf).max(axis=0)
+    middle, width = (low + high) / 2, high - low
+    moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
+    moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
+    further = candidates.take(wide[moved])
+    further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
+    return further
+
+
+def min_contact_offset(gripper: Gripper) -> float:
+    """Least distance between the hand's axis and a contact on a wide object, metres."""
+    return WIDE * gripper.max_opening / 2 - MAX_SHIFT

@@ -1,0 +1,224 @@
+"""From a scene to the candidates that the network scores."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgegrasp_model.candidates.collision import collides
+from edgegrasp_model.candidates.edge_grasps import (
+    BallCrop,
+    Candidates,
+    Headings,
+    centred_grasps,
+    closing_headings,
+    crop_balls,
+    edge_grasps,
+    retract,
+    sample_approach_points,
+    top_down_grasps,
+)
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
+from edgegrasp_model.options import ApproachDirection, DetectOptions
+from edgegrasp_model.results import Outcome
+from edgegrasp_model.scene.cloud import UP
+from edgegrasp_model.scene.scene import Scene
+
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
+OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
+CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
+TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
+SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
+MIN_APPROACH_UP = -0.1  # where nothing is asked for: cosine of the outward approach and up
+
+
+APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Every candidate around one set of approach points, and what became of it so far."""
+
+    candidates: Candidates  # E of them
+    outcome: NDArray[np.int8]  # (E,) CODE of its Outcome; RETURNED: still in
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The candidates to score, around one set of approach points; canonical frame."""
+
+    approach_index: Int64  # (A,) rows of the cloud
+    crop: BallCrop
+    candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
+    view: HandView  # of the same candidates
+    collision_free: Bools  # (E,)
+    attempts: list[Attempt]  # the last of which holds these candidates
+    row: Int64  # (E,) their rows in it
+
+
+def sample_candidates(
+    scene: Scene,
+    options: DetectOptions,
+    gripper: Gripper,
+    crop_radius: float,
+    counts: dict[str, int],
+    centre: bool = False,
+) -> Sample:
+    """Sample approach points and the candidates around them, collision-free where possible.
+
+    Args:
+        scene: With at least one point in the approach region.
+        options: Sampling, constraints and seed.
+        gripper: What has to fit.
+        crop_radius: Radius of the balls, metres.
+        counts: Gets the number of candidates left after each constraint, over all attempts.
+        centre: Whether there are centred hands among them: for networks that see where a hand is.
+
+    Returns:
+        At most num_candidates candidates. With `collision: avoid` none of them collides.
+    """
+    rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
+    rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
+    approach_rows = np.flatnonzero(scene.approach_allowed)
+    limit = OVERSAMPLING * options.num_candidates
+    headings = None if scene.support is None else closing_headings(scene.cloud, scene.support)
+    attempts: list[Attempt] = []
+    while True:
+        chosen = sample_approach_points(
+            scene.cloud.points[approach_rows],
+            options.num_approach_points,
+            options.sampling,
+            rng_approach,
+        )
+        approach_index = approach_rows[chosen]
+        crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
+        this = _constrained(scene, headings, approach_index, crop, options, gripper, counts, centre)
+        attempts.append(this)
+        passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
+        row = passed[random_rows(len(passed), limit, rng_candidates)]
+        this.outcome[passed] = CODE[Outcome.NOT_CHECKED]
+        candidates = this.candidates.take(row)
+        free = ~collides(scene, candidates.T_cloud_hand, gripper, options.collision)
+        ignored = options.collision.mode == "ignore"
+        this.outcome[row] = CODE[Outcome.NOT_SCORED]
+        if not ignored:
+            this.outcome[row[~free]] = CODE[Outcome.COLLISION]
+        add_count(counts, "checked", len(row))
+        add_count(counts, "collision_free", int(free.sum()))
+        found = len(row) > 0 if ignored else free.any()
+        # A further attempt would draw the same approach points and candidates.
+        exhausted = len(approach_rows) <= len(chosen) and len(passed) <= limit
+        if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
+            break
+    scored = rows_to_score(free, options, rng_candidates)
+    this.outcome[row[scored]] = CODE[Outcome.RETURNED]
+    counts["scored"] = len(scored)
+    candidates = candidates.take(scored)
+    return Sample(
+        approach_index,
+        crop,
+        candidates,
+        hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
+        free[scored],
+        attempts,
+        row[scored],
+    )
+
+
+def _constrained(
+    scene: Scene,
+    headings: Headings | None,
+    approach_index: Int64,
+    crop: BallCrop,
+    options: DetectOptions,
+    gripper: Gripper,
+    counts: dict[str, int],
+    centre: bool,
+) -> Attempt:
+    """The edge grasps of some balls, and which satisfy every constraint but collision avoidance."""
+    add_count(counts, "approach_points", len(approach_index))
+    add_count(counts, "pairs", len(crop.ball_rows))
+    pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
+    add_count(counts, "in_contact_region", len(pair))
+    pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
+    candidates = edge_grasps(scene.cloud, *pairs, gripper)
+    if scene.support is not None:
+        level = top_down_grasps(scene.cloud, *pairs, scene.support, gripper, headings)
+        candidates = Candidates.concatenate([candidates, level])
+    candidates = replace(candidates, pair=pair[candidates.pair])
+    if centre:
+        centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
+        candidates = Candidates.concatenate([candidates, centred])
+    add_count(counts, "candidates", len(candidates))
+    outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
+    if scene.support is not None:
+        margin = options.collision.margin
+        candidates, clear = retract(candidates, scene.support, gripper, margin)
+        outcome[~clear] = CODE[Outcome.SUPPORT]
+    direction = -candidates.approach
+    allowed = allowed_directions(direction, options.approach_direction, UP, scene.frame.directions)
+    outcome[~allowed] = CODE[Outcome.DIRECTION]
+    add_count(counts, "in_direction", int(allowed.sum()))
+    add_count(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
+    return Attempt(candidates, outcome)
+
+
+def rows_to_score(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
+    """Ascending rows of at most num_candidates candidates, those free of collision first."""
+    if options.collision.mode == "ignore":
+        return random_rows(len(free), options.num_candidates, rng)
+    clear, hit = np.flatnonzero(free), np.flatnonzero(~free)
+    rows = clear[random_rows(len(clear), options.num_candidates, rng)]
+    if options.collision.mode == "penalise":
+        rest = random_rows(len(hit), options.num_candidates - len(rows), rng)
+        rows = np.sort(np.concatenate([rows, hit[rest]]))
+    return rows
+
+
+def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
+    """Ascending rows of at most `limit` out of `size`."""
+    if size <= limit:
+        return np.arange(size, dtype=np.int64)
+    return np.sort(rng.choice(size, limit, replace=False)).astype(np.int64)
+
+
+def add_count(counts: dict[str, int], name: str, number: int) -> None:
+    """Add to a count, which is 0 where it is not there yet."""
+    counts[name] = counts.get(name, 0) + number
+
+
+def allowed_directions(
+    direction: NDArray[np.floating],
+    constraint: ApproachDirection | None,
+    up: ArrayLike,
+    in_frame: Callable[[ArrayLike], NDArray[np.floating]] = np.asarray,
+) -> NDArray[np.bool_]:
+    """Which directions the hand may move in.
+
+    Args:
+        direction: (E, 3) unit, the directions in which hands move; their +z.
+        constraint: What was asked for.
+        up: (3,) unit, in the frame of `direction`.
+        in_frame: Maps the constraint's directions to the frame of `direction`.
+
+    Returns:
+        (E,)
+    """
+    rise = direction @ np.asarray(up)
+    if constraint is None:
+        return np.asarray(-rise > MIN_APPROACH_UP)
+    allowed = np.zeros(len(direction), dtype=bool)
+    for cone in constraint.cones:
+        axis = in_frame(cone.direction)
+        allowed |= direction @ (axis / np.linalg.norm(axis)) >= math.cos(cone.max_angle)
+    if constraint.preset == "top-down":
+        allowed |= -rise >= math.cos(TOP_DOWN_ANGLE)
+    if constraint.preset == "side":
+        allowed |= np.abs(rise) <= math.sin(SIDE_ANGLE)
+    return allowed

@@ -1,0 +1,281 @@
+"""Score the edges and hand poses that a caller gives (the paper's grasp evaluation function)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.collision import clearances, collides, required_openings
+from edgegrasp_model.candidates.edge_grasps import (
+    EDGE_MARGIN,
+    MIN_DEPTH,
+    MIN_EDGE,
+    BallCrop,
+    Candidates,
+    crop_balls,
+    edge_grasps,
+    measure_edges,
+    retract,
+)
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
+from edgegrasp_model.options import Collision
+from edgegrasp_model.ranking import grasps_in_cloud
+from edgegrasp_model.results import Evaluation, NoGrasp
+from edgegrasp_model.scene.scene import Scene
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+BALLS_AT_A_TIME = 64
+MAX_GIVEN = 16_000
+FIRST_TOUCH = 0.004  # metres from the outermost point, within which points are touched first
+FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """A network as the evaluation sees it."""
+
+    probability: Callable[[BallBatch | HandBatch], NDArray[np.floating]]
+    crop_radius: float  # metres
+    network: NetworkConfig
+
+
+@dataclass(frozen=True)
+class Given:
+    """M edges or hand poses, E of which define an edge grasp."""
+
+    candidates: Candidates  # E of them; `pair` ascends and says which of the M each is
+    reason: list[NoGrasp | None]  # M: why it defines none
+    T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
+
+
+def evaluate(
+    scene: Scene, given: Given, gripper: Gripper, request: Collision, scorer: Scorer
+) -> list[Evaluation]:
+    """Evaluate what a caller gives, in order.
+
+    Args:
+        scene: The scene.
+        given: Edges or hand poses as candidates.
+        gripper: The hand.
+        request: What collides.
+        scorer: The network.
+    """
+    candidates = given.candidates
+    view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
+    if scorer.network.architecture == "hand":
+        score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network, view))
+    else:
+        score = _score_balls(scene, candidates, scorer)
+    if given.T_cloud_hand is not None:
+        candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
+    hands = candidates.T_cloud_hand
+    grasps = grasps_in_cloud(
+        scene,
+        candidates,
+        gripper,
+        score,
+        required_openings(view, gripper),
+        ~collides(scene, given.candidates.T_cloud_hand, gripper, request),
+        clearances(scene, hands, gripper),
+    )
+    evaluations = [Evaluation(None, reason) for reason in given.reason]
+    for number, grasp in zip(candidates.pair.tolist(), grasps, strict=True):
+        evaluations[number] = Evaluation(grasp, None)
+    return evaluations
+
+
+def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> NDArray[np.floating]:
+    """Scores (E,), ball by ball: there are as many balls as the caller has approach points."""
+    score = np.empty(len(candidates))
+    points, normals = scene.cloud.points, scene.cloud.normals
+    balls = np.unique(candidates.approach_index)
+    for start in range(0, len(balls), BALLS_AT_A_TIME):
+        some = balls[start : start + BALLS_AT_A_TIME]
+        crop = crop_balls(points, some, scorer.crop_radius)
+        rows = np.flatnonzero(np.isin(candidates.approach_index, some))
+        here = candidates.take(rows)
+        contact = _contact_rows(here, some, crop, len(points))
+        score[rows] = scorer.probability(
+            BallBatch.from_cloud(
+                points, normals, some, crop, contact, here.approach, here.depth, scorer.network.k
+            )
+        )
+    return score
+
+
+def _contact_rows(
+    candidates: Candidates, balls: NDArray[np.int64], crop: BallCrop, size: int
+) -> NDArray[np.int64]:
+    """Rows (E,) of the crop that hold the candidates' contacts, each in its own ball."""
+    keys = crop.ball_of_point * size + crop.ball_rows  # ascending
+    ball = np.searchsorted(balls, candidates.approach_index)
+    return np.searchsorted(keys, ball * size + candidates.contact_index).astype(np.int64)
+
+
+def check_edges(edges: object, rows: int) -> Int64:
+    """Check (M, 2) rows of the cloud as sent.
+
+    Raises:
+        InvalidRequest: Another type or shape, too many, or a row that the cloud does not have.
+    """
+    fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
+    if not isinstance(edges, np.ndarray):
+        raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
+    if edges.dtype.kind not in "iu" or edges.shape[1:] != (2,):
+        raise InvalidRequest("edges", f"dtype {edges.dtype}, shape {edges.shape}", fix)
+    _check_number("edges", len(edges))
+    low, high = int(edges.min(initial=0)), int(edges.max(initial=0))
+    if low < 0 or high >= rows:
+        value = f"row {low if low < 0 else high} of a cloud of {rows} rows"
+        raise InvalidRequest("edges", value, f"Send rows from 0 to {rows - 1}.")
+    return edges.astype(np.int64)
+
+
+def check_hand_poses(poses: object) -> Float32:
+    """Check (M, 4, 4) poses T_cloud_hand.
+
+    Raises:
+        InvalidRequest: Another type or shape, too many, or one that is no rigid transform.
+    """
+    fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
+    if not isinstance(poses, np.ndarray):
+        raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
+    if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
+        raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
+    _check_number("hand_poses", len(poses))
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
+    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    rigid: NDArray[np.bool_] = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
+    rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
+    if not rigid.all():
+        fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
+        value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"
+        raise InvalidRequest("hand_poses", value, fix)
+    return poses.astype(np.float32)
+
+
+def _check_number(field: str, number: int) -> None:
+    if not 1 <= number <= MAX_GIVEN:
+        raise InvalidRequest(field, f"{number} of them", f"Send 1 to {MAX_GIVEN}.")
+
+
+def from_edges(
+    scene: Scene, edges: Int64, gripper: Gripper, crop_radius: float, margin: float
+) -> Given:
+    """Candidates of edges, between the points of the processed cloud that their rows went into.
+
+    Args:
+        scene: The scene.
+        edges: (M, 2) rows of the cloud as sent: approach and contact point.
+        gripper: What has to fit.
+        crop_radius: Metres around the approach point within which the contact has to be.
+        margin: Metres that hands are retracted to above the support plane, where that helps.
+    """
+    point = scene.point_of_row[edges]
+    reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
+    there = np.flatnonzero((point >= 0).all(axis=1))
+    measures = measure_edges(scene.cloud, point[there, 0], point[there, 1])
+    longest = min(gripper.max_opening / 2 - EDGE_MARGIN, crop_radius)
+    faults = {
+        NoGrasp.TOO_SHORT: measures.length <= MIN_EDGE,
+        NoGrasp.TOO_LONG: measures.length >= longest,
+        NoGrasp.NO_DIRECTION: measures.depth <= MIN_DEPTH,
+        NoGrasp.TOO_DEEP: measures.depth >= gripper.finger_depth,
+    }
+    for place, row in enumerate(there.tolist()):
+        reason[row] = next((fault for fault, found in faults.items() if found[place]), None)
+    fit = there[[reason[row] is None for row in there]]
+    candidates = edge_grasps(scene.cloud, point[fit, 0], point[fit, 1], gripper)
+    if scene.support is not None:
+        candidates, _ = retract(candidates, scene.support, gripper, margin)
+    return Given(replace(candidates, pair=fit[candidates.pair]), reason)
+
+
+def from_hand_poses(
+    scene: Scene, T_cloud_hand: Float32, gripper: Gripper, crop_radius: float
+) -> Given:
+    """The edge grasps nearest to hand poses.
+
+    The contact point is what a closing finger touches first, on the side whose normal is closer
+    to the closing direction: of the points within FIRST_TOUCH of the outermost one between the
+    fingers, the one nearest to where the gripper puts its contacts. The approach point is the
+    point around it that is nearest to the hand's approach axis. The pose stays as it is given.
+
+    Args:
+        scene: The scene.
+        T_cloud_hand: (M, 4, 4), canonical frame.
+        gripper: What is between its fingers.
+        crop_radius: Metres around the approach point within which the contact has to be.
+    """
+    view = hand_views(scene.cloud, T_cloud_hand, reach_of(gripper))
+    x, y, z = view.position.T
+    between = np.flatnonzero(
+        (np.abs(x) < gripper.pad_half_width)
+        & (np.abs(y) < gripper.max_opening / 2)
+        & (z > gripper.palm_z)
+        & (z < gripper.max_tip_z)
+    )
+    hand = view.candidate[between]
+    off_contact = x[between] ** 2 + (z[between] - gripper.contact_z_at(2 * np.abs(y[between]))) ** 2
+    facing = np.full((2, len(T_cloud_hand)), -np.inf)  # (+y, -y): cosine of normal and finger
+    touched = np.zeros((2, len(T_cloud_hand)), dtype=np.int64)  # rows of `view`
+    for side, outward in enumerate((y[between], -y[between])):
+        outermost = np.full(len(T_cloud_hand), -np.inf, dtype=np.float32)
+        np.maximum.at(outermost, hand, outward)
+        first = np.flatnonzero(outward > outermost[hand] - FIRST_TOUCH)
+        hands, best = _least(hand[first], off_contact[first])
+        touched[side, hands] = between[first[best]]
+        normal = scene.cloud.normals[view.row[touched[side, hands]]]
+        closing = T_cloud_hand[hands, :3, 1] * (1 - 2 * side)
+        facing[side, hands] = np.einsum("ed,ed->e", normal, closing)
+    side = facing.argmax(axis=0)
+    contact = touched[side, np.arange(len(T_cloud_hand))]  # rows of `view`
+    approach = _approach_points(view, contact, crop_radius)
+    found = np.flatnonzero(np.isfinite(facing.max(axis=0)) & (approach >= 0))
+    reason: list[NoGrasp | None] = [NoGrasp.NOTHING_BETWEEN] * len(T_cloud_hand)
+    for row in found.tolist():
+        reason[row] = None
+    given = T_cloud_hand[found]
+    pose = np.where((side[found] == 0)[:, None, None], given, given @ FLIP)
+    a, c = approach[found], view.row[contact[found]] if len(found) else found
+    edge = scene.cloud.points[c] - scene.cloud.points[a]
+    depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)
+    return Given(Candidates(found, a, c, -pose[:, :3, 2], depth, pose), reason, given)
+
+
+def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
+    """For each hand the point nearest to its axis, near its contact but not at it; -1: none.
+
+    Args:
+        view: The cloud from M hands.
+        contact: (M,) rows of the view.
+        crop_radius: Metres.
+
+    Returns:
+        (M,) rows of the cloud.
+    """
+    result = np.full(len(contact), -1, dtype=np.int64)
+    if len(view.row) == 0:
+        return result
+    apart = np.linalg.norm(view.position - view.position[contact[view.candidate]], axis=1)
+    near = np.flatnonzero((apart > MIN_EDGE) & (apart < 0.99 * crop_radius))
+    off_axis = (view.position[near, :2] ** 2).sum(axis=1)
+    hands, best = _least(view.candidate[near], off_axis)
+    result[hands] = view.row[near[best]]
+    return result
+
+
+def _least(group: Int64, key: NDArray[np.floating]) -> tuple[Int64, Int64]:
+    """The groups that occur, ascending, and where in them the key is least."""
+    order = np.lexsort((key, group))
+    groups, first = np.unique(group[order], return_index=True)
+    return groups, order[first]

@@ -1,0 +1,143 @@
+"""The batch that the ball networks score: the neighbourhoods of the approach points."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
+from edgegrasp_model.kernels import nearest_in_groups
+from edgegrasp_model.networks.config import NetworkConfig
+
+
+def nearest_in_ball(
+    points: NDArray[np.float32],  # (N, 3)
+    approach_index: NDArray[np.integer],  # (A,)
+    crop: BallCrop,
+    k: int = 16,
+) -> NDArray[np.int64]:
+    """Joins the points of balls to their k nearest in the same ball.
+
+    The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
+    row fills the rest, which changes no maximum over neighbours.
+
+    Args:
+        points: The cloud (N, 3), metres.
+        approach_index: Rows (A,) of `points`, as given to `crop_balls`.
+        crop: P ball points.
+        k: Neighbours per point, itself included.
+
+    Returns:
+        (P, k) rows of `crop.ball_rows`, nearest (the point itself) first.
+
+    Source: paper section IV (its PointNet++ graph of 16 nearest).
+    """
+    centre = points[np.asarray(approach_index, dtype=np.int64)[crop.ball_of_point]]
+    centred = points[crop.ball_rows] - centre
+    bounds = np.searchsorted(crop.ball_of_point, np.arange(len(approach_index) + 1))
+    return nearest_in_groups(centred, bounds, k)
+
+
+@dataclass(frozen=True)
+class BallBatch:
+    """Everything a ball network needs to score the edge grasps of one cloud.
+
+    P ball points in `num_balls` balls, E edge grasps. Metres; every ball in the axes of its cloud.
+    """
+
+    points: Tensor  # (P, 3) float32, centred on their own ball's approach point
+    normals: Tensor  # (P, 3) float32
+    neighbors: Tensor  # (P, k) int64, rows of `points` in the same ball, the own row included
+    ball_of_point: Tensor  # (P,) int64, ascending, 0..num_balls-1, none of them empty
+    num_balls: int
+    contact: Tensor  # (E,) int64, rows of `points`: the contact point of each edge grasp
+    approach: Tensor  # (E, 3) float32, outward approach direction u, unit length
+    depth: Tensor  # (E,) float32, |r_perp|: contact below approach point along u
+
+    @classmethod
+    def from_cloud(
+        cls,
+        points: NDArray[np.float32],  # (N, 3)
+        normals: NDArray[np.float32],  # (N, 3)
+        approach_index: NDArray[np.integer],  # (A,)
+        crop: BallCrop,
+        contact: NDArray[np.integer],  # (E,)
+        approach: NDArray[np.float32],  # (E, 3)
+        depth: NDArray[np.float32],  # (E,)
+        k: int = 16,
+    ) -> Self:
+        """Packs a cloud and its balls.
+
+        Args:
+            points: The cloud (N, 3), metres.
+            normals: Its normals (N, 3).
+            approach_index: Rows (A,) of `points`, as given to `crop_balls`.
+            crop: The balls.
+            contact: Rows (E,) of `crop.ball_rows`, not of the cloud: a contact has a ball.
+            approach: Outward approach directions (E, 3), unit length.
+            depth: Depths (E,), metres.
+            k: Neighbours per point, itself included.
+        """
+        centre = points[approach_index][crop.ball_of_point]
+        return cls(
+            points=_float_tensor(points[crop.ball_rows] - centre),
+            normals=_float_tensor(normals[crop.ball_rows]),
+            neighbors=torch.from_numpy(nearest_in_ball(points, approach_index, crop, k)),
+            ball_of_point=torch.from_numpy(crop.ball_of_point),
+            num_balls=len(approach_index),
+            contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
+            approach=_float_tensor(approach),
+            depth=_float_tensor(depth),
+        )
+
+    @classmethod
+    def made_up(cls, config: NetworkConfig) -> Self:
+        """A fixed batch of 32 edge grasps, to see whether a network computes as it did before."""
+        rng = np.random.default_rng(0)
+        points = rng.uniform(-0.06, 0.06, (200, 3)).astype(np.float32)
+        normals = rng.normal(size=(200, 3))
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        balls = np.array([0, 1])
+        crop = crop_balls(points, balls, config.crop_radius)
+        contact = rng.choice(len(crop.ball_rows), 32)
+        return cls.from_cloud(
+            points,
+            normals.astype(np.float32),
+            balls,
+            crop,
+            contact,
+            approach=normals[:32].astype(np.float32),
+            depth=rng.uniform(0.0, 0.04, 32).astype(np.float32),
+            k=config.k,
+        )
+
+    @property
+    def ball_of_edge(self) -> Tensor:
+        """Ball (E,) int64 of each edge grasp."""
+        return self.ball_of_point[self.contact]
+
+    @property
+    def ball_sizes(self) -> list[int]:
+        """Number of points of each ball, in order."""
+        sizes: list[int] = torch.bincount(self.ball_of_point, minlength=self.num_balls).tolist()
+        return sizes
+
+    def to(self, device: torch.device | str) -> "BallBatch":
+        """Moves every tensor to a device."""
+        return BallBatch(
+            points=self.points.to(device),
+            normals=self.normals.to(device),
+            neighbors=self.neighbors.to(device),
+            ball_of_point=self.ball_of_point.to(device),
+            num_balls=self.num_balls,
+            contact=self.contact.to(device),
+            approach=self.approach.to(device),
+            depth=self.depth.to(device),
+        )
+
+
+def _float_tensor(array: NDArray[np.floating]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

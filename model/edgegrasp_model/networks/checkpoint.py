@@ -1,0 +1,177 @@
+"""Checkpoints: a network's weights and what is needed to use them, in one safetensors file.
+
+The file's metadata holds one JSON text under the key `edgegrasp`; nothing in it is ever executed.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from edgegrasp_model.errors import InvalidCheckpoint
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import Architecture, CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.hand import HandBatch, HandNet
+from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
+
+_METADATA_KEY = "edgegrasp"
+_FORMAT = 1
+MIN_CORRELATION = 0.99
+NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
+    "edgegrasp": EdgeGraspNet,
+    "vn-edgegrasp": VNEdgeGraspNet,
+    "hand": HandNet,
+}
+
+
+def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:
+    """Writes a checkpoint; a reader sees the old file or the new one, never half of it.
+
+    The same weights and metadata make the same bytes.
+
+    Args:
+        path: File to write, usually `<name>.safetensors`.
+        network: Built from `metadata.network`.
+        metadata: What to say of it; its digest is not written.
+    """
+    tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
+    values = asdict(metadata) | {
+        "format": _FORMAT,
+        "network": metadata.network.to_dict(),
+        "tensors_digest": _digest(tensors),
+        "reference_logits": [round(logit, 4) for logit in reference_logits(network)],
+    }
+    del values["digest"]
+    text = json.dumps(values, sort_keys=True)
+    partial = path.with_name(path.name + ".partial")
+    save_file(tensors, partial, metadata={_METADATA_KEY: text})
+    partial.replace(path)
+
+
+def load_checkpoint(
+    path: Path, device: torch.device | str = "cpu"
+) -> tuple[nn.Module, CheckpointMetadata]:
+    """Loads a checkpoint; the network comes in evaluation mode.
+
+    Raises:
+        InvalidCheckpoint: The file is missing, truncated, damaged or foreign, a weight is not
+            finite, or the weights do not fit the network that its metadata describes, or do not
+            give the logits that they gave when they were written.
+    """
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            text = (file.metadata() or {}).get(_METADATA_KEY)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    except (OSError, SafetensorError) as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, which cannot be read as safetensors ({error}). "
+            "Give a complete file written by `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+    metadata = replace(_read_metadata(path, text), digest=digest)
+    _check_tensors(path, tensors, metadata.tensors_digest)
+    network = build_network(metadata.network)
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose weights do not fit its own metadata ({error}). "
+            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+    network = network.to(device).eval()
+    _check_logits(path, reference_logits(network), metadata.reference_logits)
+    return network, metadata
+
+
+def reference_logits(network: nn.Module) -> list[float]:
+    """The logits that a network gives a fixed made-up batch, whatever its architecture."""
+    config: NetworkConfig = network.config  # type: ignore[assignment]
+    parameter = next(network.parameters())
+    was_training = network.training
+    network.eval()
+    kind: type[HandBatch | BallBatch] = HandBatch if config.architecture == "hand" else BallBatch
+    with torch.inference_mode():
+        logits: list[float] = network(kind.made_up(config).to(parameter.device)).float().tolist()
+    network.train(was_training)
+    return logits
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: str) -> None:
+    for name, tensor in tensors.items():
+        if not tensor.isfinite().all():
+            raise InvalidCheckpoint(
+                f"checkpoint: got {path}, whose {name} holds NaN or infinity. Restore the file "
+                "from a copy, or train anew."
+            )
+    if expected and _digest(tensors) != expected:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose weights are not those it was written with. Restore the "
+            "file from a copy."
+        )
+
+
+def _check_logits(path: Path, found: list[float], expected: tuple[float, ...]) -> None:
+    """Compare by correlation: a near tie may fall the other way on another processor."""
+    alike = not expected or np.corrcoef(found, expected)[0, 1] > MIN_CORRELATION
+    if not (np.isfinite(found).all() and alike):
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose network does not give the logits it was written with. "
+            "Check this installation of PyTorch and Numba, or restore the file from a copy."
+        )
+
+
+def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
+    if text is None:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, a safetensors file without edgegrasp metadata. "
+            "Convert foreign weights with `edgegrasp import-checkpoint`."
+        )
+    try:
+        values = json.loads(text)
+        written = values.pop("format")
+        if written != _FORMAT:
+            raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
+        values["network"] = NetworkConfig.from_dict(values["network"])
+        return CheckpointMetadata(**values)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise InvalidCheckpoint(
+            f"checkpoint: got {path}, whose edgegrasp metadata is unusable ({error!r}). "
+            "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
+        ) from error
+
+
+def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
+    """Builds a network with random weights.
+
+    Args:
+        config: Its architecture and widths.
+        generator: Source of the weights; without one, those of seed 0.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    # The layers first initialise themselves from the global stream: leave it as it was.
+    with torch.random.fork_rng(devices=[]):
+        network = NETWORKS[config.architecture](config)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.
+            bound = module.in_features**-0.5
+            nn.init.uniform_(module.weight, -bound, bound, generator=generator)
+            if module.bias is not None:
+                nn.init.uniform_(module.bias, -bound, bound, generator=generator)
+    return network

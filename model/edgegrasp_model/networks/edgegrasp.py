@@ -1,0 +1,165 @@
+"""EdgeGraspNet: scores edge grasps from local, global and grasp features.
+
+Huang, Wang, Zhu, Walters, Platt: "Edge Grasp Network: A Graph-Based SE(3)-invariant Approach to
+Grasp Detection", ICRA 2023, section IV. Widths below are the paper's; P points, B balls, E grasps.
+"""
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from edgegrasp_model.kernels import compiled
+from edgegrasp_model.networks.balls import BallBatch
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.layers import (
+    CONVOLVED,
+    EDGE_ROWS,
+    BallMaximum,
+    PackedLinear,
+    PackedMlp,
+    SharedLinear,
+    ball_chunks,
+    by_chunks,
+    float32_inference,
+    gather_rows,
+    in_chunks,
+    maximum,
+    mlp,
+    row_linear,
+)
+
+Float32 = NDArray[np.float32]
+
+GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
+
+
+class EdgeGraspNet(nn.Module):
+    """The paper's network."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        width_1, width_2, width_3 = config.conv_widths
+        self.conv1 = PointNetConv(3 + 3, width_1)
+        self.conv2 = PointNetConv(width_1, width_2)
+        self.conv3 = PointNetConv(width_2, width_3)
+        self.ball_feature = GlobalFeature(
+            config.local_width, config.global_widths_1, config.global_widths_2
+        )
+        own_width = GRASP_WIDTH + width_3
+        self.join = SharedLinear(
+            own_width + config.global_widths_2[-1], config.classifier_widths[0]
+        )
+        self.classifier = mlp((*config.classifier_widths, 1))
+
+    def forward(self, batch: BallBatch) -> Tensor:
+        """Scores the edge grasps of a batch: logits (E,) of success."""
+        f1 = F.relu(self.conv1(torch.cat((batch.points, batch.normals), dim=1), batch))  # (P, 32)
+        f2 = F.relu(self.conv2(f1, batch))  # (P, 64)
+        f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
+        ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
+        grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
+        join, classifier, logits = self.join.on(ball), PackedMlp(self.classifier), []
+        for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
+            logits.append(classifier(join(own, ball_of_edge).relu_()))  # (e, 1)
+        return torch.cat(logits).squeeze(1)[: len(grasp)]
+
+    def _grasp_features(self, batch: BallBatch) -> Tensor:
+        """What is told of each grasp itself, (E, 10)."""
+        contact = batch.contact
+        parts = (
+            batch.points[contact],
+            batch.normals[contact],
+            batch.depth.unsqueeze(1),
+            batch.approach,
+        )
+        return torch.cat(parts, dim=1)
+
+
+class PointNetConv(nn.Module):
+    """Graph convolution: a two-layer MLP on [f_j, p_j - p_i], maximum over neighbours j."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(inputs + 3, width)
+        self.output = nn.Linear(width, width)
+
+    def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, inputs) to (P, width)."""
+        if float32_inference(features):
+            return fused_convolution(self, features, batch)
+        # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
+        widths = [features.shape[1], 3]
+        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
+        v = row_linear(batch.points, point_weight)  # (P, width)
+        u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
+        output, pooled = PackedLinear(self.output.weight), []
+        for neighbors, v_here in in_chunks(CONVOLVED, batch.neighbors, v):
+            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
+            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
+        # The bias is the same for all neighbours: added once, after the maximum.
+        return torch.cat(pooled)[: len(v)] + self.output.bias
+
+
+class GlobalFeature(nn.Module):
+    """One feature per ball: MLP, maximum over the ball, joined to each point; the same again."""
+
+    def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
+        super().__init__()
+        self.mlp_1 = mlp((inputs, *widths_1))
+        self.join = SharedLinear(inputs + widths_1[-1], widths_2[0])
+        self.mlp_2 = mlp(widths_2)
+
+    def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
+        """Maps point features (P, 224) to ball features (B, 1024)."""
+        chunks = ball_chunks(local, batch)
+        mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
+        for chunk in chunks:
+            maximum_1.add(mlp_1(chunk.values), chunk)
+        join = self.join.on(maximum_1.result())  # of (B, 512)
+        mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
+        for chunk in chunks:
+            joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
+            maximum_2.add(mlp_2(joined), chunk)
+        return maximum_2.result()
+
+
+def fused_convolution(layer: PointNetConv, features: Tensor, batch: BallBatch) -> Tensor:
+    """`PointNetConv.forward`: maps point features (P, inputs) to (P, width)."""
+    # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
+    weight, output = layer.hidden.weight, PackedLinear(layer.output.weight)
+    u = by_chunks(
+        PackedLinear(weight, layer.hidden.bias), torch.cat((features, batch.points), dim=1)
+    )
+    offset = weight[:, -3:].t().contiguous().numpy()  # V, (3, width)
+    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
+    (count, k), width = neighbors.shape, len(weight)
+    hidden = torch.zeros(CONVOLVED * k, width)
+    pooled = torch.empty(count, width)
+    for first in range(0, count, CONVOLVED):
+        part = slice(first, min(first + CONVOLVED, count))
+        _gathered_relu(u.numpy(), points[part], offset, neighbors[part], hidden.numpy())
+        messages = output(hidden).view(CONVOLVED, k, width)[: part.stop - part.start]
+        torch.amax(messages, dim=1, out=pooled[part])
+    # The bias is the same for all neighbours: added once, after the maximum.
+    return pooled.add_(layer.output.bias)
+
+
+@compiled("contract", "nsz")
+def _gathered_relu(
+    u: Float32, points: Float32, offset: Float32, neighbors: NDArray[np.int64], result: Float32
+) -> None:
+    """ReLU of u_j - V p_i for the neighbours (p, k) of each of p points."""
+    width, k = result.shape[1], neighbors.shape[1]
+    zero = np.float32(0.0)
+    here = np.empty(width, np.float32)
+    for i in range(len(neighbors)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for c in range(width):
+            here[c] = x * offset[0, c] + y * offset[1, c] + z * offset[2, c]
+        for j in range(k):
+            there, row = u[neighbors[i, j]], result[i * k + j]
+            for c in range(width):
+                row[c] = max(there[c] - here[c], zero)

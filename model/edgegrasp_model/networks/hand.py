@@ -1,0 +1,173 @@
+"""HandNet: scores edge grasps from what each hand sees in its own frame.
+
+A PointNet over the points around the fingers, beside the hand description. Where the paper's
+network shares one ball among all its edge grasps and has to learn what a rotation does, this one
+sees each edge grasp in the frame of its own hand: invariant by construction.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from edgegrasp_model.candidates.edge_grasps import Candidates
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
+from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.layers import (
+    EDGE_ROWS,
+    PackedMlp,
+    by_chunks,
+    in_chunks,
+    maximum,
+    mlp,
+)
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.scene import Scene
+
+Float32 = NDArray[np.float32]
+
+POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
+DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
+CHUNK = 32  # hands at a time, so that the work stays in cache
+
+
+@dataclass(frozen=True)
+class HandBatch:
+    """E edge grasps, each with what its own hand sees. Metres."""
+
+    description: Tensor  # (E, F) float32
+    points: Tensor  # (E, P, 6) float32, positions and normals around the fingers, hand frame
+    point_count: Tensor  # (E,) int64, how many of the P there are; zeros follow
+
+    @classmethod
+    def from_cloud(
+        cls,
+        cloud: Cloud,
+        candidates: Candidates,
+        gripper: Gripper,
+        up: Float32,
+        support: SupportPlane | None,
+        viewpoint: Float32 | None,
+        at_side: NDArray[np.bool_] | None,
+        num_points: int,
+        view: HandView | None = None,
+    ) -> Self:
+        """Look at a cloud from the hands of some candidates.
+
+        Args:
+            cloud: N points with normals.
+            candidates: E of them.
+            gripper: The hand, open to its maximum.
+            up: (3,) away from gravity.
+            support: Plane that heights are measured from, where it is known.
+            viewpoint: (3,) the camera, where there is one and it is known.
+            at_side: (N,) points where a side of the workspace cuts things off.
+            num_points: P.
+            view: `hand_views` of the same candidates, where the caller has it already.
+        """
+        T_cloud_hand = candidates.T_cloud_hand
+        view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
+        description = describe_hands(
+            cloud, candidates, gripper, up, support, viewpoint, at_side, view
+        )
+        points, count = points_around_fingers(
+            cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
+        )
+        return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
+
+    @classmethod
+    def made_up(cls, config: NetworkConfig) -> Self:
+        """A fixed batch of 32 hands, to see whether a network computes as it did before."""
+        rng = np.random.default_rng(0)
+        description = rng.normal(size=(32, HAND_DESCRIPTION_SIZE))
+        points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
+        count = rng.integers(0, config.hand_points + 1, 32)
+        return cls(
+            torch.from_numpy(description.astype(np.float32)),
+            torch.from_numpy(points.astype(np.float32)),
+            torch.from_numpy(count),
+        )
+
+    def to(self, device: torch.device | str) -> "HandBatch":
+        """Moves every tensor to a device."""
+        return HandBatch(
+            self.description.to(device),
+            self.points.to(device),
+            self.point_count.to(device),
+        )
+
+
+def hand_batch(
+    scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
+) -> HandBatch:
+    """What the hand network is told of some candidates of a scene."""
+    return HandBatch.from_cloud(
+        scene.cloud,
+        candidates,
+        gripper,
+        UP,
+        scene.support,
+        scene.viewpoint,
+        scene.at_side,
+        network.hand_points,
+        view,
+    )
+
+
+class HandNet(nn.Module):
+    """E edge grasps, P points around the fingers of each."""
+
+    mean: Tensor  # (F,) of the training data's descriptions
+    std: Tensor  # (F,)
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("mean", torch.zeros(HAND_DESCRIPTION_SIZE))
+        self.register_buffer("std", torch.ones(HAND_DESCRIPTION_SIZE))
+        self.point_encoder = mlp((6, *config.hand_widths))
+        inputs = HAND_DESCRIPTION_SIZE + 2 * config.hand_widths[-1]
+        self.classifier = mlp((inputs, *config.classifier_widths, 1))
+
+    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Stores mean (F,) and standard deviation (F,) of the training data's descriptions."""
+        self.mean.copy_(mean)
+        self.std.copy_(std.clamp_min(1e-3))
+
+    def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
+        """Scores the edge grasps of a batch: logits (E,) of success.
+
+        Args:
+            batch: What E hands see.
+            left_out: In training, draws what the classifier is not told; None: it is told all.
+        """
+        description = (batch.description - self.mean) / self.std  # (E, F)
+        encoder = PackedMlp(self.point_encoder)
+        chunks = [
+            _around(encoder, points, count)
+            for points, count in in_chunks(CHUNK, batch.points, batch.point_count)
+        ]
+        around = torch.cat(chunks)[: len(description)]  # (E, 2 C)
+        seen = torch.cat((description, around), dim=1)
+        if left_out is not None:
+            draws = torch.rand(seen.shape, generator=left_out, device=left_out.device)
+            seen = seen * (draws >= DROPOUT).to(seen.device) / (1.0 - DROPOUT)
+        logits = by_chunks(PackedMlp(self.classifier), seen, EDGE_ROWS)
+        return logits.squeeze(1)  # (E,)
+
+
+def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
+    """Maximum and mean over the points (E, P, 6) that there are of their features: (E, 2 C)."""
+    positions, normals = torch.split(points, 3, dim=2)
+    unit = torch.cat((positions / POINT_UNIT, normals), dim=2)  # (E, P, 6)
+    there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)  # (E, P)
+    features = F.relu(encoder(unit)) * there.unsqueeze(2)  # (E, P, C), none below 0
+    mean = features.sum(dim=1) / count.clamp_min(1).unsqueeze(1)  # (E, C)
+    return torch.cat((maximum(features, dim=1), mean), dim=1)  # (E, 2 C)

@@ -1,0 +1,163 @@
+"""Conversion of the authors' checkpoints, which keep each part of a network in a file of its own.
+
+Their layout (github.com/HaojHuang/Edge-Grasp-Network): `local_emd_model-ckpt-N.pt`,
+`global_emd_model-ckpt-N.pt`, `classifier_model-ckpt-N.pt` and, for the VN network, `std-ckpt-N.pt`.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from pickle import UnpicklingError
+
+import torch
+from torch import Tensor, nn
+
+from edgegrasp_model.errors import InvalidCheckpoint
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import (
+    EDGEGRASP,
+    VN_EDGEGRASP,
+    CheckpointMetadata,
+    NetworkConfig,
+)
+from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
+
+# Each file's prefix here, and then the parts of theirs under the names of ours.
+_FILES = {
+    "local": "local_emd_model",
+    "global": "global_emd_model",
+    "classifier": "classifier_model",
+    "std": "std",
+}
+_EDGEGRASP_PARTS = {
+    r"local\.(conv\d)\.local_nn\.0": r"\1.hidden",
+    r"local\.(conv\d)\.local_nn\.2": r"\1.output",
+    r"global\.mlp1\.(\d)": r"ball_feature.mlp_1.\1",
+    r"global\.mlp2\.0": r"ball_feature.join",
+    r"global\.mlp2\.2": r"ball_feature.mlp_2.0",
+    r"classifier\.head\.0": r"join",
+    r"classifier\.head\.2": r"classifier.0",
+    r"classifier\.head\.4": r"classifier.2",
+    r"classifier\.head\.6": r"classifier.4",
+}
+_VN_PARTS = {
+    r"local\.(conv\d)\.vn_linear_1\.map_to_feat": r"\1.hidden",
+    r"local\.(conv\d)\.relu_1\.map_to_dir": r"\1.hidden_relu.direction",
+    r"local\.(conv\d)\.vn_linear_2\.map_to_feat": r"\1.output",
+    r"local\.(conv\d)\.map_to_dir\.map_to_feat": r"\1.reach",
+    r"local\.relu(\d)\.map_to_dir": r"conv\1.output_relu.direction",
+    r"global\.vn([12])\.map_to_feat": r"ball_feature.vn_\1.feature",
+    r"global\.vn([12])\.map_to_dir": r"ball_feature.vn_\1.direction",
+    r"global\.vn3\.map_to_feat": r"ball_feature.vn_3",
+    r"global\.vn4\.map_to_feat": r"ball_feature.join.feature",
+    r"global\.vn4\.map_to_dir": r"ball_feature.join.direction",
+    r"global\.vn5\.map_to_feat": r"ball_feature.vn_5",
+    r"global\.map_to_dir_([12])\.map_to_feat": r"ball_feature.maximum_\1.reach",
+    r"global\.relu3\.map_to_dir": r"ball_feature.maximum_1.relu.direction",
+    r"global\.relu5\.map_to_dir": r"ball_feature.maximum_2.relu.direction",
+    r"std\.vn([12])\.map_to_feat": r"frame_\1.feature",
+    r"std\.vn([12])\.map_to_dir": r"frame_\1.direction",
+    r"std\.vn_lin": r"frame_3",
+    r"classifier\.head\.(\d)": r"classifier.\1",
+}
+
+
+def import_checkpoint(
+    directory: Path,
+    *,
+    voxel_size: float = 0.0045,
+    crop_radius: float = 0.05,
+    gripper: str = "panda",
+) -> tuple[nn.Module, CheckpointMetadata]:
+    """Reads a checkpoint in the authors' layout; a VN network where there is a `std` file.
+
+    Args:
+        directory: Holds the files of one checkpoint number N.
+        voxel_size: Of the clouds to give it, metres; by default that of the authors' evaluation.
+        crop_radius: Ball radius, metres; likewise.
+        gripper: Name of the gripper it was trained for.
+
+    Returns:
+        The network in evaluation mode and its metadata, ready for `save_checkpoint`.
+
+    Raises:
+        InvalidCheckpoint: A file is missing, is more than tensors, or does not fit the network.
+    """
+    number = _checkpoint_number(directory)
+    is_vn = (directory / f"std-ckpt-{number}.pt").exists()
+    config = replace(VN_EDGEGRASP if is_vn else EDGEGRASP, crop_radius=crop_radius)
+    theirs = {
+        f"{part}.{name}": weight
+        for part, stem in _FILES.items()
+        if part != "std" or is_vn
+        for name, weight in _load_weights(directory / f"{stem}-ckpt-{number}.pt").items()
+    }
+    network = build_network(config)
+    try:
+        ours = _renamed(theirs, _VN_PARTS) if is_vn else _edgegrasp_weights(theirs, config)
+        network.load_state_dict(ours)
+    except RuntimeError as error:
+        raise InvalidCheckpoint(
+            f"directory: got {directory}, which does not fit {config.architecture} ({error}). "
+            "Give the authors' layout at the paper's widths."
+        ) from error
+    metadata = CheckpointMetadata(
+        name=config.architecture,
+        network=config,
+        voxel_size=voxel_size,
+        gripper=gripper,
+        training={"source": "imported from the authors' layout", "checkpoint": number},
+    )
+    return network.eval(), metadata
+
+
+def _checkpoint_number(directory: Path) -> int:
+    numbers = [
+        int(match[1])
+        for path in directory.glob("local_emd_model-ckpt-*.pt")
+        if (match := re.fullmatch(r"local_emd_model-ckpt-(\d+)\.pt", path.name))
+    ]
+    if len(numbers) != 1:
+        raise InvalidCheckpoint(
+            f"directory: got {directory} with {len(numbers)} files local_emd_model-ckpt-N.pt. "
+            "Give a directory with the files of exactly one checkpoint."
+        )
+    return numbers[0]
+
+
+def _load_weights(path: Path) -> dict[str, Tensor]:
+    try:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, UnpicklingError) as error:
+        raise InvalidCheckpoint(
+            f"directory: got {path}, which cannot be read as a state dict ({error}). "
+            "Give complete files that hold tensors alone."
+        ) from error
+    if not isinstance(weights, dict):
+        raise InvalidCheckpoint(
+            f"directory: got {path} with a {type(weights).__name__}. Give a state dict."
+        )
+    return weights
+
+
+def _renamed(theirs: dict[str, Tensor], parts: dict[str, str]) -> dict[str, Tensor]:
+    """Weights under our names; those without one stay as they are, for load_state_dict to name."""
+    ours = {}
+    for name, weight in theirs.items():
+        module, _, kind = name.rpartition(".")
+        for pattern, replacement in parts.items():
+            if match := re.fullmatch(pattern, module):
+                name = f"{match.expand(replacement)}.{kind}"
+                break
+        ours[name] = weight
+    return ours
+
+
+def _edgegrasp_weights(theirs: dict[str, Tensor], config: NetworkConfig) -> dict[str, Tensor]:
+    ours = _renamed(theirs, _EDGEGRASP_PARTS)
+    if "join.weight" in ours:
+        # Theirs reads [p, n, f3, ball, depth, approach]; ours [p, n, depth, approach, f3, ball].
+        features = config.conv_widths[-1] + config.global_widths_2[-1]
+        parts = torch.split(ours["join.weight"], [6, features, GRASP_WIDTH - 6], dim=1)
+        ours["join.weight"] = torch.cat((parts[0], parts[2], parts[1]), dim=1)
+    return ours

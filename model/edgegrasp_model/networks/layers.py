@@ -1,0 +1,264 @@
+"""Layers, matrix products and chunks of rows that the networks share.
+
+In inference no bit of a row depends on the other rows: a candidate's score is the same whatever
+else is scored with it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from edgegrasp_model.networks.balls import BallBatch
+
+# Products of fewer rows add up in an order that depends on how many there are.
+MIN_ROWS = 32
+ROWS = 512  # points at a time: 1,024 channels of them stay in cache
+CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
+EDGE_ROWS = 256  # edge grasps at a time
+
+
+class RowLinear(nn.Linear):
+    """A linear layer as `row_linear` computes it."""
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Maps (M, ..., inputs) to (M, ..., outputs)."""
+        return row_linear(values, self.weight, self.bias)
+
+
+class SharedLinear(nn.Linear):
+    """A linear layer on rows [own, shared[row]] that multiplies each shared part only once.
+
+    Many ball points (or edge grasps) share one ball feature: W [a, b] = W_a a + W_b b.
+    """
+
+    def forward(self, own: Tensor, shared: Tensor, shared_of_row: Tensor) -> Tensor:  # type: ignore[override]
+        """Applies the layer to own (M, ..., C1) and shared (B, ..., C2)[shared_of_row (M,)]."""
+        return self.on(shared)(own, shared_of_row)
+
+    def on(self, shared: Tensor) -> "SharedProduct":
+        """The layer on shared parts (B, ..., C2), for the rows of many chunks."""
+        return SharedProduct(self.weight, self.bias, shared)
+
+
+class SharedProduct:
+    """What each row's own part gives, added to what its shared part gives."""
+
+    def __init__(self, weight: Tensor, bias: Tensor | None, shared: Tensor) -> None:
+        """Multiplies the shared parts (B, ..., C2).
+
+        Args:
+            weight: (outputs, C1 + C2).
+            bias: (outputs,), or none.
+            shared: The shared parts.
+        """
+        widths = [weight.shape[1] - shared.shape[-1], shared.shape[-1]]
+        own_weight, shared_weight = torch.split(weight, widths, dim=1)
+        self._own = PackedLinear(own_weight, bias)
+        self._shared = row_linear(shared, shared_weight)  # (B, ..., outputs)
+
+    def __call__(self, own: Tensor, shared_of_row: Tensor) -> Tensor:
+        """Maps own (M, ..., C1) and the rows (M,) of their shared parts to (M, ..., outputs)."""
+        rows = self._own(own)
+        rows += self._shared.index_select(0, shared_of_row)
+        return rows
+
+
+def mlp(widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [RowLinear(inputs, outputs), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers[:-1])
+
+
+def gather_rows(values: Tensor, index: Tensor) -> Tensor:
+    """values[index] for values (M, ...) and an index (P, k): (P, k, ...)."""
+    # The backward of indexing itself is several times slower.
+    return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
+
+
+def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """F.linear of values (M, ..., C)."""
+    if torch.is_grad_enabled() or values.device.type != "cpu":
+        return F.linear(values, weight, bias)
+    if len(weight) == 1:  # a product with a vector, which has an order of its own for each size
+        product = (values * weight[0]).sum(dim=-1, keepdim=True)
+        return product if bias is None else product + bias
+    if 0 < values.shape[:-1].numel() < MIN_ROWS:
+        padded = values.new_zeros((MIN_ROWS, *values.shape[1:]))
+        padded[: len(values)] = values
+        return F.linear(padded, weight, bias)[: len(values)]
+    return F.linear(values, weight, bias)
+
+
+class PackedLinear:
+    """A linear layer on many chunks of rows, one after another, by the faster of two libraries.
+
+    For as long as the weights stay as they are: one forward pass.
+    """
+
+    def __init__(
+        self, weight: Tensor, bias: Tensor | None = None, *, rectified: bool = False
+    ) -> None:
+        """Prepare the weights.
+
+        Args:
+            weight: (outputs, C), any part of a matrix.
+            bias: (outputs,), or none.
+            rectified: Whether a ReLU follows.
+        """
+        self._weight, self._bias, self._rectified = weight, bias, rectified
+        self._packed = _packed(weight)
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Maps (M, ..., C) to (M, ..., outputs).
+
+        oneDNN prepares anew for each number of rows: let all chunks have the same.
+        """
+        if self._packed is None:
+            rows = row_linear(values, self._weight, self._bias)
+            return rows.relu_() if self._rectified else rows
+        then = "relu" if self._rectified else "none"
+        result: Tensor = torch.ops.mkldnn._linear_pointwise(
+            values, self._packed, self._bias, then, [], ""
+        )
+        return result
+
+
+class PackedMlp:
+    """The linear layers of an MLP as `PackedLinear`s, with their ReLUs."""
+
+    def __init__(self, mlp: nn.Sequential) -> None:
+        layers = linear_layers(mlp)
+        self._products = [
+            PackedLinear(layer.weight, layer.bias, rectified=layer is not layers[-1])
+            for layer in layers
+        ]
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Maps (M, ..., C) to (M, ..., outputs)."""
+        for product in self._products:
+            values = product(values)
+        return values
+
+
+def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
+    """The linear layers of an MLP, in order."""
+    return [layer for layer in mlp if isinstance(layer, nn.Linear)]
+
+
+@cache
+def onednn_is_faster() -> bool:
+    """Whether oneDNN multiplies in float32 about twice as fast as MKL, which is behind F.linear.
+
+    So it is on AMD processors with AVX-512, measured on an EPYC.
+    """
+    ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and "AMD" in _processor()
+    there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    return ours and there and hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
+
+
+def _processor() -> str:
+    """The processor's name."""
+    get = getattr(torch.cpu, "get_capabilities", None)  # newer PyTorch has it
+    return "" if get is None else str(get().get("cpu_name", ""))
+
+
+def float32_inference(values: Tensor) -> bool:
+    """Whether nothing but float32 on a processor is asked for."""
+    return (
+        values.device.type == "cpu"
+        and values.dtype == torch.float32
+        and not torch.is_grad_enabled()
+        and not torch.is_autocast_enabled("cpu")
+    )
+
+
+def _packed(weight: Tensor) -> Tensor | None:
+    """A weight as oneDNN reads it; None where the plain product serves."""
+    if len(weight) == 1 or not (float32_inference(weight) and onednn_is_faster()):
+        return None
+    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
+    return packed
+
+
+class BallChunk(NamedTuple):
+    """p points of a few balls, one of which may go on in the next chunk."""
+
+    values: Tensor  # (p, ...)
+    ball_of_point: Tensor  # (p,) int64
+    balls: list[int]
+    sizes: list[int]  # rows of each of these balls, in order, then of what fills the chunk up
+
+
+def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
+    """Splits values (P, ...) of a batch's points into chunks of `rows`, the last one filled up.
+
+    To record gradients, which keeps all of them anyway, and off the processor: one chunk.
+    """
+    ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
+    if torch.is_grad_enabled() or values.device.type != "cpu":
+        return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
+    ends = torch.tensor(sizes).cumsum(0).tolist()
+    chunks = []
+    ball, start = 0, 0
+    for number, (part, ball_of_row) in enumerate(in_chunks(rows, values, ball_of_point)):
+        end = (number + 1) * rows
+        balls, sizes = [], []
+        while ball < len(ends) and start < end:
+            stop = min(ends[ball], end)
+            balls.append(ball)
+            sizes.append(stop - start)
+            start = stop
+            ball += stop == ends[ball]
+        chunks.append(BallChunk(part, ball_of_row, balls, [*sizes, end - start]))
+    return chunks
+
+
+def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
+    """Splits values (M, ...) of equal length into chunks of `rows`.
+
+    In inference the last one is filled up with zeros. Off the processor it is one chunk.
+    """
+    if values[0].device.type != "cpu":
+        return [values]
+    chunks = list(zip(*(torch.split(each, rows) for each in values), strict=True))
+    missing = rows - len(chunks[-1][0])
+    if missing and not torch.is_grad_enabled():
+        chunks[-1] = tuple(
+            F.pad(part, (0, 0) * (part.dim() - 1) + (0, missing)) for part in chunks[-1]
+        )
+    return chunks
+
+
+def by_chunks(layer: Callable[[Tensor], Tensor], values: Tensor, rows: int = ROWS) -> Tensor:
+    """A layer that maps the rows of values (M, ...) one by one."""
+    parts = [layer(part) for (part,) in in_chunks(rows, values)]
+    return torch.cat(parts)[: len(values)]
+
+
+class BallMaximum:
+    """Maximum over the points of each ball, chunk by chunk."""
+
+    def __init__(self, num_balls: int) -> None:
+        self._parts: list[list[Tensor]] = [[] for _ in range(num_balls)]
+
+    def add(self, values: Tensor, chunk: BallChunk) -> None:
+        """Take in the values (p, C) of a chunk's points."""
+        for ball, part in zip(chunk.balls, torch.split(values, chunk.sizes), strict=False):
+            self._parts[ball].append(maximum(part, dim=0))
+
+    def result(self) -> Tensor:
+        """The maximum (B, C) of each ball."""
+        return torch.stack([maximum(torch.stack(parts), dim=0) for parts in self._parts])
+
+
+def maximum(values: Tensor, dim: int) -> Tensor:
+    """Maximum along a dimension."""
+    # On a processor amax is some ten times faster forward, but its backward several times slower.
+    return values.max(dim).values if torch.is_grad_enabled() else values.amax(dim)

@@ -1,0 +1,339 @@
+"""From the array a caller sends to the small, clean cloud with normals that the network sees."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from edgegrasp_model.errors import InvalidRequest
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+MAX_EXTENT = 20.0  # metres; a wider cloud is millimetres taken for metres
+MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
+OUTLIER_NEIGHBORS = 8
+OUTLIER_DEVIATIONS = 2.5
+NORMAL_NEIGHBORS = 20
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
+MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
+
+
+@dataclass(frozen=True)
+class CloudInput:
+    """A cloud as a caller sends it; rows are counted row-major where it is organised.
+
+    Per-point arrays have one entry for each point, in the shape of the cloud or flat.
+    """
+
+    points: object  # (N, 3), or (H, W, 3) with NaN where there is no point; float32/64, metres
+    normals: object | None = None  # like points, outward, any length; used as they are
+    colors: object | None = None  # like points; checked, and not used by any network so far
+    segment_ids: object | None = None  # (N,) or (H, W) integers
+    view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
+
+
+@dataclass(frozen=True)
+class CheckedCloud:
+    """The finite points of a cloud, and what comes with them."""
+
+    points: Float32  # (N, 3) metres
+    row: NDArray[np.int64]  # (N,) each point's row in the cloud as sent
+    rows_sent: int
+    normals: Float32 | None = None  # (N, 3)
+    segment_ids: NDArray[np.int64] | None = None  # (N,)
+    view_ids: NDArray[np.int64] | None = None  # (N,)
+
+    def take(self, kept: NDArray[np.bool_]) -> "CheckedCloud":
+        """The points for which `kept` (N,) holds; rows are counted as before."""
+        return CheckedCloud(
+            self.points[kept],
+            self.row[kept],
+            self.rows_sent,
+            None if self.normals is None else self.normals[kept],
+            None if self.segment_ids is None else self.segment_ids[kept],
+            None if self.view_ids is None else self.view_ids[kept],
+        )
+
+
+def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
+    """Check a caller's cloud, and drop the holes of an organised one.
+
+    Args:
+        cloud: A CloudInput, or an array of points alone.
+        num_approach_points: How many of its points the caller wants as approach points.
+
+    Raises:
+        InvalidRequest: An array is of the wrong type, dtype or shape, or holds what it must not;
+            names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
+    """
+    sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
+    points = sent.points
+    kept = None
+    if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
+        points = points.reshape(-1, 3)
+        if points.dtype in (np.float32, np.float64):
+            kept = np.flatnonzero(np.isfinite(points).all(axis=1))
+            points = points[kept]
+            if len(points) == 0:
+                raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
+    valid = validate_cloud(points, num_approach_points)
+    row = np.arange(len(valid)) if kept is None else kept
+    size = len(sent.points.reshape(-1, 3)) if isinstance(sent.points, np.ndarray) else len(valid)
+    _floats("colors", sent.colors, size, None)
+    return CheckedCloud(
+        valid,
+        row.astype(np.int64),
+        size,
+        _floats("normals", sent.normals, size, row),
+        _integers("segment_ids", sent.segment_ids, size, row),
+        _integers("view_ids", sent.view_ids, size, row),
+    )
+
+
+def _floats(
+    field: str, array: object | None, size: int, row: NDArray[np.int64] | None
+) -> Float32 | None:
+    """The given rows of an (N, 3) or (H, W, 3) array beside the cloud; None: only check it."""
+    if array is None:
+        return None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fui":
+        raise InvalidRequest(field, _kind(array), "Send an array of numbers, three for each point.")
+    if array.shape[-1:] != (3,) or array.size != 3 * size:
+        fix = f"Send three numbers for each of the cloud's {size} points."
+        raise InvalidRequest(field, f"shape {array.shape}", fix)
+    if row is None:
+        return None
+    values = np.ascontiguousarray(array.reshape(-1, 3)[row], dtype=np.float32)
+    if not np.isfinite(values).all():
+        bad = int(row[np.argmin(np.isfinite(values).all(axis=1))])
+        raise InvalidRequest(field, f"NaN or infinity in row {bad}", "Send finite numbers.")
+    return values
+
+
+def _integers(
+    field: str, array: object | None, size: int, row: NDArray[np.int64]
+) -> NDArray[np.int64] | None:
+    """The given rows of an (N,) or (H, W) array beside the cloud."""
+    if array is None:
+        return None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iu":
+        raise InvalidRequest(field, _kind(array), "Send an array of integers, one for each point.")
+    if array.size != size:
+        fix = f"Send one integer for each of the cloud's {size} points."
+        raise InvalidRequest(field, f"shape {array.shape}", fix)
+    return array.reshape(-1)[row].astype(np.int64)
+
+
+def _kind(array: object) -> str:
+    return f"dtype {array.dtype}" if isinstance(array, np.ndarray) else f"a {type(array).__name__}"
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points and their unit normals, metres."""
+
+    points: Float32  # (N, 3)
+    normals: Float32  # (N, 3)
+
+
+def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
+    """Check a caller's array and give it back as float32.
+
+    Args:
+        cloud: (N, 3) float32 or float64, metres.
+        num_approach_points: How many of its points the caller wants as approach points.
+
+    Returns:
+        (N, 3) float32.
+
+    Raises:
+        InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity, an extent that
+            suggests millimetres, too far from the origin, or fewer points than approach points.
+    """
+    if not isinstance(cloud, np.ndarray):
+        kind = type(cloud).__name__
+        raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
+    if cloud.dtype not in (np.float32, np.float64):
+        raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise InvalidRequest("cloud", f"shape {cloud.shape}", "Send shape (N, 3): x, y, z a row.")
+    if len(cloud) == 0:
+        raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
+    finite = np.isfinite(cloud).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise InvalidRequest(
+            "cloud",
+            f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
+            "Remove points without a finite x, y, z.",
+        )
+    extent = float(np.ptp(cloud.astype(np.float64), axis=0).max())
+    if extent > MAX_EXTENT:
+        raise InvalidRequest(
+            "cloud",
+            f"an extent of {extent:.4g} m, which suggests millimetres",
+            "Send metres: divide by 1000.",
+        )
+    furthest = float(np.abs(cloud).max())
+    if furthest > MAX_DISTANCE:
+        raise InvalidRequest(
+            "cloud",
+            f"points {furthest:.4g} m from the origin, where float32 rounds away millimetres",
+            "Subtract an origin near the cloud from it and from every position of the request, and "
+            "add it to the grasps.",
+        )
+    if len(cloud) < num_approach_points:
+        raise InvalidRequest(
+            "cloud",
+            f"{len(cloud)} points for num_approach_points = {num_approach_points}",
+            "Send more points or lower options.num_approach_points.",
+        )
+    return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """The occupied voxels of a cloud, ordered by place: the order of the points does not matter."""
+
+    voxel: NDArray[np.int64]  # (N,) voxel of each point
+    size: NDArray[np.int64]  # (V,) points in each
+
+    def mean(self, values: NDArray[np.floating]) -> Float32:
+        """Mean (V, 3) of a vector of each point (N, 3)."""
+        sums = [np.bincount(self.voxel, values[:, axis], len(self.size)) for axis in range(3)]
+        return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
+
+    def share(self, holds: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Share (V,) of each voxel's points for which something holds (N,)."""
+        return np.bincount(self.voxel, holds, len(self.size)) / self.size
+
+    def commonest(self, labels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Commonest label (V,) in each voxel, of labels (N,) from 0 to count - 1."""
+        tally = np.bincount(self.voxel * count + labels, minlength=count * len(self.size))
+        best: NDArray[np.int64] = tally.reshape(-1, count).argmax(axis=1)
+        return best
+
+
+def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
+    """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
+    low = points.min(axis=0).astype(np.float64)
+    cells = np.floor((points - low) / voxel_size).astype(np.int64)  # (N, 3)
+    sizes = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
+    return Voxels(voxel, count)
+
+
+def statistical_outlier_removal(points: Float32) -> NDArray[np.bool_]:
+    """Which points (N,) are not far from their neighbours by the measure of the whole cloud."""
+    if len(points) <= OUTLIER_NEIGHBORS:
+        return np.ones(len(points), dtype=bool)
+    distances, _ = cKDTree(points).query(points, k=range(2, OUTLIER_NEIGHBORS + 2))
+    mean = np.mean(distances, axis=1)
+    kept: NDArray[np.bool_] = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
+    return kept
+
+
+def estimate_normals(points: Float32) -> Float32:
+    """Unit normals by principal components of each neighbourhood, of either sign.
+
+    Args:
+        points: (N, 3).
+
+    Returns:
+        (N, 3): the direction of least variance among the NORMAL_NEIGHBORS nearest points.
+    """
+    k = min(NORMAL_NEIGHBORS, len(points))
+    _, rows = cKDTree(points).query(points, k=range(1, k + 1))
+    columns = [column[rows].astype(np.float64) for column in points.T]  # x, y, z, (N, k) each
+    columns = [column - column.mean(axis=1, keepdims=True) for column in columns]
+    products = [[np.einsum("nk,nk->n", one, other) for other in columns] for one in columns]
+    _, vectors = np.linalg.eigh(np.array(products).transpose(2, 0, 1))  # ascending variance
+    return vectors[:, :, 0].astype(np.float32)
+
+
+def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
+    """Turn each normal to the side of its surface that the viewpoint, (3,) or (N, 3), sees."""
+    away = np.einsum("nd,nd->n", normals, viewpoint - points) < 0
+    return np.where(away[:, None], -normals, normals).astype(np.float32)
+
+
+def assumed_viewpoint(points: Float32, up: Float32) -> Float32:
+    """A stand-in for an unknown camera: one metre above the cloud's middle."""
+    middle: Float32 = (points.min(axis=0) + points.max(axis=0)) / 2
+    return middle + up / np.linalg.norm(up)
+
+
+@dataclass(frozen=True)
+class CanonicalFrame:
+    """z along up, x horizontally toward the camera, the origin at the points' mean."""
+
+    T_canonical_cloud: Float64  # (4, 4)
+
+    @classmethod
+    def of_scene(cls, points: Float32, up: ArrayLike, viewpoint: ArrayLike | None) -> Self:
+        """Fix the frame to the scene: it turns and moves with the scene.
+
+        Args:
+            points: (N, 3) metres.
+            up: (3,) of any length but zero.
+            viewpoint: (3,) the camera. Where there is none, or it is straight above, x points to
+                the furthest point instead.
+        """
+        origin = points.mean(axis=0, dtype=np.float64)
+        z = np.asarray(up, dtype=np.float64)
+        z = z / np.linalg.norm(z)
+        x = None if viewpoint is None else _furthest_out(np.asarray([viewpoint]) - origin, z)
+        x = _furthest_out(points - origin, z) if x is None else x
+        x = _furthest_out(np.eye(3), z) if x is None else x
+        assert x is not None
+        T_canonical_cloud = np.eye(4)
+        T_canonical_cloud[:3, :3] = np.stack([x, np.cross(z, x), z])
+        T_canonical_cloud[:3, 3] = -T_canonical_cloud[:3, :3] @ origin
+        return cls(T_canonical_cloud)
+
+    def points(self, points: ArrayLike) -> Float64:
+        """Points (..., 3) of the cloud's frame in this one."""
+        turned: Float64 = np.asarray(points, dtype=np.float64) @ self._turn.T
+        return turned + self.T_canonical_cloud[:3, 3]
+
+    def directions(self, directions: ArrayLike) -> Float64:
+        """Directions (..., 3) of the cloud's frame in this one."""
+        turned: Float64 = np.asarray(directions, dtype=np.float64) @ self._turn.T
+        return turned
+
+    def poses(self, T_cloud_hand: ArrayLike) -> Float32:
+        """Poses (..., 4, 4) in the cloud's frame, in this one."""
+        return (self.T_canonical_cloud @ np.asarray(T_cloud_hand, np.float64)).astype(np.float32)
+
+    def points_in_cloud(self, points: ArrayLike) -> Float32:
+        """Points (..., 3) of this frame in the cloud's."""
+        shifted = np.asarray(points, dtype=np.float64) - self.T_canonical_cloud[:3, 3]
+        return (shifted @ self._turn).astype(np.float32)
+
+    def directions_in_cloud(self, directions: ArrayLike) -> Float32:
+        """Directions (..., 3) of this frame in the cloud's."""
+        return (np.asarray(directions, dtype=np.float64) @ self._turn).astype(np.float32)
+
+    def poses_in_cloud(self, T_canonical_hand: ArrayLike) -> Float32:
+        """Poses (..., 4, 4) in this frame, in the cloud's."""
+        T_cloud_canonical = np.linalg.inv(self.T_canonical_cloud)
+        return (T_cloud_canonical @ np.asarray(T_canonical_hand, np.float64)).astype(np.float32)
+
+    @property
+    def _turn(self) -> Float64:
+        return self.T_canonical_cloud[:3, :3]
+
+
+def _furthest_out(offsets: Float64, z: Float64) -> Float64 | None:
+    """Horizontal direction (3,) of the offset that is the longest seen from above, if any is."""
+    horizontal = offsets - (offsets @ z)[:, None] * z
+    length = np.linalg.norm(horizontal, axis=1)
+    longest = int(length.argmax())
+    if length[longest] < MIN_HORIZONTAL:
+        return None
+    direction: Float64 = horizontal[longest] / length[longest]
+    return direction

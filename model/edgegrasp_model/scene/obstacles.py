@@ -1,0 +1,155 @@
+"""Solid boxes in any orientation: whether a moving hand meets them, and how far away they are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.options import Box, OrientedBox
+from edgegrasp_model.scene.cloud import CanonicalFrame
+
+Float64 = NDArray[np.float64]
+
+CHUNK = 20_000  # pairs of boxes at a time
+_SIGNS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
+_DIFFER = (_SIGNS[:, None] != _SIGNS).sum(axis=2)  # (8, 8) coordinates
+_EDGES = np.argwhere(np.triu(_DIFFER == 1))  # (12, 2) corners
+
+
+@dataclass(frozen=True)
+class SolidBoxes:
+    """Boxes by their middles and the vectors from there to the middles of their faces."""
+
+    center: Float64  # (M, 3) metres
+    half: Float64  # (M, 3, 3) rows: half extents times axes, metres
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    @classmethod
+    def from_shapes(cls, shapes: Sequence[Box | OrientedBox], frame: CanonicalFrame) -> Self:
+        """Boxes of a request in the canonical frame."""
+        centers, halves = np.empty((len(shapes), 3)), np.empty((len(shapes), 3, 3))
+        for row, shape in enumerate(shapes):
+            if isinstance(shape, OrientedBox):
+                turn = Rotation.from_quat(shape.quaternion).as_matrix()  # T_cloud_box
+                centers[row], halves[row] = shape.center, np.diag(shape.half_extents) @ turn.T
+            else:
+                low, high = np.asarray(shape.min), np.asarray(shape.max)
+                centers[row], halves[row] = (low + high) / 2, np.diag((high - low) / 2)
+        return cls(frame.points(centers), frame.directions(halves))
+
+    @classmethod
+    def of_hands(cls, T_cloud_hand: NDArray[np.float32], boxes: Float64) -> Self:
+        """Boxes (B, 2, 3) of the hand frame at hands (E, 4, 4): E * B boxes, hand by hand."""
+        pose = T_cloud_hand.astype(np.float64)
+        turn = pose[:, :3, :3]
+        middle, extent = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3)
+        center = np.einsum("edk,bk->ebd", turn, middle) + pose[:, None, :3, 3]
+        half = np.einsum("edk,bk->ebkd", turn, extent)
+        return cls(center.reshape(-1, 3), half.reshape(-1, 3, 3))
+
+    def take(self, rows: NDArray[np.integer]) -> "SolidBoxes":
+        """The boxes of the given rows."""
+        return SolidBoxes(self.center[rows], self.half[rows])
+
+    def corners(self) -> Float64:
+        """(M, 8, 3)."""
+        corners: Float64 = self.center[:, None] + _SIGNS @ self.half
+        return corners
+
+    @property
+    def radius(self) -> Float64:
+        """Distance (M,) of the corners from the middle."""
+        radius: Float64 = np.linalg.norm(self.half, axis=(1, 2))
+        return radius
+
+
+def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = None) -> Float64:
+    """Widest gap between boxes along any axis that can separate them; exact as to its sign.
+
+    Negative: they overlap, and by so much they would have to move apart. Positive: a lower bound
+    of their distance, which is this or more.
+
+    Args:
+        ours: M boxes.
+        theirs: M boxes, each for the one of the same row.
+        sweep: (M, 3) ours cover all they pass when moved along this; None: at rest.
+
+    Returns:
+        (M,) metres.
+    """
+    edges = ours.half  # (M, 3 or 4, 3) generators: a swept box is a sum of four segments
+    center = ours.center
+    if sweep is not None:
+        edges = np.concatenate([edges, sweep[:, None] / 2], axis=1)
+        center = center + sweep / 2
+    own = [np.cross(edges[:, i], edges[:, j]) for i in range(edges.shape[1]) for j in range(i)]
+    crossed = np.cross(edges[:, :, None], theirs.half[:, None])
+    crossed = crossed.reshape(len(center), 3 * edges.shape[1], 3)
+    axes = np.concatenate([np.stack(own, axis=1), theirs.half, crossed], axis=1)  # (M, A, 3)
+    length = np.linalg.norm(axes, axis=2)
+    scale = np.where(length > 1e-12, 1.0 / np.maximum(length, 1e-12), 0.0)
+    axes = axes * scale[..., None]
+    reach = np.abs(axes @ edges.transpose(0, 2, 1)).sum(axis=2)
+    reach += np.abs(axes @ theirs.half.transpose(0, 2, 1)).sum(axis=2)
+    gap = np.abs(np.einsum("mad,md->ma", axes, theirs.center - center)) - reach
+    widest: Float64 = np.where(length > 1e-12, gap, -np.inf).max(axis=1)
+    return widest
+
+
+def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
+    """Distance between boxes; where they overlap, minus the way they would have to move apart.
+
+    Args:
+        ours: M boxes.
+        theirs: M boxes, each for the one of the same row.
+
+    Returns:
+        (M,) metres.
+    """
+    distance = separation(ours, theirs)
+    apart = np.flatnonzero(distance > 0)
+    for start in range(0, len(apart), CHUNK):
+        rows = apart[start : start + CHUNK]
+        distance[rows] = _distance_apart(ours.take(rows), theirs.take(rows))
+    return distance
+
+
+def _distance_apart(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
+    """Distance (M,) of boxes that do not overlap: of a corner and a box, or of two edges."""
+    one, other = ours.corners(), theirs.corners()
+    distance = np.minimum(_corner_distance(one, theirs), _corner_distance(other, ours))
+    for first in _EDGES:
+        start, end = one[:, first[0], None], one[:, first[1], None]
+        apart = _segment_distance(start, end, other[:, _EDGES[:, 0]], other[:, _EDGES[:, 1]])
+        distance = np.minimum(distance, apart.min(axis=1))
+    return distance
+
+
+def _corner_distance(corners: Float64, boxes: SolidBoxes) -> Float64:
+    """Least distance (M,) of corners (M, 8, 3) to M boxes."""
+    extent = np.linalg.norm(boxes.half, axis=2)  # (M, 3)
+    axes = boxes.half / extent[..., None]
+    within = np.abs((corners - boxes.center[:, None]) @ axes.transpose(0, 2, 1))  # (M, 8, 3)
+    outside = np.maximum(within - extent[:, None], 0.0)
+    distance: Float64 = np.linalg.norm(outside, axis=2).min(axis=1)
+    return distance
+
+
+def _segment_distance(p0: Float64, p1: Float64, q0: Float64, q1: Float64) -> Float64:
+    """Distance of segments p0 p1 and q0 q1, (..., 3) each, none of length zero."""
+    p, q, r = p1 - p0, q1 - q0, p0 - q0
+    pp, qq, pq = (p * p).sum(-1), (q * q).sum(-1), (p * q).sum(-1)
+    pr, qr = (p * r).sum(-1), (q * r).sum(-1)
+    across = pp * qq - pq * pq
+    parallel = across < 1e-9 * pp * qq
+    s = np.where(parallel, 0.0, (pq * qr - pr * qq) / np.where(parallel, 1.0, across))
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((pq * s + qr) / qq, 0.0, 1.0)
+    s = np.clip((pq * t - pr) / pp, 0.0, 1.0)
+    distance: Float64 = np.linalg.norm(r + s[..., None] * p - t[..., None] * q, axis=-1)
+    return distance

@@ -1,0 +1,280 @@
+"""Requests whose answers are recorded: clouds from the labelled views and from a drawn scene.
+
+Everything is made from files of the repository and explicit seeds, so that it is the same on
+every machine. Options are in the client's form, which the model reads as well.
+"""
+
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+VIEWS = Path(__file__).parents[2] / "examples" / "labelled_views"
+TABLE_HEIGHT = 0.05  # metres, in the labelled views
+TABLE = {"kind": "plane", "normal": (0.0, 0.0, 1.0), "offset": TABLE_HEIGHT}
+FEW = {"num_approach_points": 12, "num_candidates": 150, "top_k": 20}  # for the ball networks
+
+LONG_FINGERS = {"name": "long-fingers", "max_opening": 0.09, "tip_z": 0.13, "contact_z": 0.124} | {
+    "tcp_z": 0.12,
+    "hand": {"boxes": [[(-0.03, -0.1, -0.04), (0.03, 0.1, 0.06)]]},
+    "finger": {"boxes": [[(-0.01, 0.0, 0.06), (0.01, 0.015, 0.13)]]},
+}
+
+
+@dataclass
+class Case:
+    """One request: a cloud or depth images, what is beside it, and options."""
+
+    options: dict[str, Any]
+    points: np.ndarray | None = None  # (N, 3), or (H, W, 3) with NaN, metres
+    beside: dict[str, np.ndarray] = field(default_factory=dict)  # normals, segment_ids, view_ids
+    depth_images: list[dict[str, Any]] | None = None
+    given: dict[str, np.ndarray] = field(default_factory=dict)  # edges or hand_poses: score them
+
+
+@cache
+def view(name: str) -> dict[str, np.ndarray]:
+    with np.load(VIEWS / f"{name}.npz") as arrays:
+        return dict(arrays)
+
+
+def camera(name: str) -> list[float]:
+    return [float(number) for number in view(name)["camera_position"]]
+
+
+def with_table(points: np.ndarray, seed: int) -> np.ndarray:
+    """Points and a noisy table under them, 30 cm wide, a point every 6 mm."""
+    side = np.arange(0.0, 0.3, 0.006)
+    table = np.stack(np.meshgrid(side, side, [TABLE_HEIGHT]), axis=-1).reshape(-1, 3)
+    noise = np.random.default_rng(seed).normal(0.0, 0.0005, table.shape)
+    return np.concatenate([points, (table + noise).astype(np.float32)])
+
+
+def turned(points: np.ndarray, angle: float) -> np.ndarray:
+    """Turn about the x axis, so that the table's normal leans toward -y; radians."""
+    sine, cosine = np.sin(angle), np.cos(angle)
+    matrix = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
+    return (points.astype(np.float64) @ matrix.T).astype(np.float32)
+
+
+CAMERA = {"fx": 220.0, "fy": 220.0, "cx": 79.5, "cy": 59.5}  # pixels
+T_CLOUD_CAMERA = np.array(  # looks down at the table from 0.5 m, tilted by 30 degrees
+    [
+        [1.0, 0.0, 0.0, 0.15],
+        [0.0, -np.cos(np.pi / 6), np.sin(np.pi / 6), -0.1],
+        [0.0, -np.sin(np.pi / 6), -np.cos(np.pi / 6), 0.5],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+@cache
+def drawn_depth() -> np.ndarray:
+    """(120, 160) metres: two balls and a box on the table z = 0, NaN where there is no reading."""
+    row, column = np.indices((120, 160))
+    ray = np.stack(
+        [
+            (column - CAMERA["cx"]) / CAMERA["fx"],
+            (row - CAMERA["cy"]) / CAMERA["fy"],
+            np.ones(row.shape),
+        ],
+        axis=-1,
+    )
+    ray, origin = ray @ T_CLOUD_CAMERA[:3, :3].T, T_CLOUD_CAMERA[:3, 3]
+    depth = -origin[2] / ray[..., 2]
+    for center, radius in (((0.1, 0.15, 0.028), 0.028), ((0.2, 0.2, 0.032), 0.032)):
+        away = origin - center
+        a, b = (ray**2).sum(axis=-1), ray @ away
+        inside = b**2 - a * (away @ away - radius**2)
+        near = (-b - np.sqrt(np.maximum(inside, 0.0))) / a
+        depth = np.where(inside > 0.0, np.minimum(depth, near), depth)
+    low, high = np.array([0.13, 0.09, 0.0]), np.array([0.17, 0.15, 0.05])
+    walls = np.stack([(low - origin) / ray, (high - origin) / ray])
+    enter, leave = walls.min(axis=0).max(axis=-1), walls.max(axis=0).min(axis=-1)
+    depth = np.where(enter < leave, np.minimum(depth, enter), depth)
+    rng = np.random.default_rng(11)
+    depth += rng.normal(0.0, 0.0004, depth.shape)
+    depth[rng.random(depth.shape) < 0.05] = np.nan
+    return depth.astype(np.float32)
+
+
+def points_of(image: dict[str, Any]) -> np.ndarray:
+    """(H, W, 3) float32 in the cloud's frame: what a depth image stands for."""
+    depth = np.where(image["depth"] > 0, image["depth"], np.nan).astype(np.float64)
+    row, column = np.indices(depth.shape)
+    pixels, pose = image["intrinsics"], np.asarray(image["T_cloud_camera"])
+    x = (column - pixels["cx"]) / pixels["fx"] * depth
+    y = (row - pixels["cy"]) / pixels["fy"] * depth
+    points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
+    return points.astype(np.float32)
+
+
+def drawn_image(scale: float = 1.0) -> dict[str, Any]:
+    depth = drawn_depth() * np.float32(scale)
+    return {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_CLOUD_CAMERA}
+
+
+def seen(name: str, table_seed: int | None = None, **options: Any) -> Case:
+    """A labelled view, with its camera as viewpoint and, unless told otherwise, its table."""
+    points = view(name)["points"]
+    options = {"viewpoint": camera(name), "support": TABLE} | options
+    return Case(options, points if table_seed is None else with_table(points, table_seed))
+
+
+def packed_plane() -> Case:
+    case = seen("packed_7-000002_0", 1, seed=3)
+    case.points = case.points.astype(np.float64)
+    return case
+
+
+def pile_ransac() -> Case:
+    options = {"support": {"kind": "ransac", "distance": 0.004}, "sampling": "uniform", "seed": 5}
+    collision = {"mode": "penalise", "margin": 0.004}
+    few = FEW | options
+    return seen("pile_7-000013_0", 2, model="edgegrasp", collision=collision, **few)
+
+
+def organised_mask() -> Case:
+    points = points_of(drawn_image())
+    mask = np.zeros(points.shape[:2], dtype=bool)
+    mask[:, 60:130] = True
+    options = {
+        "viewpoint": T_CLOUD_CAMERA[:3, 3].tolist(),
+        "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.0},
+        "approach_region": {"include": [{"kind": "mask", "mask": mask.ravel().tolist()}]},
+    }
+    return Case(options | {"suppression": None, "top_k": 40, "seed": 2}, points)
+
+
+def depth_image() -> Case:
+    support = {"normal": (0.0, 0.0, 1.0), "offset": 0.0, "max_depth_error": 0.05}
+    options = {"model": "edgegrasp-small", "support": support, "min_score": 0.9, "seed": 9}
+    return Case(options, depth_images=[drawn_image(scale=1.015)])
+
+
+def two_views() -> Case:
+    first, second = "packed_7-000000_0", "packed_7-000010_0"
+    near, far = with_table(view(first)["points"], 3), view(second)["points"]
+    position = np.array(camera(first))
+    near = ((near - position) * 1.01 + position).astype(np.float32)
+    options = {
+        "viewpoint": [camera(first), camera(second)],
+        "support": TABLE | {"max_depth_error": 0.04},
+        "suppression": {"translation": 0.02, "rotation": 1.0},
+    }
+    beside = {"view_ids": np.repeat([0, 1], [len(near), len(far)])}
+    few = FEW | options | {"model": "vn-edgegrasp", "seed": 1}
+    return Case(few, np.concatenate([near, far]), beside)
+
+
+def given_normals() -> Case:
+    name = "pile_7-000009_0"
+    down = {"direction": (0.0, 0.0, -1.0), "max_angle": 0.5}
+    aslant = {"direction": (1.0, 0.5, -1.0), "max_angle": 0.6}
+    ball = {"kind": "sphere", "center": (0.12, 0.1, 0.08), "radius": 0.03}
+    above = {"kind": "half_space", "normal": (0.0, 0.0, 1.0), "offset": 0.065}
+    options = {
+        "model": "vn-edgegrasp",
+        "viewpoint": None,
+        "approach_direction": {"cones": [down, aslant]},
+        "contact_region": {"include": [above], "exclude": [ball]},
+    }
+    case = seen(name, seed=4, **FEW, **options)
+    case.beside = {"normals": view(name)["normals"].astype(np.float32)}
+    return case
+
+
+def segments_own_gripper() -> Case:
+    corner = {"kind": "box", "min": (0.1, 0.2, 0.0), "max": (0.14, 0.26, 0.2)}
+    ball = {"kind": "sphere", "center": (0.1, 0.2, 0.08), "radius": 0.09}
+    turn = {"quaternion": (0.0, 0.0, 0.5, 0.75**0.5)}
+    extent = {"center": (0.1, 0.08, 0.08), "half_extents": (0.05, 0.06, 0.05)}
+    segments = {"kind": "segments", "ids": [1, 2, 3]}
+    options = {
+        "model": "edgegrasp",
+        "gripper": LONG_FINGERS,
+        "approach_region": {"include": [segments], "exclude": [corner]},
+        "contact_region": {"include": [ball, {"kind": "oriented_box"} | extent | turn]},
+    }
+    case = seen("pile_7-000001_0", seed=6, **FEW, **options)
+    x, y, _ = case.points.T
+    case.beside = {"segment_ids": (x > 0.1) + 2 * (y > 0.15).astype(np.int64)}
+    return case
+
+
+def robotiq_side() -> Case:
+    side = {"preset": "side"}
+    options = {"gripper": "robotiq-2f-85", "approach_direction": side, "collision": "ignore"}
+    return seen("packed_7-000014_0", model="edgegrasp-small", seed=8, **options)
+
+
+def obstacles_clearance() -> Case:
+    wall = {"center": (0.0, 0.1, 0.1), "half_extents": (0.01, 0.2, 0.1)}
+    turn = {"quaternion": (0.0, 0.0, 0.25881904510252074, 0.9659258262890683)}
+    obstacles = [
+        {"kind": "box", "min": (0.27, 0.0, 0.05), "max": (0.3, 0.3, 0.25)},
+        {"kind": "oriented_box"} | wall | turn,
+    ]
+    ways = {"approach_length": 0.04, "retreat_length": 0.06, "retreat_direction": "up"}
+    collision = {"margin": 0.001, "opening": 0.07, "obstacles": obstacles} | ways
+    return seen("packed_7-000004_0", collision=collision, order="clearance", seed=10)
+
+
+def indices_highest_debug() -> Case:
+    name = "packed_7-000008_0"
+    rows = list(range(len(view(name)["points"]) // 2))
+    options = {
+        "workspace": {"min": (0.0, 0.0, 0.0), "max": (0.3, 0.2, 0.3)},
+        "approach_region": {"include": [{"kind": "indices", "indices": rows}]},
+        "approach_direction": {"preset": "top-down"},
+        "num_approach_points": 8,
+        "num_candidates": 300,
+    }
+    return seen(name, order="highest", debug=True, seed=12, **options)
+
+
+def tilted_up() -> Case:
+    name, angle = "pile_7-000005_0", 0.4
+    options = {
+        "viewpoint": turned(np.array(camera(name)), angle).tolist(),
+        "up": (0.0, -np.sin(angle), np.cos(angle)),
+        "support": {"kind": "ransac"},
+        "approach_direction": {"preset": "top-down"},
+    }
+    case = seen(name, 4, seed=13, **options)
+    case.points = turned(case.points, angle)
+    return case
+
+
+def nothing_from_below() -> Case:
+    upward = {"cones": [{"direction": (0.0, 0.0, 1.0), "max_angle": 0.2}]}
+    unknown = {"gripper": "robotiq-2f-85", "viewpoint": None}  # each brings a warning more
+    return seen("packed_7-000006_0", approach_direction=upward, seed=14, **unknown)
+
+
+def score_edges() -> Case:
+    name = "packed_7-000012_0"
+    case, arrays = seen(name, seed=15), view(name)
+    edges = np.stack([arrays["approach_index"], arrays["contact_index"]], axis=1).astype(np.int64)
+    edges[::4, 1] = edges[::-4, 0]  # most of these are longer than the hand opens
+    edges[5, 1] = edges[5, 0]
+    case.given = {"edges": edges}
+    return case
+
+
+def score_hand_poses() -> Case:
+    name = "pile_7-000011_0"
+    poses = view(name)["T_world_hand"][:40].copy()
+    poses[::8, 2, 3] += 0.3  # far above everything
+    case = seen(name, model="edgegrasp", collision="penalise")
+    case.given = {"hand_poses": poses}
+    return case
+
+
+MAKERS = (packed_plane, pile_ransac, organised_mask, depth_image, two_views, given_normals)
+MAKERS += (segments_own_gripper, robotiq_side, obstacles_clearance, indices_highest_debug)
+MAKERS += (tilted_up, nothing_from_below, score_edges, score_hand_poses)
+CASES = {make.__name__: make for make in MAKERS}
+OVER_THE_WIRE = ("depth_image", "segments_own_gripper", "score_edges")

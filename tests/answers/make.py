@@ -1,0 +1,87 @@
+"""Record the answers of the code as it is: `python -m tests.answers.make`.
+
+Answers are promised to stay what they are: record them again only for a change that is meant.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edgegrasp_model.detector import ModelCatalogue
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CloudInput
+
+from .clouds import CASES, Case, points_of
+
+DATA = Path(__file__).parent / "data"
+GRASP_FIELDS = (
+    "score",
+    "T_cloud_hand",
+    "T_cloud_tcp",
+    "width",
+    "approach_point",
+    "contact_point",
+    "approach_direction",
+    "collision_free",
+    "clearance",
+)
+DEBUG_FIELDS = ("points", "normals", "approach_index", "contact_index", "T_cloud_hand", "score")
+
+Record = tuple[dict[str, Any], dict[str, np.ndarray]]
+
+
+def answer(case: Case, catalogue: ModelCatalogue) -> Any:
+    """The detection or scoring of a case, without a server."""
+    points, options = case.points, case.options
+    if case.depth_images is not None:  # as a server reads them
+        (image,) = case.depth_images
+        points = points_of(image)
+        options = options | {"viewpoint": np.asarray(image["T_cloud_camera"])[:3, 3].tolist()}
+    cloud, asked = CloudInput(points, **case.beside), parse_options(options)
+    detector = catalogue.get(asked.model)
+    if case.given:
+        return detector.score(cloud, asked, **case.given)
+    return detector.detect(cloud, asked)
+
+
+def record(answer: Any) -> Record:
+    """What is kept of an answer, of the model's or of the client's: plain values and arrays."""
+    plain = {
+        "counts": dict(answer.counts),
+        "model": answer.model,
+        "warnings": len(answer.warnings),
+    }
+    grasps = getattr(answer, "grasps", None)
+    if grasps is None:
+        plain["reasons"] = [each.reason and str(each.reason) for each in answer.evaluations]
+        grasps = [each.grasp for each in answer.evaluations if each.grasp is not None]
+    arrays = {
+        name: np.array([getattr(grasp, name) for grasp in grasps], dtype=np.float32)
+        for name in GRASP_FIELDS
+    }
+    debug = getattr(answer, "debug", None)
+    if debug is not None:
+        plain["outcomes"] = [str(outcome) for outcome in debug.outcome]
+        plain["support_plane"] = np.asarray(debug.support_plane).tolist()
+        arrays |= {f"debug_{name}": np.asarray(getattr(debug, name)) for name in DEBUG_FIELDS}
+    return plain, arrays
+
+
+def load(name: str) -> Record:
+    """The recorded answer of a case."""
+    with np.load(DATA / f"{name}.npz") as arrays:
+        found = dict(arrays)
+    return json.loads(str(found.pop("plain"))), found
+
+
+def main() -> None:
+    catalogue = ModelCatalogue.load()
+    for name, make in CASES.items():
+        plain, arrays = record(answer(make(), catalogue))
+        np.savez_compressed(DATA / f"{name}.npz", plain=np.array(json.dumps(plain)), **arrays)
+
+
+if __name__ == "__main__":
+    main()

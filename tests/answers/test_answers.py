@@ -1,0 +1,90 @@
+"""Answers stay what they were: same grasps, in the same order, from either transport or none."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from edgegrasp_client import GraspClient
+from edgegrasp_model.detector import ModelCatalogue
+
+from .clouds import CASES, OVER_THE_WIRE
+from .make import GRASP_FIELDS, Record, answer, load, record
+
+CLOSE = 1e-5  # of scores, metres and matrix entries: another processor rounds otherwise
+TIED = 2e-5  # scores that differ by less may change places
+
+
+def assert_same(found: Record, expected: Record) -> None:
+    (plain, arrays), (expected_plain, expected_arrays) = found, expected
+    plane, expected_plane = (each.get("support_plane", ()) for each in (plain, expected_plain))
+    assert plane == pytest.approx(expected_plane, abs=CLOSE)
+    assert plain | {"support_plane": ()} == expected_plain | {"support_plane": ()}
+    assert arrays.keys() == expected_arrays.keys()
+    for name in arrays.keys() - set(GRASP_FIELDS):
+        np.testing.assert_allclose(arrays[name], expected_arrays[name], rtol=0, atol=CLOSE)
+    assert len(arrays["score"]) == len(expected_arrays["score"])
+    if "reasons" in plain:  # each evaluation has its own place
+        for name in GRASP_FIELDS:
+            np.testing.assert_allclose(arrays[name], expected_arrays[name], rtol=0, atol=CLOSE)
+    else:
+        assert_same_grasps(arrays, expected_arrays)
+
+
+def assert_same_grasps(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    """Same grasps in the same order, save that those of tied scores may change places."""
+    left = list(range(len(found["score"])))
+    for row in range(len(expected["score"])):
+        for other in left:
+            pairs = [(found[name][other], expected[name][row]) for name in GRASP_FIELDS]
+            if all(np.allclose(*pair, rtol=0, atol=CLOSE) for pair in pairs):
+                left.remove(other)
+                break
+            apart = abs(float(found["score"][other]) - float(expected["score"][row]))
+            assert apart < TIED, f"grasp {row} was another one: {pairs}"
+        else:
+            pytest.fail(f"grasp {row} is gone, among others of its score")
+
+
+@pytest.fixture(scope="module")
+def catalogue() -> ModelCatalogue:
+    return ModelCatalogue.load()
+
+
+@pytest.fixture(scope="module")
+def addresses(start_server) -> Iterator[dict[str, str]]:
+    with start_server("--log-level", "warning") as server:
+        yield {"rest": server.http_url, "grpc": server.grpc_address}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_detector_answers_as_recorded(name: str, catalogue: ModelCatalogue) -> None:
+    assert_same(record(answer(CASES[name](), catalogue)), load(name))
+
+
+@pytest.mark.parametrize("transport", ["rest", "grpc"])
+@pytest.mark.parametrize("name", OVER_THE_WIRE)
+def test_server_answers_as_recorded(name: str, transport: str, addresses: dict[str, str]) -> None:
+    case = CASES[name]()
+    with GraspClient(addresses[transport], timeout=120.0) as client:
+        ask = client.score if case.given else client.detect
+        sent = {"depth_images": case.depth_images, **case.beside, **case.given, **case.options}
+        found = ask(case.points, **sent)
+    assert_same(record(found), load(name))
+
+
+def test_cases_find_grasps_of_all_shipped_weights_and_one_finds_none() -> None:
+    models = {load(name)[0]["model"] for name in CASES if len(load(name)[1]["score"]) > 5}
+    assert models == {"edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp"}
+    assert len(load("nothing_from_below")[1]["score"]) == 0
+
+
+def test_another_order_is_told_apart_from_a_tie() -> None:
+    _, expected = load("packed_plane")
+    swapped = {name: expected[name][[1, 0, *range(2, len(expected["score"]))]] for name in expected}
+    with pytest.raises(AssertionError):
+        assert_same_grasps(swapped, expected)
+    tied = {"score": np.full_like(expected["score"], 0.5)}
+    assert_same_grasps(swapped | tied, expected | tied)
+    with pytest.raises(pytest.fail.Exception):
+        assert_same_grasps(swapped | tied, expected | tied | {"width": expected["width"] + 0.001})
