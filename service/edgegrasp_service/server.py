@@ -50,6 +50,7 @@ class Server:
 
     Attributes:
         metrics: What /metrics shows.
+        service: The front without a transport.
         pool: The workers.
         http_url: e.g. "http://127.0.0.1:8000", once ports are open.
         grpc_address: e.g. "127.0.0.1:50051", once ports are open.
@@ -69,7 +70,7 @@ class Server:
         self._recorder: Recorder | None = None
         if settings.record_folder is not None:
             self._recorder = Recorder(settings.record_folder, settings.record_bytes)
-        self._service = GraspService(
+        self.service = GraspService(
             settings,
             self.pool,
             load_tokens(settings),
@@ -77,14 +78,14 @@ class Server:
             None if self._recorder is None else self._recorder.record,
         )
         self.reloader = Reloader(
-            self._service, lambda: load_tokens(settings), self._tls, self.metrics.reloaded
+            self.service, lambda: load_tokens(settings), self._tls, self.metrics.reloaded
         )
         self._watch()
         self.http_url = ""
         self.grpc_address = ""
 
     def _watch(self) -> None:
-        service, admission, watch = self._service, self._service.admission, self.metrics.watch
+        service, admission, watch = self.service, self.service.admission, self.metrics.watch
         self.metrics.describe_models(lambda: self.pool.models)
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
@@ -118,7 +119,7 @@ class Server:
         asyncio.get_running_loop().set_exception_handler(_LoopErrors())
         with _listen(settings.host, settings.http_port) as http_socket:
             credentials = None if self._tls is None else self._tls.grpc
-            grpc_server = GrpcServer(self._service, self.reloader, credentials)
+            grpc_server = GrpcServer(self.service, self.reloader, credentials)
             http_server = self._http_server()
             scheme = "http" if self._tls is None else "https"
             self.http_url = f"{scheme}://{_host_and_port(http_socket)}"
@@ -145,7 +146,7 @@ class Server:
 
     async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
         await self.pool.start()
-        if not self._service.stopping.is_set():
+        if not self.service.stopping.is_set():
             await grpc_server.set_serving(True)
             ready()
 
@@ -153,17 +154,17 @@ class Server:
         """Refuse new requests, and wait until those accepted are answered, or grace is over."""
         clock = asyncio.get_running_loop().time
         end = clock() + self._settings.grace_seconds
-        self._service.stopping.set()
+        self.service.stopping.set()
         await grpc_server.stop_serving()
         await asyncio.sleep(min(NOTICE_SECONDS, self._settings.grace_seconds))
-        if not await self._service.drain(end - clock()):
+        if not await self.service.drain(end - clock()):
             logger.warning("grace is over: requests in flight are given up")
 
     def _http_server(self) -> "_HttpServer":
         tls = self._tls
-        app = create_app(self._service, self.metrics, self.reloader)
+        app = create_app(self.service, self.metrics, self.reloader)
         config = uvicorn.Config(
-            HttpMiddleware(app, self._service),
+            HttpMiddleware(app, self.service),
             log_config=None,
             access_log=False,
             lifespan="off",

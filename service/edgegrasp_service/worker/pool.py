@@ -355,7 +355,9 @@ class _Worker(asyncio.Protocol):
                 self._killing.cancel()
                 self._killing = None
             answer.set_result(replace(message, body=body))
-            if message.error is None or message.error.kind != WORKER_LOST:  # then it ends itself
+            if message.error is not None and message.error.kind == WORKER_LOST:
+                self.kill()  # it ran out of memory: what is left of it cannot be trusted
+            else:
                 self._pool._free(self)
 
     def connection_lost(self, error: Exception | None) -> None:

@@ -115,7 +115,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
             answer: Answer = answerer.answer(job)
-        except BaseException:  # out of memory: what is left of this process cannot be trusted
+        except BaseException:  # out of memory
             facts = Facts(traceback=traceback.format_exc())
             send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
             return
