@@ -28,6 +28,7 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/mypy
 	$(BIN)/mypy $(wildcard examples/*.py)
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/unasync.py --check
 	mkdir -p build/proto
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build/proto
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
@@ -35,9 +36,10 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 format: $(INSTALLED) ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+	$(BIN)/python scripts/unasync.py
 
-test: $(INSTALLED) ## run the tests
-	$(BIN)/pytest -q
+test: $(INSTALLED) ## run the tests, on every core
+	$(BIN)/pytest -q -n auto
 
 fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
 	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz

@@ -3,13 +3,14 @@
 from edgegrasp_client import GraspClient
 
 with GraspClient("127.0.0.1:50051") as client:  # or "http://127.0.0.1:8000"
-detection = client.detect(points, seed=7, top_k=5)
+    detection = client.detect(points, seed=7, top_k=5)
 best = detection.grasps[0]
 """
 
 from edgegrasp_client.async_client import AsyncGraspClient
 from edgegrasp_client.client import GraspClient
-from edgegrasp_client.depth_image import DepthImage, Intrinsics
+from edgegrasp_client.clouds import DepthImage, Intrinsics, PointCloud2, PointField
+from edgegrasp_client.connection import Tls
 from edgegrasp_client.errors import (
     AccessDeniedError,
     DeadlineError,
@@ -43,10 +44,16 @@ from edgegrasp_client.options import (
     Suppression,
     Workspace,
 )
-from edgegrasp_client.point_cloud2 import PointCloud2, PointField
-from edgegrasp_client.results import DebugInfo, Detection, Evaluation, Grasp, Model, Scoring
-from edgegrasp_client.security import Tls
-from edgegrasp_client.stream import StreamAnswer, StreamRequest
+from edgegrasp_client.requests import StreamRequest
+from edgegrasp_client.results import (
+    DebugInfo,
+    Detection,
+    Evaluation,
+    Grasp,
+    Model,
+    Scoring,
+    StreamAnswer,
+)
 
 __all__ = [
     "AccessDeniedError",

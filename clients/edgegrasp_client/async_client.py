@@ -1,24 +1,51 @@
-"""The client, for asyncio."""
+"""The client for asyncio; `scripts/unasync.py` makes the synchronous one, client.py, from it."""
 
 import asyncio
-from collections.abc import AsyncIterable, AsyncIterator, Iterable, Sequence
-from types import TracebackType
-from typing import Any, Self, Unpack
+import time
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, Self, TypeVar, Unpack
 
+import grpc.aio
 import httpx
-from grpc import aio
 from numpy.typing import NDArray
 
-from edgegrasp_client.async_transports import GrpcTransport, RestTransport, Transport
-from edgegrasp_client.client import DEFAULT_ADDRESS, POLL_SECONDS, is_rest
-from edgegrasp_client.cloud_encoding import Cloud
-from edgegrasp_client.depth_image import DepthImage
-from edgegrasp_client.errors import DeadlineError
-from edgegrasp_client.inputs import Given, Inputs
-from edgegrasp_client.options import DetectOptions, plain_options
-from edgegrasp_client.results import Detection, Model, Scoring
-from edgegrasp_client.security import Tls
-from edgegrasp_client.stream import StreamAnswer, StreamRequest
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import grpc_wire, rest_wire
+from edgegrasp_client.clouds import Cloud, DepthImage
+from edgegrasp_client.connection import (
+    CHANNEL_OPTIONS,
+    DEFAULT_ADDRESS,
+    Tls,
+    channel_credentials,
+    is_rest,
+    retry_delay,
+    ssl_context,
+    token_metadata,
+)
+from edgegrasp_client.errors import DeadlineError, GraspClientError, ServerUnavailableError
+from edgegrasp_client.options import DetectOptions
+from edgegrasp_client.requests import (
+    Request,
+    ScoreRequest,
+    StreamRequest,
+    async_enumerate,
+    plain_options,
+)
+from edgegrasp_client.results import (
+    Detection,
+    Model,
+    Read,
+    Scoring,
+    StreamAnswer,
+    detection_from,
+    models_from,
+    scoring_from,
+)
+
+POLL_SECONDS = 0.1
+
+Answer = TypeVar("Answer")
 
 
 class AsyncGraspClient:
@@ -26,8 +53,10 @@ class AsyncGraspClient:
 
     Args:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
-        timeout: Seconds for one call, unless the call says otherwise; over REST for each of
-            connecting, sending and waiting.
+        timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
+            for each of connecting, sending and waiting.
+        retry: Whether to try again, after short random delays, where the server is away or busy
+            or lost the worker of the request. Requests of a stream are sent once.
         token: For a server that asks for one; over TLS, or everyone on the way can read it.
         tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx knows.
@@ -40,17 +69,19 @@ class AsyncGraspClient:
         address: str = DEFAULT_ADDRESS,
         *,
         timeout: float = 30.0,
+        retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
-        channel: aio.Channel | None = None,
+        channel: grpc.aio.Channel | None = None,
         http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._transport: Transport
+        self._retry = retry
+        self._transport: _GrpcTransport | _RestTransport
         if is_rest(address):
-            self._transport = RestTransport(address, token, tls, http_transport)
+            self._transport = _RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = GrpcTransport(address, token, tls, channel)
+            self._transport = _GrpcTransport(address, token, tls, channel)
 
     async def detect(
         self,
@@ -82,8 +113,9 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
-        return await self._transport.detect(inputs, plain_options(options), self._seconds(timeout))
+        arrays = (normals, colors, segment_ids, view_ids)
+        request = Request(cloud, depth_images, *arrays, options=plain_options(options))
+        return await self._retried(partial(self._transport.detect, request), timeout)
 
     async def score(
         self,
@@ -119,10 +151,9 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
-        given = Given(edges, hand_poses)
-        plain = plain_options(options)
-        return await self._transport.score(inputs, given, plain, self._seconds(timeout))
+        arrays = (normals, colors, segment_ids, view_ids, plain_options(options))
+        request = ScoreRequest(cloud, depth_images, *arrays, edges, hand_poses)
+        return await self._retried(partial(self._transport.score, request), timeout)
 
     def detect_stream(
         self,
@@ -147,7 +178,7 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: The stream itself failed, so that no more answers come.
         """
-        return self._transport.detect_stream(_asynchronous(requests), self._seconds(timeout))
+        return self._transport.detect_stream(async_enumerate(requests), self._seconds(timeout))
 
     async def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name.
@@ -155,7 +186,7 @@ class AsyncGraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        return await self._transport.models(self._seconds(timeout))
+        return await self._retried(self._transport.models, timeout)
 
     async def ready(self, *, timeout: float | None = None) -> bool:
         """Whether the server answers requests: False if it is not there or still loading."""
@@ -167,40 +198,172 @@ class AsyncGraspClient:
         Raises:
             DeadlineError: It did not within `timeout` seconds.
         """
-        loop = asyncio.get_running_loop()
-        end = loop.time() + timeout
-        while not await self.ready(timeout=max(POLL_SECONDS, end - loop.time())):
-            if loop.time() >= end:
+        end = time.monotonic() + timeout
+        while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
+            if time.monotonic() >= end:
                 raise DeadlineError(f"The server was not ready within {timeout:g} s.")
             await asyncio.sleep(POLL_SECONDS)
 
     async def close(self) -> None:
         """Close the connection."""
+        self._retry = False  # a call that this cancels has no connection to try again on
         await self._transport.close()
 
     async def __aenter__(self) -> Self:
         """Itself."""
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Close the connection."""
         await self.close()
 
     def _seconds(self, timeout: float | None) -> float:
         return self._timeout if timeout is None else timeout
 
+    async def _retried(
+        self, call: Callable[[float], Awaitable[Answer]], timeout: float | None
+    ) -> Answer:
+        """The answer of a call, made again while the server is away or busy and time is left."""
+        left = self._seconds(timeout)
+        end = time.monotonic() + left
+        attempt = 0
+        while True:
+            try:
+                return await call(left)
+            except ServerUnavailableError as error:
+                delay = retry_delay(error, attempt)
+                if not self._retry or delay is None or time.monotonic() + delay >= end:
+                    raise
+            await asyncio.sleep(delay)
+            left = max(end - time.monotonic(), 0.0)
+            attempt += 1
 
-async def _asynchronous(
-    requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
-) -> AsyncIterator[StreamRequest]:
-    if isinstance(requests, AsyncIterable):
-        async for request in requests:
-            yield request
-    else:
-        for request in requests:
-            yield request
+
+class _GrpcTransport:
+    """Calls over one channel; raises GraspClientErrors."""
+
+    def __init__(
+        self, address: str, token: str | None, tls: Tls | None, channel: grpc.aio.Channel | None
+    ) -> None:
+        self._owned = channel is None
+        self._channel = channel or _open_channel(address, tls)
+        self._metadata = token_metadata(token)
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
+        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
+
+    async def detect(self, request: Request, timeout: float) -> Detection:
+        message = grpc_wire.detect_message(request)
+        return await self._answer(self._stub.DetectGrasps, message, timeout, detection_from)
+
+    async def score(self, request: ScoreRequest, timeout: float) -> Scoring:
+        message = grpc_wire.score_message(request)
+        return await self._answer(self._stub.ScoreGrasps, message, timeout, scoring_from)
+
+    async def models(self, timeout: float) -> list[Model]:
+        message = grasp_pb2.ListModelsRequest()
+        return await self._answer(self._stub.ListModels, message, timeout, models_from)
+
+    async def _answer(
+        self, method: Any, message: Any, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            answer = await method(message, timeout=timeout, metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return parse(answer, grpc_wire.read_field)
+
+    async def detect_stream(
+        self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
+    ) -> AsyncIterator[StreamAnswer]:
+        failed: list[Exception] = []
+
+        async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
+            try:
+                async for number, request in requests:
+                    yield grpc_wire.stream_message(request, number, timeout)
+            except Exception as error:  # gRPC reads this elsewhere, and would only log it
+                failed.append(error)
+
+        call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
+        try:
+            async for answer in call:
+                yield grpc_wire.stream_answer(answer)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        finally:
+            call.cancel()
+        if failed:
+            raise failed[0]
+
+    async def ready(self, timeout: float) -> bool:
+        try:
+            return bool(await self._check(b"", timeout=timeout) == grpc_wire.SERVING)
+        except grpc.RpcError:
+            return False
+
+    async def close(self) -> None:
+        if self._owned:
+            await self._channel.close(None)
+
+
+class _RestTransport:
+    """Posts over connections that are kept open; raises GraspClientErrors."""
+
+    def __init__(
+        self,
+        address: str,
+        token: str | None,
+        tls: Tls | None,
+        transport: httpx.AsyncBaseTransport | None,
+    ) -> None:
+        self._http = httpx.AsyncClient(
+            base_url=address,
+            headers=dict(token_metadata(token)),
+            verify=ssl_context(tls),
+            transport=transport,
+        )
+
+    async def detect(self, request: Request, timeout: float) -> Detection:
+        return await self._answer(rest_wire.detect_call(request), timeout, detection_from)
+
+    async def score(self, request: ScoreRequest, timeout: float) -> Scoring:
+        return await self._answer(rest_wire.score_call(request), timeout, scoring_from)
+
+    async def models(self, timeout: float) -> list[Model]:
+        return await self._answer(rest_wire.models_call(), timeout, models_from)
+
+    async def _answer(
+        self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            response = await self._http.request(**rest_wire.with_deadline(call, timeout))
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.parsed(response, parse)
+
+    async def detect_stream(
+        self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
+    ) -> AsyncIterator[StreamAnswer]:
+        async for number, request in requests:
+            call = rest_wire.detect_call(request.request)
+            seconds = timeout if request.timeout is None else request.timeout
+            try:
+                detection = await self._answer(call, seconds, detection_from)
+                yield StreamAnswer(request.name(number), detection)
+            except GraspClientError as error:
+                yield StreamAnswer(request.name(number), error=error)
+
+    async def ready(self, timeout: float) -> bool:
+        try:
+            return (await self._http.get(rest_wire.READY, timeout=timeout)).is_success
+        except httpx.HTTPError:
+            return False
+
+    async def close(self) -> None:
+        await self._http.aclose()
+
+
+def _open_channel(address: str, tls: Tls | None) -> grpc.aio.Channel:
+    if tls is None:
+        return grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
+    return grpc.aio.secure_channel(address, channel_credentials(tls), CHANNEL_OPTIONS)

@@ -1,26 +1,49 @@
-"""The client, synchronous."""
+"""The synchronous client, generated from async_client.py: edit that one."""
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from types import TracebackType
-from typing import Any, Self, Unpack
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any, Self, TypeVar, Unpack
 
 import grpc
 import httpx
 from numpy.typing import NDArray
 
-from edgegrasp_client.cloud_encoding import Cloud
-from edgegrasp_client.depth_image import DepthImage
-from edgegrasp_client.errors import DeadlineError
-from edgegrasp_client.inputs import Given, Inputs
-from edgegrasp_client.options import DetectOptions, plain_options
-from edgegrasp_client.results import Detection, Model, Scoring
-from edgegrasp_client.security import Tls
-from edgegrasp_client.stream import StreamAnswer, StreamRequest
-from edgegrasp_client.transports import GrpcTransport, RestTransport, Transport
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import grpc_wire, rest_wire
+from edgegrasp_client.clouds import Cloud, DepthImage
+from edgegrasp_client.connection import (
+    CHANNEL_OPTIONS,
+    DEFAULT_ADDRESS,
+    Tls,
+    channel_credentials,
+    is_rest,
+    retry_delay,
+    ssl_context,
+    token_metadata,
+)
+from edgegrasp_client.errors import DeadlineError, GraspClientError, ServerUnavailableError
+from edgegrasp_client.options import DetectOptions
+from edgegrasp_client.requests import (
+    Request,
+    ScoreRequest,
+    StreamRequest,
+    plain_options,
+)
+from edgegrasp_client.results import (
+    Detection,
+    Model,
+    Read,
+    Scoring,
+    StreamAnswer,
+    detection_from,
+    models_from,
+    scoring_from,
+)
 
-DEFAULT_ADDRESS = "127.0.0.1:50051"
 POLL_SECONDS = 0.1
+
+Answer = TypeVar("Answer")
 
 
 class GraspClient:
@@ -28,8 +51,10 @@ class GraspClient:
 
     Args:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
-        timeout: Seconds for one call, unless the call says otherwise; over REST for each of
-            connecting, sending and waiting.
+        timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
+            for each of connecting, sending and waiting.
+        retry: Whether to try again, after short random delays, where the server is away or busy
+            or lost the worker of the request. Requests of a stream are sent once.
         token: For a server that asks for one; over TLS, or everyone on the way can read it.
         tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx knows.
@@ -42,17 +67,19 @@ class GraspClient:
         address: str = DEFAULT_ADDRESS,
         *,
         timeout: float = 30.0,
+        retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
         channel: grpc.Channel | None = None,
         http_transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._transport: Transport
+        self._retry = retry
+        self._transport: _GrpcTransport | _RestTransport
         if is_rest(address):
-            self._transport = RestTransport(address, token, tls, http_transport)
+            self._transport = _RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = GrpcTransport(address, token, tls, channel)
+            self._transport = _GrpcTransport(address, token, tls, channel)
 
     def detect(
         self,
@@ -84,8 +111,9 @@ class GraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
-        return self._transport.detect(inputs, plain_options(options), self._seconds(timeout))
+        arrays = (normals, colors, segment_ids, view_ids)
+        request = Request(cloud, depth_images, *arrays, options=plain_options(options))
+        return self._retried(partial(self._transport.detect, request), timeout)
 
     def score(
         self,
@@ -121,13 +149,15 @@ class GraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        inputs = Inputs(cloud, depth_images, normals, colors, segment_ids, view_ids)
-        given = Given(edges, hand_poses)
-        plain = plain_options(options)
-        return self._transport.score(inputs, given, plain, self._seconds(timeout))
+        arrays = (normals, colors, segment_ids, view_ids, plain_options(options))
+        request = ScoreRequest(cloud, depth_images, *arrays, edges, hand_poses)
+        return self._retried(partial(self._transport.score, request), timeout)
 
     def detect_stream(
-        self, requests: Iterable[StreamRequest], *, timeout: float | None = None
+        self,
+        requests: Iterable[StreamRequest],
+        *,
+        timeout: float | None = None,
     ) -> Iterator[StreamAnswer]:
         """Find grasps in one cloud after the other, over one stream.
 
@@ -146,7 +176,7 @@ class GraspClient:
         Raises:
             GraspClientError: The stream itself failed, so that no more answers come.
         """
-        return self._transport.detect_stream(requests, self._seconds(timeout))
+        return self._transport.detect_stream(enumerate(requests), self._seconds(timeout))
 
     def models(self, *, timeout: float | None = None) -> list[Model]:
         """The weights that `model` can name.
@@ -154,7 +184,7 @@ class GraspClient:
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
         """
-        return self._transport.models(self._seconds(timeout))
+        return self._retried(self._transport.models, timeout)
 
     def ready(self, *, timeout: float | None = None) -> bool:
         """Whether the server answers requests: False if it is not there or still loading."""
@@ -174,25 +204,162 @@ class GraspClient:
 
     def close(self) -> None:
         """Close the connection."""
+        self._retry = False  # a call that this cancels has no connection to try again on
         self._transport.close()
 
     def __enter__(self) -> Self:
         """Itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the connection."""
         self.close()
 
     def _seconds(self, timeout: float | None) -> float:
         return self._timeout if timeout is None else timeout
 
+    def _retried(self, call: Callable[[float], Answer], timeout: float | None) -> Answer:
+        """The answer of a call, made again while the server is away or busy and time is left."""
+        left = self._seconds(timeout)
+        end = time.monotonic() + left
+        attempt = 0
+        while True:
+            try:
+                return call(left)
+            except ServerUnavailableError as error:
+                delay = retry_delay(error, attempt)
+                if not self._retry or delay is None or time.monotonic() + delay >= end:
+                    raise
+            time.sleep(delay)
+            left = max(end - time.monotonic(), 0.0)
+            attempt += 1
 
-def is_rest(address: str) -> bool:
-    """Whether an address names the REST transport."""
-    return address.startswith(("http://", "https://"))
+
+class _GrpcTransport:
+    """Calls over one channel; raises GraspClientErrors."""
+
+    def __init__(
+        self, address: str, token: str | None, tls: Tls | None, channel: grpc.Channel | None
+    ) -> None:
+        self._owned = channel is None
+        self._channel = channel or _open_channel(address, tls)
+        self._metadata = token_metadata(token)
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
+        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
+
+    def detect(self, request: Request, timeout: float) -> Detection:
+        message = grpc_wire.detect_message(request)
+        return self._answer(self._stub.DetectGrasps, message, timeout, detection_from)
+
+    def score(self, request: ScoreRequest, timeout: float) -> Scoring:
+        message = grpc_wire.score_message(request)
+        return self._answer(self._stub.ScoreGrasps, message, timeout, scoring_from)
+
+    def models(self, timeout: float) -> list[Model]:
+        message = grasp_pb2.ListModelsRequest()
+        return self._answer(self._stub.ListModels, message, timeout, models_from)
+
+    def _answer(
+        self, method: Any, message: Any, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            answer = method(message, timeout=timeout, metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        return parse(answer, grpc_wire.read_field)
+
+    def detect_stream(
+        self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
+    ) -> Iterator[StreamAnswer]:
+        failed: list[Exception] = []
+
+        def messages() -> Iterator[grasp_pb2.DetectGraspsStreamRequest]:
+            try:
+                for number, request in requests:
+                    yield grpc_wire.stream_message(request, number, timeout)
+            except Exception as error:  # gRPC reads this elsewhere, and would only log it
+                failed.append(error)
+
+        call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
+        try:
+            for answer in call:
+                yield grpc_wire.stream_answer(answer)
+        except grpc.RpcError as error:
+            raise grpc_wire.error_from_call(error) from None
+        finally:
+            call.cancel()
+        if failed:
+            raise failed[0]
+
+    def ready(self, timeout: float) -> bool:
+        try:
+            return bool(self._check(b"", timeout=timeout) == grpc_wire.SERVING)
+        except grpc.RpcError:
+            return False
+
+    def close(self) -> None:
+        if self._owned:
+            self._channel.close()
+
+
+class _RestTransport:
+    """Posts over connections that are kept open; raises GraspClientErrors."""
+
+    def __init__(
+        self,
+        address: str,
+        token: str | None,
+        tls: Tls | None,
+        transport: httpx.BaseTransport | None,
+    ) -> None:
+        self._http = httpx.Client(
+            base_url=address,
+            headers=dict(token_metadata(token)),
+            verify=ssl_context(tls),
+            transport=transport,
+        )
+
+    def detect(self, request: Request, timeout: float) -> Detection:
+        return self._answer(rest_wire.detect_call(request), timeout, detection_from)
+
+    def score(self, request: ScoreRequest, timeout: float) -> Scoring:
+        return self._answer(rest_wire.score_call(request), timeout, scoring_from)
+
+    def models(self, timeout: float) -> list[Model]:
+        return self._answer(rest_wire.models_call(), timeout, models_from)
+
+    def _answer(
+        self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]
+    ) -> Answer:
+        try:
+            response = self._http.request(**rest_wire.with_deadline(call, timeout))
+        except httpx.HTTPError as error:
+            raise rest_wire.error_from_transport(error) from None
+        return rest_wire.parsed(response, parse)
+
+    def detect_stream(
+        self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
+    ) -> Iterator[StreamAnswer]:
+        for number, request in requests:
+            call = rest_wire.detect_call(request.request)
+            seconds = timeout if request.timeout is None else request.timeout
+            try:
+                detection = self._answer(call, seconds, detection_from)
+                yield StreamAnswer(request.name(number), detection)
+            except GraspClientError as error:
+                yield StreamAnswer(request.name(number), error=error)
+
+    def ready(self, timeout: float) -> bool:
+        try:
+            return (self._http.get(rest_wire.READY, timeout=timeout)).is_success
+        except httpx.HTTPError:
+            return False
+
+    def close(self) -> None:
+        self._http.close()
+
+
+def _open_channel(address: str, tls: Tls | None) -> grpc.Channel:
+    if tls is None:
+        return grpc.insecure_channel(address, CHANNEL_OPTIONS)
+    return grpc.secure_channel(address, channel_credentials(tls), CHANNEL_OPTIONS)

@@ -4,12 +4,13 @@ GraspClientError
   + InvalidRequestError         the cloud or an option is wrong: field, value, fix
       + UnknownModelError       the server has no weights of that name
       + PayloadTooLargeError    the request exceeds the server's limits
-  + AccessDeniedError           no token, none the server knows, or one that is good for less
-  + ServerUnavailableError      no connection, weights still loading, or the server is stopping
+  + AccessDeniedError           no token, an unknown one, or one without the right to this
+  + ServerUnavailableError      no connection, weights still loading, the server is stopping, or
+                                its worker was lost
       + OverloadedError         the server is full: retry_after
   + DeadlineError               no answer within the timeout
   + ServerFailedError           the server failed on a good request
-  + ProtocolError               the answer is none of this service: is the address right?
+  + ProtocolError               the answer is not from a grasp service: is the address right?
 """
 
 
@@ -43,11 +44,11 @@ class PayloadTooLargeError(InvalidRequestError):
 
 
 class AccessDeniedError(GraspClientError):
-    """The server asks for a token: there is none, it does not know it, or it is good for less."""
+    """The server asks for a token: there is none, it is unknown, or it does not allow this."""
 
 
 class ServerUnavailableError(GraspClientError):
-    """No connection, weights still loading, or the server is stopping; trying again may help."""
+    """No connection, weights still loading, or the server is stopping; another try may help."""
 
 
 class OverloadedError(ServerUnavailableError):
@@ -72,7 +73,7 @@ class ServerFailedError(GraspClientError):
 
 
 class ProtocolError(GraspClientError):
-    """The answer is none of this service; the address may be of another one."""
+    """The answer is not from a grasp service; the address may be of another one."""
 
 
 _BY_KIND: dict[str, type[GraspClientError]] = {
@@ -113,5 +114,5 @@ def error_of_kind(
 
 
 def invalid(field: str, value: str, fix: str) -> InvalidRequestError:
-    """The exception for what need not be sent to be refused."""
+    """The exception for what the client refuses before it is sent."""
     return InvalidRequestError(f"{field}: got {value}. {fix}", field, value, fix)

@@ -1,15 +1,20 @@
 """Requests, answers and errors as gRPC carries them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import grpc
 import numpy as np
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.cloud_encoding import cloud_file, packable
-from edgegrasp_client.depth_image import depth_image_fields
+from edgegrasp_client.clouds import (
+    cloud_file,
+    depth_image_fields,
+    float32_points,
+    is_point_cloud2,
+    point_cloud2_fields,
+)
 from edgegrasp_client.errors import (
     AccessDeniedError,
     DeadlineError,
@@ -20,36 +25,18 @@ from edgegrasp_client.errors import (
     ServerFailedError,
     ServerUnavailableError,
     error_of_kind,
+    invalid,
 )
-from edgegrasp_client.inputs import Given, Inputs
-from edgegrasp_client.option_messages import fill
-from edgegrasp_client.point_cloud2 import is_point_cloud2, point_cloud2_fields
-from edgegrasp_client.results import (
-    DebugInfo,
-    Detection,
-    Evaluation,
-    Float32,
-    Grasp,
-    Model,
-    Scoring,
-)
-from edgegrasp_client.stream import StreamAnswer, StreamRequest
-
-CHANNEL_OPTIONS = (
-    ("grpc.max_receive_message_length", -1),
-    ("grpc.max_send_message_length", -1),
-    ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
-    ("grpc.max_reconnect_backoff_ms", 1000),
-    # A server that vanished without a word is found out, and streams to it end.
-    ("grpc.keepalive_time_ms", 30_000),
-    ("grpc.keepalive_timeout_ms", 10_000),
-)
+from edgegrasp_client.requests import Request, ScoreRequest, StreamRequest
+from edgegrasp_client.results import StreamAnswer, detection_from
 
 # grpc.health.v1: an empty request asks about the whole server; field 1 = 1 means SERVING.
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
 
 _ERROR_METADATA = "edgegrasp-error-bin"
+
+Filled = tuple[Message, object]  # a message, and the mapping of its fields that goes into it
 
 _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineError,
@@ -64,81 +51,50 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
 }
 
 
-def request_message(inputs: Inputs, options: Mapping[str, Any]) -> grasp_pb2.DetectGraspsRequest:
-    """A request; raises InvalidRequestError for what no message can hold."""
+def detect_message(request: Request) -> grasp_pb2.DetectGraspsRequest:
+    """A request for grasps; raises InvalidRequestError for what no message can hold."""
     message = grasp_pb2.DetectGraspsRequest()
-    _set_cloud(message, inputs)
-    fill(message.options, options, "options")
+    _set_cloud_and_options(message, request)
     return message
 
 
-def score_message(
-    inputs: Inputs, given: Given, options: Mapping[str, Any]
-) -> grasp_pb2.ScoreGraspsRequest:
+def score_message(request: ScoreRequest) -> grasp_pb2.ScoreGraspsRequest:
     """A request to score; raises InvalidRequestError for what no message can hold."""
     message = grasp_pb2.ScoreGraspsRequest()
-    _set_cloud(message, inputs)
-    fill(message.options, options, "options")
-    if given.edges is not None:
-        for approach, contact in given.edges.tolist():
+    _set_cloud_and_options(message, request)
+    if request.edges is not None:
+        for approach, contact in request.edges.tolist():
             edge = {"approach_index": approach, "contact_index": contact}
             fill(message.edges.add(), edge, "edges")
-    if given.hand_poses is not None:
-        for pose in given.hand_poses:
+    if request.hand_poses is not None:
+        for pose in request.hand_poses:
             message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
     return message
 
 
-def _set_cloud(message: Any, inputs: Inputs) -> None:
-    cloud = inputs.cloud
-    if cloud is None:
-        for row, image in enumerate(inputs.depth_images or ()):
-            fields = depth_image_fields(image, row)
-            fill(message.depth_images.add(), fields, f"depth_images.{row}")
-    elif is_point_cloud2(cloud):
-        fill(message.point_cloud2, point_cloud2_fields(cloud), "point_cloud2")
-    elif (points := packable(cloud)) is not None:
-        message.points = points.astype("<f4", copy=False).tobytes()
-    else:
-        file = cloud_file(cloud)
-        message.encoded.format, message.encoded.data = file.format, file.data
-    for name, array in inputs.beside().items():
-        setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
-
-
-def detection_from_message(message: grasp_pb2.DetectGraspsResponse) -> Detection:
-    """The answer to a detection."""
-    return Detection(
-        grasps=[_grasp(grasp) for grasp in message.grasps],
-        counts=dict(message.counts),
-        seconds=dict(message.seconds),
-        model=message.model,
-        warnings=list(message.warnings),
-        debug=_debug(message.debug) if message.HasField("debug") else None,
+def stream_message(
+    request: StreamRequest, number: int, timeout: float
+) -> grasp_pb2.DetectGraspsStreamRequest:
+    """A request of a stream; raises InvalidRequestError for what no message can hold."""
+    return grasp_pb2.DetectGraspsStreamRequest(
+        request_id=request.name(number),
+        request=detect_message(request.request),
+        timeout=timeout if request.timeout is None else request.timeout,
     )
 
 
-def scoring_from_message(message: grasp_pb2.ScoreGraspsResponse) -> Scoring:
-    """The answer to a request to score."""
-    return Scoring(
-        evaluations=[
-            Evaluation(
-                _grasp(evaluation.grasp) if evaluation.HasField("grasp") else None,
-                evaluation.reason if evaluation.HasField("reason") else None,
-            )
-            for evaluation in message.evaluations
-        ],
-        counts=dict(message.counts),
-        seconds=dict(message.seconds),
-        model=message.model,
-        warnings=list(message.warnings),
-    )
+def read_field(message: Message, name: str) -> Any:
+    """A field of an answer; None if it is absent. What the parsers of `results` read with."""
+    absent = message.DESCRIPTOR.fields_by_name[name].has_presence and not message.HasField(name)
+    return None if absent else getattr(message, name)
 
 
-def models_from_message(message: grasp_pb2.ListModelsResponse) -> list[Model]:
-    """The answer to a listing."""
-    names = [field.name for field in grasp_pb2.Model.DESCRIPTOR.fields]
-    return [Model(**{name: getattr(model, name) for name in names}) for model in message.models]
+def stream_answer(message: grasp_pb2.DetectGraspsStreamResponse) -> StreamAnswer:
+    """The answer to one request of a stream."""
+    if message.HasField("detection"):
+        return StreamAnswer(message.request_id, detection_from(message.detection, read_field))
+    error = _error(message.error.message, message.error.detail)
+    return StreamAnswer(message.request_id, error=error)
 
 
 def error_from_call(error: Any) -> GraspClientError:
@@ -154,25 +110,6 @@ def error_from_call(error: Any) -> GraspClientError:
     return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
 
 
-def stream_message(
-    request: StreamRequest, number: int, timeout: float
-) -> grasp_pb2.DetectGraspsStreamRequest:
-    """A request of a stream; raises InvalidRequestError for what no message can hold."""
-    return grasp_pb2.DetectGraspsStreamRequest(
-        request_id=request.name(number),
-        request=request_message(request.inputs, request.options),
-        timeout=timeout if request.timeout is None else request.timeout,
-    )
-
-
-def stream_answer(message: grasp_pb2.DetectGraspsStreamResponse) -> StreamAnswer:
-    """The answer to one request of a stream."""
-    if message.HasField("detection"):
-        return StreamAnswer(message.request_id, detection_from_message(message.detection))
-    error = _error(message.error.message, message.error.detail)
-    return StreamAnswer(message.request_id, error=error)
-
-
 def _error(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
     retry_after = detail.retry_after if detail.HasField("retry_after") else None
     return error_of_kind(
@@ -180,32 +117,143 @@ def _error(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
     )
 
 
-def _floats(values: Any) -> Float32:
-    return np.array(values, dtype=np.float32)
+def _set_cloud_and_options(message: Any, request: Request) -> None:
+    cloud = request.cloud
+    if cloud is None:
+        for which, image in enumerate(request.depth_images or ()):
+            fields = depth_image_fields(image, which)
+            fields["T_cloud_camera"] = np.ravel(fields["T_cloud_camera"]).tolist()
+            fill(message.depth_images.add(), fields, f"depth_images.{which}")
+    elif is_point_cloud2(cloud):
+        fill(message.point_cloud2, point_cloud2_fields(cloud), "point_cloud2")
+    elif (points := float32_points(cloud)) is not None:
+        message.points = points.astype("<f4", copy=False).tobytes()
+    else:
+        file = cloud_file(cloud)
+        message.encoded.format, message.encoded.data = file.format, file.data
+    for name, array in request.row_arrays().items():
+        setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
+    fill(message.options, request.options, "options")
 
 
-def _grasp(message: grasp_pb2.Grasp) -> Grasp:
-    return Grasp(
-        score=message.score,
-        T_cloud_hand=_floats(message.T_cloud_hand).reshape(4, 4),
-        T_cloud_tcp=_floats(message.T_cloud_tcp).reshape(4, 4),
-        width=message.width,
-        approach_point=_floats(message.approach_point),
-        contact_point=_floats(message.contact_point),
-        approach_direction=_floats(message.approach_direction),
-        collision_free=message.collision_free,
-        clearance=message.clearance,
-    )
+def fill(message: Message, value: object, path: str) -> None:
+    """Set a message to a plain value, written as the same thing is in JSON.
+
+    Raises:
+        InvalidRequestError: The message cannot hold the value. Whether the value is a good one is
+            for the server to say.
+    """
+    if (form := _FORMS.get(type(message))) is not None:
+        message, value = form(message, value, path)
+    if not isinstance(value, Mapping):
+        raise invalid(path, repr(value)[:80], f"Give a mapping with {_known(message)}.")
+    message.SetInParent()
+    for name, part in value.items():
+        field = message.DESCRIPTOR.fields_by_name.get(name)
+        here = f"{path}.{name}"
+        if field is None:
+            raise invalid(here, "an unknown field", f"Give {_known(message)} only.")
+        if field.is_repeated:
+            _extend(getattr(message, name), part, here, field.message_type is not None)
+        elif field.message_type is not None:
+            fill(getattr(message, name), part, here)
+        else:
+            _set(message, name, part, here)
 
 
-def _debug(message: grasp_pb2.DebugInfo) -> DebugInfo:
-    return DebugInfo(
-        points=_floats(message.points).reshape(-1, 3),
-        normals=_floats(message.normals).reshape(-1, 3),
-        approach_index=np.array(message.approach_index, dtype=np.int32),
-        contact_index=np.array(message.contact_index, dtype=np.int32),
-        T_cloud_hand=_floats(message.T_cloud_hand).reshape(-1, 4, 4),
-        score=_floats(message.score),
-        outcome=list(message.outcome),
-        support_plane=_floats(message.support_plane) if message.support_plane else None,
-    )
+def _set(message: Message, name: str, value: object, path: str) -> None:
+    try:
+        setattr(message, name, value)
+    except (TypeError, ValueError) as error:
+        raise invalid(path, repr(value)[:80], f"{error}.") from None
+
+
+def _extend(container: Any, values: object, path: str, messages: bool) -> None:
+    if not isinstance(values, Sequence) or isinstance(values, str):
+        raise invalid(path, repr(values)[:80], "Give a list.")
+    if messages:
+        for row, value in enumerate(values):
+            fill(container.add(), value, f"{path}.{row}")
+        return
+    try:
+        container.extend(values)
+    except (TypeError, ValueError) as error:
+        raise invalid(path, repr(values)[:80], f"{error}.") from None
+
+
+def _known(message: Message) -> str:
+    internal = ("disabled", "ransac")  # JSON writes these in another way
+    return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
+
+
+def _options(message: Message, value: Any, path: str) -> Filled:
+    """One viewpoint may be given without a list around it."""
+    viewpoint = value.get("viewpoint")
+    listed = isinstance(viewpoint, list) and bool(viewpoint) and isinstance(viewpoint[0], list)
+    if viewpoint is None or listed:
+        return message, value
+    return message, {**value, "viewpoint": [viewpoint]}
+
+
+def _coordinates(message: Message, value: Any, path: str) -> Filled:
+    names = [field.name for field in message.DESCRIPTOR.fields]
+    if not isinstance(value, Sequence) or len(value) != len(names):
+        count = {3: "three", 4: "four"}[len(names)]
+        raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
+    return message, dict(zip(names, value, strict=True))
+
+
+def _corners(message: Message, value: Any, path: str) -> Filled:
+    if not isinstance(value, Sequence) or len(value) != 2:
+        raise invalid(path, repr(value)[:80], "Give two corners: [min, max].")
+    return message, {"min": value[0], "max": value[1]}
+
+
+def _gripper(message: Any, value: Any, path: str) -> Filled:
+    return (message, {"name": value}) if isinstance(value, str) else (message.geometry, value)
+
+
+def _shape(message: Message, value: Any, path: str) -> Filled:
+    kinds = [field.name for field in message.DESCRIPTOR.fields]
+    if not isinstance(value, Mapping) or value.get("kind") not in kinds:
+        kind = repr(value.get("kind") if isinstance(value, Mapping) else value)[:80]
+        raise invalid(path, kind, f"Set its kind to one of {', '.join(kinds)}.")
+    return getattr(message, value["kind"]), _without_kind(value)
+
+
+def _support(message: Any, value: Any, path: str) -> Filled:
+    if not isinstance(value, Mapping):
+        raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
+    kind = value.get("kind", "plane")
+    if kind == "ransac":
+        return message.ransac, _without_kind(value)
+    if kind != "plane" or "ransac" in value:
+        raise invalid(path, repr(kind)[:80], "Set its kind to one of plane, ransac.")
+    return message, _without_kind(value)
+
+
+def _suppression(message: Message, value: Any, path: str) -> Filled:
+    return message, {"disabled": True} if value is None else value
+
+
+def _collision(message: Message, value: Any, path: str) -> Filled:
+    return message, {"mode": value} if isinstance(value, str) else value
+
+
+def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: part for name, part in value.items() if name != "kind"}
+
+
+# Messages that JSON does not write field by field: the message to fill, and its fields.
+_FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
+    grasp_pb2.DetectOptions: _options,
+    grasp_pb2.Vector: _coordinates,
+    grasp_pb2.Quaternion: _coordinates,
+    grasp_pb2.HandBox: _corners,
+    grasp_pb2.GripperChoice: _gripper,
+    grasp_pb2.Shape: _shape,
+    grasp_pb2.Obstacle: _shape,
+    grasp_pb2.Support: _support,
+    grasp_pb2.Suppression: _suppression,
+    grasp_pb2.Collision: _collision,
+}

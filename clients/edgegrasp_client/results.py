@@ -1,9 +1,13 @@
-"""What a server answers, as typed values."""
+"""What a server answers, as typed values, and how they are read from either transport."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from edgegrasp_client.errors import GraspClientError
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
@@ -83,3 +87,97 @@ class Model:
     default: bool  # whether a request that names no model gets these
     hand_description: bool  # whether the network also sees the hand-frame description
     device: str = ""  # where it computes: "cpu", or a GPU such as "cuda:0"
+
+
+@dataclass(frozen=True, eq=False)
+class StreamAnswer:
+    """The answer to one request of a stream: a detection or an error."""
+
+    request_id: str
+    detection: Detection | None = None
+    error: GraspClientError | None = None
+
+    def result(self) -> Detection:
+        """The detection; raises the error where there is none."""
+        if self.detection is None:
+            assert self.error is not None
+            raise self.error
+        return self.detection
+
+
+Read = Callable[[Any, str], Any]
+"""read(answer, name): the field of that name of an object in an answer; None if it is absent."""
+
+
+def detection_from(answer: Any, read: Read) -> Detection:
+    """The answer to a request for grasps."""
+    debug = read(answer, "debug")
+    return Detection(
+        grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
+        debug=None if debug is None else _debug(debug, read),
+        **_common(answer, read),
+    )
+
+
+def scoring_from(answer: Any, read: Read) -> Scoring:
+    """The answer to a request to score."""
+    return Scoring(
+        evaluations=[_evaluation(each, read) for each in read(answer, "evaluations")],
+        **_common(answer, read),
+    )
+
+
+def models_from(answer: Any, read: Read) -> list[Model]:
+    """The answer to a listing."""
+    names = [field.name for field in fields(Model)]
+    models = read(answer, "models")
+    return [Model(**{name: read(model, name) for name in names}) for model in models]
+
+
+def _common(answer: Any, read: Read) -> dict[str, Any]:
+    return {
+        "counts": dict(read(answer, "counts")),
+        "seconds": dict(read(answer, "seconds")),
+        "model": read(answer, "model"),
+        "warnings": list(read(answer, "warnings")),
+    }
+
+
+def _evaluation(answer: Any, read: Read) -> Evaluation:
+    grasp = read(answer, "grasp")
+    return Evaluation(None if grasp is None else _grasp(grasp, read), read(answer, "reason"))
+
+
+def _grasp(answer: Any, read: Read) -> Grasp:
+    def floats(name: str, *shape: int) -> Float32:
+        return np.array(read(answer, name), dtype=np.float32).reshape(shape)
+
+    return Grasp(
+        score=read(answer, "score"),
+        T_cloud_hand=floats("T_cloud_hand", 4, 4),
+        T_cloud_tcp=floats("T_cloud_tcp", 4, 4),
+        width=read(answer, "width"),
+        approach_point=floats("approach_point", 3),
+        contact_point=floats("contact_point", 3),
+        approach_direction=floats("approach_direction", 3),
+        collision_free=read(answer, "collision_free"),
+        clearance=read(answer, "clearance"),
+    )
+
+
+def _debug(answer: Any, read: Read) -> DebugInfo:
+    def array(name: str, dtype: type, *shape: int) -> NDArray[Any]:
+        return np.array(read(answer, name), dtype=dtype).reshape(shape)
+
+    return DebugInfo(
+        points=array("points", np.float32, -1, 3),
+        normals=array("normals", np.float32, -1, 3),
+        approach_index=array("approach_index", np.int32, -1),
+        contact_index=array("contact_index", np.int32, -1),
+        T_cloud_hand=array("T_cloud_hand", np.float32, -1, 4, 4),
+        score=array("score", np.float32, -1),  # null in JSON becomes NaN
+        outcome=list(read(answer, "outcome")),
+        support_plane=array("support_plane", np.float32, 4)
+        if read(answer, "support_plane")
+        else None,
+    )

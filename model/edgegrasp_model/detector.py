@@ -26,7 +26,7 @@ from edgegrasp_model.given import (
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
-from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
@@ -414,6 +414,9 @@ class ModelCatalogue:
         """Run every model once on a small made-up cloud, so that the first request is not slow.
 
         A few candidates take every path that a request takes, in a tenth of the time.
+
+        Raises:
+            InvalidCheckpoint: A network does not give the logits that it was written with.
         """
         rng = np.random.default_rng(0)
         box = rng.uniform(-1.0, 1.0, (2000, 3)) * (0.02, 0.03, 0.04)
@@ -421,6 +424,7 @@ class ModelCatalogue:
             viewpoint=(0.0, 0.0, 0.5), num_approach_points=4, num_candidates=100
         )
         for detector in self._detectors.values():
+            check_reference_logits(detector.network, detector.metadata)
             detector.detect(box, options)
 
 

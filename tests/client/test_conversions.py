@@ -1,4 +1,4 @@
-import importlib
+import sys
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_client import Grasp
 from edgegrasp_client.conversions import (
     CONTACT_GRASPNET,
-    PANDA_JOINTS,
     VGN,
     FingerJoints,
     HandFrame,
@@ -36,6 +35,7 @@ THUMB = FingerJoints(("thumb",), lambda opening: (0.8 - 9.0 * opening,))
 
 # The hand above the point (0.5, -0.1, 0), looking down, its fingers closing along the cloud's x.
 DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1.0]])
+UP = np.array([[1, 0, 0, 0.25], [0, 1, 0, -0.5], [0, 0, 1, 1.0], [0, 0, 0, 1]])  # no turn at all
 
 finite = st.floats(-2.0, 2.0)
 quaternions = st.tuples(finite, finite, finite, finite).filter(lambda q: np.linalg.norm(q) > 1e-3)
@@ -95,21 +95,17 @@ def test_the_named_axes_point_where_they_say(frame: HandFrame) -> None:
     np.testing.assert_allclose(to_frame(DOWN, frame)[:3, 3], [0.5, -0.1, 0.3 - frame.origin_z])
 
 
-def test_contact_graspnet_closes_along_its_x() -> None:
-    expected = [[1, 0, 0, 0.5], [0, -1, 0, -0.1], [0, 0, -1, 0.3], [0, 0, 0, 1]]
-    np.testing.assert_allclose(to_frame(DOWN, CONTACT_GRASPNET), expected, atol=1e-12)
-
-
-def test_graspnet_approaches_along_its_x_from_depth_behind_the_fingertips() -> None:
-    # Tips at height 0.3 - 0.1122; the origin 0.02 above them.
-    expected = [[0, 1, 0, 0.5], [0, 0, -1, -0.1], [-1, 0, 0, 0.2078], [0, 0, 0, 1]]
-    np.testing.assert_allclose(to_frame(DOWN, graspnet_frame(0.1122, 0.02)), expected, atol=1e-12)
-
-
-def test_the_tcp_of_vgn_lies_62_mm_ahead_with_the_same_axes() -> None:
-    expected = DOWN.copy()
-    expected[2, 3] = 0.238
-    np.testing.assert_allclose(to_frame(DOWN, VGN), expected, atol=1e-12)
+@pytest.mark.parametrize(
+    ("frame", "expected"),
+    [
+        (CONTACT_GRASPNET, [[1, 0, 0, 0.5], [0, -1, 0, -0.1], [0, 0, -1, 0.3]]),
+        # Tips at height 0.3 - 0.1122; the origin 0.02 above them.
+        (graspnet_frame(0.1122, 0.02), [[0, 1, 0, 0.5], [0, 0, -1, -0.1], [-1, 0, 0, 0.2078]]),
+        (VGN, [[0, 1, 0, 0.5], [1, 0, 0, -0.1], [0, 0, -1, 0.238]]),
+    ],
+)
+def test_the_frames_of_others(frame: HandFrame, expected: list[list[float]]) -> None:
+    np.testing.assert_allclose(to_frame(DOWN, frame)[:3], expected, atol=1e-12)
 
 
 def test_many_poses_are_converted_at_once() -> None:
@@ -202,41 +198,34 @@ def test_isaac_grasps_round_trip(
 
 
 def test_an_isaac_file_says_what_the_format_asks_for() -> None:
-    up = np.eye(4)  # looking up: no turn at all
-    up[:3, 3] = [0.25, -0.5, 1.0]
     text = isaac_grasps(
-        [grasp(up, 0.5, 0.06)], object_frame="/World/mug", gripper_frame="/World/panda_hand"
+        [grasp(UP, 0.5, 0.06)], object_frame="/World/mug #1", gripper_frame='"hand"'
     )
     assert text == (
         "format: isaac_grasp\n"
         "format_version: 1.0\n"
-        'object_frame_link: "/World/mug"\n'
-        'gripper_frame_link: "/World/panda_hand"\n'
+        "object_frame_link: '/World/mug #1'\n"
+        "gripper_frame_link: '\"hand\"'\n"
         "grasps:\n"
         "  grasp_0:\n"
         "    confidence: 0.5\n"
         "    position: [0.25, -0.5, 1.0]\n"
-        "    orientation: {w: 1.0, xyz: [0.0, 0.0, 0.0]}\n"
-        "    cspace_position:\n"
-        "      panda_finger_joint1: 0.0\n"
-        "      panda_finger_joint2: 0.0\n"
-        "    pregrasp_cspace_position:\n"
-        "      panda_finger_joint1: 0.03\n"
-        "      panda_finger_joint2: 0.03\n"
+        "    orientation:\n"
+        "      w: 1.0\n"
+        "      xyz: [0.0, 0.0, 0.0]\n"
+        "    cspace_position: {panda_finger_joint1: 0.0, panda_finger_joint2: 0.0}\n"
+        "    pregrasp_cspace_position: {panda_finger_joint1: 0.03, panda_finger_joint2: 0.03}\n"
     )
 
 
-@pytest.mark.parametrize("scores", [[], [1e-5], [1e-300, 0.25]])
-def test_an_isaac_file_is_yaml_to_others(scores: list[float]) -> None:
-    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
-    grasps = [grasp(DOWN, score) for score in scores]
-    text = isaac_grasps(grasps, object_frame="/World/mug #1", gripper_frame='"hand"')
-    read = yaml.safe_load(text)
-    assert read["object_frame_link"] == "/World/mug #1"
-    assert read["gripper_frame_link"] == '"hand"'
-    assert [each["confidence"] for each in read["grasps"].values()] == scores
-    for each in read["grasps"].values():
-        assert all(type(number) is float for number in each["position"])
+def test_no_grasps_are_an_isaac_file_too() -> None:
+    assert read_isaac_grasps(isaac_grasps([], object_frame="a", gripper_frame="b")) == []
+
+
+def test_isaac_files_say_which_extra_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):
+        read_isaac_grasps("format: isaac_grasp")
 
 
 def test_a_file_of_the_grasp_editor_is_read() -> None:
@@ -285,32 +274,20 @@ grasps:
     [
         (("format: isaac_grasp", "format: other"), "Give isaac_grasp, 1.0"),
         (("format_version: 1.0", "format_version: 2.0"), "Give isaac_grasp, 1.0"),
-        (("    confidence: 0.5", "    confidence 0.5"), "line 7: got '    confidence 0.5'"),
+        (("format: isaac_grasp", "- format"), "line 2"),
+        (("  grasp_0:", "- grasp_0:"), "grasps: got a list"),
+        (("    confidence: 0.5", "    confidence 0.5"), "line 8"),
         (("    confidence: 0.5\n", ""), "grasps.grasp_0: KeyError"),
         (("    confidence: 0.5", "    confidence: high"), "grasps.grasp_0: ValueError"),
-        (("[0.0, 0.0, 0.0]}", "[0.0, 0.0, 0.0}"), "line 9"),
-        (("[0.0, 0.0, 0.0]}", "[0.0, 0.0, 0.0]"), "line 9"),
         (("xyz: [0.0, 0.0, 0.0]", "xyz: [0.0, 0.0]"), "grasps.grasp_0: ValueError"),
-        (("{w: 1.0", "{w 1.0"), "line 9"),
-        (("{w: 1.0", "{w: 0.0"), "not all zero"),
+        (("xyz: [0.0, 0.0, 0.0]", "xyz: [0.0, 0.0, 0.0"), "line 12"),
+        (("w: 1.0", "w: 0.0"), "not all zero"),
         (("[0.25, -0.5, 1.0]", "[0.25, -0.5]"), "grasps.grasp_0: ValueError"),
-        (("    cspace_position:", "    - cspace_position"), "line 10"),
+        (("{panda_finger_joint1: 0.0, ", "[{"), "line 12"),
     ],
 )
 def test_what_is_no_isaac_file_is_refused(edit: tuple[str, str], message: str) -> None:
-    pose = np.eye(4)
-    pose[:3, 3] = [0.25, -0.5, 1.0]
-    text = isaac_grasps([grasp(pose, 0.5)], object_frame="a", gripper_frame="b")
-    assert len(read_isaac_grasps(text)) == 1
+    text = isaac_grasps([grasp(UP, 0.5)], object_frame="a", gripper_frame="b")
     assert edit[0] in text
-    with pytest.raises(ValueError, match=message.replace("[", r"\[")):
+    with pytest.raises(ValueError, match=message):
         read_isaac_grasps(text.replace(*edit, 1))
-
-
-def test_the_panda_has_a_joint_for_each_finger() -> None:
-    assert PANDA_JOINTS.at(0.08) == {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04}
-
-
-def test_conversions_name_everything_they_offer() -> None:
-    module = importlib.import_module("edgegrasp_client.conversions")
-    assert all(hasattr(module, name) for name in module.__all__)

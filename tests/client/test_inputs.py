@@ -113,9 +113,9 @@ def test_bad_inputs(arguments: dict[str, Any], field: str, client) -> None:
     assert caught.value.fix
 
 
-def test_edges_are_scored_in_their_order(client, cloud) -> None:
+def test_edges_are_scored_in_their_order(either_client, cloud) -> None:
     edges = np.array([[0, 1], [7, 7], [499, 3]])
-    scoring = client.score(cloud, edges=edges, seed=2, collision={"mode": "ignore"})
+    scoring = either_client.score(cloud, edges=edges, seed=2, collision={"mode": "ignore"})
     assert [evaluation.reason for evaluation in scoring.evaluations] == [None, "too-short", None]
     first, none, last = (evaluation.grasp for evaluation in scoring.evaluations)
     assert none is None

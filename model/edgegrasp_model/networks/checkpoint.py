@@ -63,8 +63,7 @@ def load_checkpoint(
 
     Raises:
         InvalidCheckpoint: The file is missing, truncated, damaged or foreign, a weight is not
-            finite, or the weights do not fit the network that its metadata describes, or do not
-            give the logits that they gave when they were written.
+            finite, or the weights do not fit the network that its metadata describes.
     """
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
@@ -86,9 +85,21 @@ def load_checkpoint(
             f"checkpoint: got {path}, whose weights do not fit its own metadata ({error}). "
             "Write it anew with `edgegrasp train` or `edgegrasp import-checkpoint`."
         ) from error
-    network = network.to(device).eval()
-    _check_logits(path, reference_logits(network), metadata.reference_logits)
-    return network, metadata
+    return network.to(device).eval(), metadata
+
+
+def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
+    """Raise InvalidCheckpoint unless a network computes what it computed when it was written.
+
+    Compared by correlation: a near tie may fall the other way on another processor.
+    """
+    found, expected = reference_logits(network), metadata.reference_logits
+    alike = not expected or np.corrcoef(found, expected)[0, 1] > MIN_CORRELATION
+    if not (np.isfinite(found).all() and alike):
+        raise InvalidCheckpoint(
+            f"checkpoint: the network of {metadata.name!r} does not give the logits it was written "
+            "with. Check this installation of PyTorch and Numba, or restore the file from a copy."
+        )
 
 
 def reference_logits(network: nn.Module) -> list[float]:
@@ -123,16 +134,6 @@ def _check_tensors(path: Path, tensors: Mapping[str, Tensor], expected: str) -> 
         raise InvalidCheckpoint(
             f"checkpoint: got {path}, whose weights are not those it was written with. Restore the "
             "file from a copy."
-        )
-
-
-def _check_logits(path: Path, found: list[float], expected: tuple[float, ...]) -> None:
-    """Compare by correlation: a near tie may fall the other way on another processor."""
-    alike = not expected or np.corrcoef(found, expected)[0, 1] > MIN_CORRELATION
-    if not (np.isfinite(found).all() and alike):
-        raise InvalidCheckpoint(
-            f"checkpoint: got {path}, whose network does not give the logits it was written with. "
-            "Check this installation of PyTorch and Numba, or restore the file from a copy."
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.option_messages import fill
+from edgegrasp_client.grpc_wire import fill
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_service.errors import report
 from edgegrasp_service.worker.answer import Answerer

@@ -1,14 +1,28 @@
-"""TLS and tokens of a connection, for both transports."""
+"""How a client knows its server, what it shows it, and when it asks again; for both clients."""
 
+import random
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
 import grpc
 
-from edgegrasp_client.errors import invalid
+from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
 
-Metadata = tuple[tuple[str, str], ...]
+DEFAULT_ADDRESS = "127.0.0.1:50051"
+
+CHANNEL_OPTIONS = (
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+    ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
+    ("grpc.max_reconnect_backoff_ms", 1000),
+    # A server that vanished without a word is found out, and streams to it end.
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+)
+
+RETRIES = 4  # of a call to a server that is away; a busy one is asked until the timeout
+FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 
 
 @dataclass(frozen=True)
@@ -29,6 +43,23 @@ class Tls:
         """Raise InvalidRequestError for a certificate without its key."""
         if (self.certificate is None) != (self.key is None):
             raise invalid("tls", "a certificate or a key alone", "Give both or neither.")
+
+
+def is_rest(address: str) -> bool:
+    """Whether an address names the REST transport."""
+    return address.startswith(("http://", "https://"))
+
+
+def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
+    """Seconds to wait after a failed attempt, counted from 0; None: it was the last.
+
+    The delays double and are drawn at random, so that clients refused together come back apart.
+    """
+    longest = min(FIRST_DELAY * 2 ** min(attempt, 10), LONGEST_DELAY)
+    jittered = random.uniform(longest / 2, longest)
+    if isinstance(error, OverloadedError):
+        return error.retry_after + jittered
+    return jittered if attempt < RETRIES else None
 
 
 def channel_credentials(tls: Tls) -> grpc.ChannelCredentials:
@@ -55,7 +86,7 @@ def ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
     return context
 
 
-def token_metadata(token: str | None) -> Metadata:
+def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
     """What carries a token, in metadata and headers; raises InvalidRequestError if none can."""
     if token is None:
         return ()

@@ -9,7 +9,7 @@ from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from edgegrasp.v1 import grasp_pb2
 
-DOCUMENT = json.loads((Path(__file__).parents[2] / "proto" / "openapi.json").read_text())
+DOCUMENT = json.loads((Path(__file__).parents[3] / "proto" / "openapi.json").read_text())
 
 # Messages that JSON writes as lists or as one number, a string or an object without a field around.
 AS_LISTS = {"Vector", "Quaternion", "HandBox", "Edge", "HandPose"}

@@ -1,0 +1,188 @@
+"""Clouds as a caller has them, and as the wire takes them."""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol, TypedDict, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_client.errors import invalid
+
+FILE_FORMATS = ("npy", "npz", "ply", "pcd", "xyz")
+DEPTH_ENCODINGS = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}
+
+
+class PointField(Protocol):
+    """The attributes of sensor_msgs/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+class PointCloud2(Protocol):
+    """The attributes of sensor_msgs/PointCloud2, metres; ROS itself is not needed."""
+
+    height: int
+    width: int
+    fields: Sequence[PointField]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: Any  # bytes, or a sequence of their values
+
+
+class Intrinsics(TypedDict):
+    """A pinhole camera without distortion, pixels. The centre of the top left pixel is (0, 0)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class DepthImage(TypedDict):
+    """What a camera saw. Camera frame: x right, y down, z forward."""
+
+    depth: NDArray[Any]  # (H, W) metres as float32 or float64, millimetres as uint16; 0, NaN: none
+    intrinsics: Intrinsics
+    T_cloud_camera: NDArray[Any] | Sequence[Sequence[float]]  # (4, 4) camera to cloud, metres
+
+
+Cloud = NDArray[Any] | str | PathLike[str] | PointCloud2
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """A point cloud file."""
+
+    format: str  # one of FILE_FORMATS
+    data: bytes
+
+
+def float32_points(cloud: Cloud) -> NDArray[np.float32] | None:
+    """The cloud as (N, 3) float32 if it is an array of N points; None if it is not."""
+    if not isinstance(cloud, np.ndarray) or cloud.dtype not in (np.float32, np.float64):
+        return None
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        return None
+    with np.errstate(over="ignore"):  # the server refuses infinity
+        return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
+def cloud_file(cloud: Cloud) -> CloudFile:
+    """The cloud as a file; an array of a wrong shape is sent as it is, for the server to refuse.
+
+    Raises:
+        InvalidRequestError: It is neither an array of numbers nor a readable file of a known
+            format.
+    """
+    if isinstance(cloud, np.ndarray):
+        points = float32_points(cloud)
+        try:
+            return CloudFile("npy", npy_bytes(cloud if points is None else points))
+        except ValueError:
+            fix = "Send float32 or float64 metres."
+            raise invalid("cloud", f"dtype {cloud.dtype}", fix) from None
+    if not isinstance(cloud, str | PathLike):
+        fix = "Give an (N, 3) array in metres, a file's path, or a PointCloud2."
+        raise invalid("cloud", f"a {type(cloud).__name__}", fix)
+    path = Path(cloud)
+    file_format = path.suffix[1:].lower()
+    if file_format not in FILE_FORMATS:
+        raise invalid("cloud", repr(path.name), f"Give one of: {', '.join(FILE_FORMATS)}.")
+    try:
+        return CloudFile(file_format, path.read_bytes())
+    except OSError as error:
+        raise invalid("cloud", f"{path} ({error.strerror})", "Give a readable file.") from None
+
+
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array as an .npy file; raises ValueError for one of objects."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def is_point_cloud2(cloud: object) -> TypeGuard[PointCloud2]:
+    """Whether an object has the attributes of sensor_msgs/PointCloud2."""
+    return all(hasattr(cloud, name) for name in PointCloud2.__annotations__)
+
+
+def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
+    """The fields of edgegrasp.v1.PointCloud2; `data` as bytes.
+
+    Args:
+        cloud: Any object with those attributes, such as a message of rclpy.
+    """
+    data = cloud.data
+    if not isinstance(data, bytes):
+        data = np.asarray(data, dtype=np.uint8).tobytes()
+    return {
+        "height": int(cloud.height),
+        "width": int(cloud.width),
+        "fields": [
+            {
+                "name": str(field.name),
+                "offset": int(field.offset),
+                "datatype": int(field.datatype),
+                "count": int(field.count),
+            }
+            for field in cloud.fields
+        ],
+        "is_bigendian": bool(cloud.is_bigendian),
+        "point_step": int(cloud.point_step),
+        "row_step": int(cloud.row_step),
+        "data": data,
+    }
+
+
+def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
+    """The fields of edgegrasp.v1.DepthImage; `data` as bytes, the pose as a (4, 4) list.
+
+    Args:
+        image: The image.
+        number: Which of the images it is, for errors.
+
+    Raises:
+        InvalidRequestError: A field is missing, unknown, or of a wrong type or shape.
+    """
+    path = f"depth_images.{number}"
+    names = DepthImage.__required_keys__
+    if not isinstance(image, Mapping) or set(image) != names:
+        found = ", ".join(map(str, image)) if isinstance(image, Mapping) else type(image).__name__
+        raise invalid(path, found[:80], f"Give a mapping with {', '.join(sorted(names))}.")
+    intrinsics = image["intrinsics"]
+    cameras = Intrinsics.__annotations__
+    if not isinstance(intrinsics, Mapping) or set(intrinsics) != set(cameras):
+        value = repr(intrinsics)[:80]
+        raise invalid(f"{path}.intrinsics", value, f"Give a mapping with {', '.join(cameras)}.")
+    pose = np.asarray(image["T_cloud_camera"])
+    if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
+        value = f"shape {pose.shape}, dtype {pose.dtype}"
+        raise invalid(f"{path}.T_cloud_camera", value, "Give a 4 x 4 matrix.")
+    return {
+        "depth": _depth_fields(image["depth"], f"{path}.depth"),
+        "intrinsics": {name: float(intrinsics[name]) for name in cameras},  # type: ignore[literal-required]
+        "T_cloud_camera": pose.astype(np.float64).tolist(),
+    }
+
+
+def _depth_fields(depth: object, path: str) -> dict[str, Any]:
+    fix = f"Give an (H, W) array of {', '.join(DEPTH_ENCODINGS)}."
+    if not isinstance(depth, np.ndarray):
+        raise invalid(path, f"a {type(depth).__name__}", fix)
+    if depth.ndim != 2 or depth.dtype.name not in DEPTH_ENCODINGS:
+        raise invalid(path, f"shape {depth.shape}, dtype {depth.dtype}", fix)
+    little_endian = depth.dtype.newbyteorder("<")
+    return {
+        "height": depth.shape[0],
+        "width": depth.shape[1],
+        "encoding": DEPTH_ENCODINGS[depth.dtype.name],
+        "data": np.ascontiguousarray(depth, dtype=little_endian).tobytes(),
+    }

@@ -1,0 +1,411 @@
+"""Grasps in the conventions of other programs; nothing of theirs is imported.
+
+- Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
+- `moveit_msgs/Grasp`, as a dictionary of its fields.
+- `isaac_grasp` YAML, the file format of Isaac Sim's Grasp Editor, version 1.0; needs the extra
+  `yaml`.
+
+Pictures of the frames stand in docs/frames.md.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgegrasp_client.results import Grasp
+
+__all__ = [
+    "CONTACT_GRASPNET",
+    "PANDA_JOINTS",
+    "VGN",
+    "FingerJoints",
+    "HandFrame",
+    "IsaacGrasp",
+    "from_frame",
+    "graspnet_frame",
+    "isaac_grasps",
+    "matrix_from_quaternion",
+    "moveit_grasp",
+    "pose_from_moveit_grasp",
+    "quaternion_from_matrix",
+    "read_isaac_grasps",
+    "to_frame",
+]
+
+Float64 = NDArray[np.float64]
+Message = dict[str, Any]
+
+_AXES = {
+    sign + axis: direction * np.eye(3)[row]
+    for sign, direction in (("", 1.0), ("-", -1.0))
+    for row, axis in enumerate("xyz")
+}
+
+
+@dataclass(frozen=True)
+class HandFrame:
+    """A frame fixed to the hand: which of its axes point where, and where its origin lies.
+
+    Turning a parallel-jaw hand by 180 degrees about the approach gives the same grasp, so that
+    `closing="x"` and `closing="-x"` are equally right.
+    """
+
+    approach: str  # its axis along which the hand moves to the object: x, -x, y, -y, z or -z
+    closing: str  # its axis along our y, the closing direction
+    origin_z: float = 0.0  # metres from the origin of our hand frame to its own, along our z
+
+    def __post_init__(self) -> None:
+        for axis in (self.approach, self.closing):
+            if axis not in _AXES:
+                raise ValueError(f"got {axis!r}. Use one of: {', '.join(_AXES)}.")
+        if self.approach[-1] == self.closing[-1]:
+            raise ValueError(f"approach and closing are both along {self.approach[-1]}.")
+
+    @property
+    def T_hand_frame(self) -> Float64:  # noqa: N802
+        """Maps its coordinates to those of our hand frame.  # (4, 4)."""
+        approach, closing = _AXES[self.approach], _AXES[self.closing]
+        transform = np.eye(4)
+        # Rows: our x, y and z axes in its coordinates.
+        transform[:3, :3] = [np.cross(closing, approach), closing, approach]
+        transform[2, 3] = self.origin_z
+        return transform
+
+
+CONTACT_GRASPNET = HandFrame(approach="z", closing="x")
+"""Contact-GraspNet, 6-DOF GraspNet, ACRONYM: origin of `panda_hand`, x the closing direction."""
+
+VGN = HandFrame(approach="z", closing="y", origin_z=0.062)
+"""VGN's TCP with the Panda hand: 0.022 m ahead of the centre of mass, which lies at z = 0.04."""
+
+
+def graspnet_frame(tip_z: float, depth: float = 0.02) -> HandFrame:
+    """GraspNet-1Billion (graspnetAPI): x the approach, y the closing direction.
+
+    Args:
+        tip_z: Fingertips of the gripper, metres along our z (0.1122 for the Panda hand).
+        depth: The grasp's `depth` there: metres from its origin to the fingertips.
+    """
+    return HandFrame(approach="x", closing="y", origin_z=tip_z - depth)
+
+
+def to_frame(T_cloud_hand: ArrayLike, frame: HandFrame) -> Float64:
+    """Poses of another frame on the hand.
+
+    Args:
+        T_cloud_hand: (..., 4, 4) poses of our hand frame.
+        frame: The other frame.
+
+    Returns:
+        (..., 4, 4) T_cloud_frame.
+    """
+    return np.asarray(T_cloud_hand, dtype=np.float64) @ frame.T_hand_frame
+
+
+def from_frame(T_cloud_frame: ArrayLike, frame: HandFrame) -> Float64:
+    """Poses of our hand frame, from those of another frame on the hand.
+
+    Args:
+        T_cloud_frame: (..., 4, 4) poses of the other frame.
+        frame: The other frame.
+
+    Returns:
+        (..., 4, 4) T_cloud_hand.
+    """
+    T_frame_hand = np.linalg.inv(frame.T_hand_frame)
+    return np.asarray(T_cloud_frame, dtype=np.float64) @ T_frame_hand
+
+
+@dataclass(frozen=True)
+class FingerJoints:
+    """The joints that open and close a gripper."""
+
+    names: tuple[str, ...]
+    positions_at: Callable[[float], tuple[float, ...]]  # opening in metres to joint positions
+
+    def at(self, opening: float) -> dict[str, float]:
+        """Position of each joint at an opening in metres."""
+        return dict(zip(self.names, self.positions_at(opening), strict=True))
+
+
+PANDA_JOINTS = FingerJoints(
+    names=("panda_finger_joint1", "panda_finger_joint2"),
+    positions_at=lambda opening: (opening / 2, opening / 2),
+)
+"""The Panda's two finger joints: metres from the middle, each half the opening."""
+
+
+def moveit_grasp(
+    grasp: Grasp,
+    frame_id: str,
+    *,
+    name: str = "",
+    joints: FingerJoints = PANDA_JOINTS,
+    T_hand_link: ArrayLike | None = None,
+    approach_distance: float = 0.05,
+    retreat_distance: float = 0.1,
+    retreat_direction: Sequence[float] | None = None,
+) -> Message:
+    """A grasp as the fields of `moveit_msgs/Grasp` (ROS 2).
+
+    Build the message with `rosidl_runtime_py.set_message_fields(Grasp(), fields)`.
+
+    Args:
+        grasp: What the server answered.
+        frame_id: Name of the cloud's frame.
+        name: The message's `id`.
+        joints: The gripper's joints.
+        T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
+            MoveIt wants; None: it is the hand frame.
+        approach_distance: Metres of straight way in.
+        retreat_distance: Metres of straight way out.
+        retreat_direction: (3,) way out, cloud frame; None: back along the approach.
+
+    Returns:
+        The message's fields; orientations are the four fields x, y, z, w.
+    """
+    approach = np.asarray(grasp.approach_direction, dtype=np.float64)
+    retreat = -approach if retreat_direction is None else np.asarray(retreat_direction, np.float64)
+    T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
+    return {
+        "id": name,
+        "pre_grasp_posture": _posture(joints, grasp.width, frame_id),
+        "grasp_posture": _posture(joints, 0.0, frame_id),
+        "grasp_pose": {"header": _header(frame_id), "pose": _pose(T_cloud_link)},
+        "grasp_quality": float(grasp.score),
+        "pre_grasp_approach": _translation(approach, approach_distance, frame_id),
+        "post_grasp_retreat": _translation(retreat, retreat_distance, frame_id),
+        "post_place_retreat": _translation(-approach, retreat_distance, frame_id),
+        "max_contact_force": 0.0,
+        "allowed_touch_objects": [],
+    }
+
+
+def pose_from_moveit_grasp(
+    message: Mapping[str, Any], T_hand_link: ArrayLike | None = None
+) -> Float64:
+    """T_cloud_hand of a `moveit_msgs/Grasp` given as a dictionary of its fields.
+
+    Args:
+        message: The fields; only `grasp_pose` is read.
+        T_hand_link: (4, 4) as for `moveit_grasp`.
+
+    Returns:
+        (4, 4).
+    """
+    pose = message["grasp_pose"]["pose"]
+    rotation = matrix_from_quaternion([pose["orientation"][axis] for axis in "xyzw"])
+    T_cloud_link = _transform(rotation, [pose["position"][axis] for axis in "xyz"])
+    T_cloud_hand: Float64 = T_cloud_link @ np.linalg.inv(_matrix(T_hand_link))
+    return T_cloud_hand
+
+
+@dataclass(frozen=True, eq=False)
+class IsaacGrasp:
+    """One grasp of an `isaac_grasp` file."""
+
+    name: str
+    confidence: float
+    T_object_gripper: Float64  # (4, 4) pose of the gripper's frame in the object's
+    cspace_position: dict[str, float] = field(default_factory=dict)  # joints, closed
+    pregrasp_cspace_position: dict[str, float] = field(default_factory=dict)  # joints, open
+
+
+def isaac_grasps(
+    grasps: Sequence[Grasp],
+    *,
+    object_frame: str,
+    gripper_frame: str,
+    T_object_cloud: ArrayLike | None = None,
+    T_hand_gripper: ArrayLike | None = None,
+    joints: FingerJoints = PANDA_JOINTS,
+) -> str:
+    """Grasps as the text of an `isaac_grasp` file.
+
+    Args:
+        grasps: What the server answered, best first.
+        object_frame: Name of the object's frame, such as `/World/mug`.
+        gripper_frame: Name of the gripper's frame, such as `/World/panda_hand`.
+        T_object_cloud: (4, 4) pose of the cloud's frame in the object's; None: they are the same.
+        T_hand_gripper: (4, 4) pose of the gripper's frame in our hand frame; None: the same.
+        joints: The gripper's joints.
+
+    Returns:
+        YAML; orientations are w and xyz.
+
+    Raises:
+        ModuleNotFoundError: The extra `yaml` is not installed.
+    """
+    T_object_cloud = _matrix(T_object_cloud)
+    T_hand_gripper = _matrix(T_hand_gripper)
+    file = {
+        "format": "isaac_grasp",
+        "format_version": 1.0,
+        "object_frame_link": object_frame,
+        "gripper_frame_link": gripper_frame,
+        "grasps": {
+            f"grasp_{number}": _isaac_fields(
+                grasp, T_object_cloud @ _matrix(grasp.T_cloud_hand) @ T_hand_gripper, joints
+            )
+            for number, grasp in enumerate(grasps)
+        },
+    }
+    return str(_yaml().safe_dump(file, sort_keys=False, default_flow_style=None, width=200))
+
+
+def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
+    """The grasps of an `isaac_grasp` file.
+
+    Raises:
+        ModuleNotFoundError: The extra `yaml` is not installed.
+        ValueError: It is not such a file; says which line or field.
+    """
+    yaml = _yaml()
+    try:
+        file = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"isaac_grasp file: {error}") from None
+    fields = file if isinstance(file, dict) else {}
+    kind = (fields.get("format"), fields.get("format_version"))
+    if kind != ("isaac_grasp", 1.0):
+        raise ValueError(f"format, format_version: got {kind}. Give isaac_grasp, 1.0.")
+    grasps = fields.get("grasps") or {}
+    if not isinstance(grasps, dict):
+        raise ValueError(f"grasps: got a {type(grasps).__name__}. Give a mapping of names.")
+    return [_isaac_grasp(name, grasp) for name, grasp in grasps.items()]
+
+
+def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
+    """The unit quaternion of a rotation, its w not negative.
+
+    Args:
+        rotation: (3, 3) orthonormal up to rounding.
+
+    Returns:
+        (4,) x, y, z, w.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    multiples = np.empty((4, 4))  # of the quaternion, by 4x, 4y, 4z and 4w
+    multiples[:3, :3] = r + r.T + (1.0 - np.trace(r)) * np.eye(3)
+    multiples[:3, 3] = multiples[3, :3] = x, y, z
+    multiples[3, 3] = 1.0 + np.trace(r)
+    longest = multiples[np.argmax(np.diag(multiples))]  # the most precise
+    quaternion: Float64 = longest / np.linalg.norm(longest)
+    return -quaternion if quaternion[3] < 0 else quaternion
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
+    """The rotation of a quaternion.
+
+    Args:
+        quaternion: (4,) x, y, z, w; of any length but zero.
+
+    Returns:
+        (3, 3).
+
+    Raises:
+        ValueError: Its length is zero or not finite.
+    """
+    q = np.asarray(quaternion, dtype=np.float64)
+    length = np.linalg.norm(q)
+    if not np.isfinite(length) or length < 1e-12:
+        raise ValueError(f"quaternion: got {q.tolist()}. Give x, y, z, w that are not all zero.")
+    x, y, z, w = q / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _transform(rotation: Float64, position: ArrayLike) -> Float64:
+    """The (4, 4) transform of a rotation and a position."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, position
+    return result
+
+
+def _matrix(pose: ArrayLike | None) -> Float64:
+    """A (4, 4) pose in double precision; None: the identity."""
+    return np.eye(4) if pose is None else np.asarray(pose, dtype=np.float64)
+
+
+def _header(frame_id: str) -> Message:
+    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
+
+
+def _pose(T: Float64) -> Message:
+    return {
+        "position": _xyz(T[:3, 3]),
+        "orientation": dict(zip("xyzw", quaternion_from_matrix(T[:3, :3]).tolist(), strict=True)),
+    }
+
+
+def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
+    point = {
+        "positions": list(joints.at(opening).values()),
+        "velocities": [],
+        "accelerations": [],
+        "effort": [],
+        "time_from_start": {"sec": 0, "nanosec": 0},
+    }
+    return {"header": _header(frame_id), "joint_names": list(joints.names), "points": [point]}
+
+
+def _translation(direction: Float64, distance: float, frame_id: str) -> Message:
+    unit = direction / np.linalg.norm(direction)
+    return {
+        "direction": {"header": _header(frame_id), "vector": _xyz(unit)},
+        "desired_distance": float(distance),
+        "min_distance": float(distance),
+    }
+
+
+def _xyz(vector: Float64) -> Message:
+    return dict(zip("xyz", vector.tolist(), strict=True))
+
+
+def _isaac_fields(grasp: Grasp, T_object_gripper: Float64, joints: FingerJoints) -> Message:
+    x, y, z, w = quaternion_from_matrix(T_object_gripper[:3, :3]).tolist()
+    return {
+        "confidence": float(grasp.score),
+        "position": T_object_gripper[:3, 3].tolist(),
+        "orientation": {"w": w, "xyz": [x, y, z]},
+        "cspace_position": _joint_positions(joints.at(0.0)),
+        "pregrasp_cspace_position": _joint_positions(joints.at(grasp.width)),
+    }
+
+
+def _isaac_grasp(name: str, fields: Any) -> IsaacGrasp:
+    try:  # 1e-05, without a point, is text to YAML: numbers are converted here
+        x, y, z = fields["orientation"]["xyz"]
+        rotation = matrix_from_quaternion([x, y, z, fields["orientation"]["w"]])
+        return IsaacGrasp(
+            name=str(name),
+            confidence=float(fields["confidence"]),
+            T_object_gripper=_transform(rotation, fields["position"]),
+            cspace_position=_joint_positions(fields.get("cspace_position")),
+            pregrasp_cspace_position=_joint_positions(fields.get("pregrasp_cspace_position")),
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"grasps.{name}: {error!r}") from error
+
+
+def _joint_positions(positions: Any) -> dict[str, float]:
+    return {str(name): float(position) for name, position in (positions or {}).items()}
+
+
+def _yaml() -> ModuleType:
+    try:
+        import yaml
+    except ModuleNotFoundError:
+        message = "isaac_grasp files need PyYAML: pip install 'edgegrasp[yaml]'"
+        raise ModuleNotFoundError(message, name="yaml") from None
+    return yaml

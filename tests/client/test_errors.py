@@ -1,0 +1,269 @@
+"""What goes wrong is the same exception over either transport, or is tried again."""
+
+import itertools
+import socket
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+
+import edgegrasp_client
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import (
+    AccessDeniedError,
+    DeadlineError,
+    GraspClientError,
+    InvalidRequestError,
+    OverloadedError,
+    PayloadTooLargeError,
+    ProtocolError,
+    ServerFailedError,
+    ServerUnavailableError,
+    StreamRequest,
+    UnknownModelError,
+    connection,
+    errors,
+)
+
+
+class Problem(NamedTuple):
+    """An error as a server describes it; one without a kind is not described."""
+
+    kind: str
+    code: grpc.StatusCode
+    status: int
+    retry_after: float | None = None
+
+
+class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
+    """Answers with one problem after the other, then with detections without grasps."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.calls = 0
+        self._problems = iter(problems)
+
+    def _problem(self) -> Problem | None:
+        self.calls += 1
+        return next(self._problems, None)
+
+    def DetectGrasps(self, request: Any, context: Any) -> Any:  # noqa: N802
+        if (problem := self._problem()) is not None:
+            detail = grasp_pb2.ErrorDetail(kind=problem.kind, field="f", value="v", fix="x")
+            if problem.retry_after is not None:
+                detail.retry_after = problem.retry_after
+            described = detail.SerializeToString() if problem.kind else b"\xff\xff"
+            context.set_trailing_metadata((("edgegrasp-error-bin", described),))
+            context.abort(problem.code, "what happened")
+        return grasp_pb2.DetectGraspsResponse(model="fake")
+
+    def DetectGraspsStream(self, requests: Any, context: Any) -> Iterator[Any]:  # noqa: N802
+        for request in requests:
+            detection = self.DetectGrasps(request.request, context)
+            yield grasp_pb2.DetectGraspsStreamResponse(detection=detection)
+
+    def respond(self, request: httpx.Request) -> httpx.Response:
+        if (problem := self._problem()) is None:
+            body = {"grasps": [], "counts": {}, "seconds": {}, "model": "fake"}
+            return httpx.Response(200, json=body | {"warnings": [], "debug": None})
+        if not problem.kind:
+            return httpx.Response(problem.status, text="<html>")
+        told = {"detail": "what happened", "field": "f", "value": "v", "fix": "x"}
+        told |= {"type": f"urn:edgegrasp:error:{problem.kind}"}
+        return httpx.Response(problem.status, json=told | {"retry_after": problem.retry_after})
+
+
+@pytest.fixture
+def failing(transport: str, make_client: Any) -> Iterator[Any]:
+    """Makes a server with problems, and a client of it."""
+    started = []
+
+    def make(problems: Iterable[Problem], **arguments: Any) -> tuple[Any, FailingServer]:
+        failing = FailingServer(problems)
+        if transport == "rest":
+            arguments["http_transport"] = httpx.MockTransport(failing.respond)
+            return make_client("http://failing", **arguments), failing
+        started.append(grpc.server(ThreadPoolExecutor(2)))
+        grasp_pb2_grpc.add_GraspServiceServicer_to_server(failing, started[-1])
+        port = started[-1].add_insecure_port("127.0.0.1:0")
+        started[-1].start()
+        return make_client(f"127.0.0.1:{port}", **arguments), failing
+
+    yield make
+    for server in started:
+        server.stop(0).wait()
+
+
+Code = grpc.StatusCode
+BUSY = Problem("overloaded", Code.RESOURCE_EXHAUSTED, 429, retry_after=0.01)
+AWAY = Problem("not-ready", Code.UNAVAILABLE, 503)
+LOST = Problem("worker-lost", Code.UNAVAILABLE, 503)
+INVALID = Problem("invalid-request", Code.INVALID_ARGUMENT, 400)
+
+DESCRIBED = [
+    (INVALID, InvalidRequestError),
+    (Problem("unsupported-media-type", Code.INVALID_ARGUMENT, 415), InvalidRequestError),
+    (Problem("headers-too-large", Code.RESOURCE_EXHAUSTED, 431), InvalidRequestError),
+    (Problem("unknown-model", Code.NOT_FOUND, 404), UnknownModelError),
+    (Problem("payload-too-large", Code.RESOURCE_EXHAUSTED, 413), PayloadTooLargeError),
+    (Problem("unauthenticated", Code.UNAUTHENTICATED, 401), AccessDeniedError),
+    (Problem("permission-denied", Code.PERMISSION_DENIED, 403), AccessDeniedError),
+    (Problem("decoder-missing", Code.UNIMPLEMENTED, 501), ServerFailedError),
+    (Problem("detector-failed", Code.INTERNAL, 500), ServerFailedError),
+    (AWAY, ServerUnavailableError),
+    (BUSY, OverloadedError),
+    (LOST, ServerUnavailableError),
+    (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), DeadlineError),
+    (Problem("teapot", Code.UNKNOWN, 418), ProtocolError),
+]
+
+
+@pytest.mark.parametrize(("problem", "expected"), DESCRIBED, ids=lambda value: str(value)[:40])
+def test_errors_that_the_server_describes(
+    problem: Problem, expected: type[GraspClientError], failing, cloud
+) -> None:
+    client, server = failing([problem], retry=False)
+    with pytest.raises(expected, match="what happened") as caught:
+        client.detect(cloud)
+    assert type(caught.value) is expected
+    assert server.calls == 1
+    if isinstance(caught.value, InvalidRequestError):
+        assert vars(caught.value) == {"field": "f", "value": "v", "fix": "x"}
+    if isinstance(caught.value, OverloadedError):
+        assert caught.value.retry_after == BUSY.retry_after
+
+
+NOT_DESCRIBED = {
+    "grpc": [
+        (Code.UNIMPLEMENTED, ProtocolError),
+        (Code.RESOURCE_EXHAUSTED, PayloadTooLargeError),
+        (Code.UNAVAILABLE, ServerUnavailableError),
+        (Code.DEADLINE_EXCEEDED, DeadlineError),
+        (Code.INTERNAL, ServerFailedError),
+    ],
+    "rest": [
+        (200, ProtocolError),
+        (404, ProtocolError),
+        (413, PayloadTooLargeError),
+        (429, OverloadedError),
+        (502, ServerUnavailableError),
+    ],
+}
+
+
+@pytest.mark.parametrize("row", range(5))
+def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, cloud) -> None:
+    code, expected = NOT_DESCRIBED[transport][row]
+    client, _ = failing(itertools.repeat(Problem("", code, code)), retry=False)
+    with pytest.raises(GraspClientError) as caught:
+        client.detect(cloud)
+    assert type(caught.value) is expected
+    assert not client.ready() or code == 200
+
+
+@pytest.mark.parametrize("body", [[], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}])
+def test_json_of_another_server(body: Any, make_client, cloud) -> None:
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, json=body))
+    client = make_client("http://elsewhere", http_transport=transport)
+    with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
+        client.detect(cloud)
+
+
+def test_a_proxy_says_when_to_come_again(make_client, cloud) -> None:
+    busy = httpx.Response(503, headers={"retry-after": "7"})
+    transport = httpx.MockTransport(lambda request: busy)
+    client = make_client("http://proxy", http_transport=transport, timeout=5)
+    with pytest.raises(OverloadedError) as caught:
+        client.detect(cloud)
+    assert caught.value.retry_after == 7
+
+
+@pytest.fixture
+def hasty_retries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "FIRST_DELAY", 0.001)
+
+
+@pytest.mark.usefixtures("hasty_retries")
+@pytest.mark.parametrize("problems", [[AWAY, BUSY, LOST], [BUSY] * 8], ids=["mixed", "busy"])
+def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cloud) -> None:
+    client, server = failing(problems)
+    assert client.detect(cloud).model == "fake"
+    assert server.calls == len(problems) + 1
+
+
+@pytest.mark.usefixtures("hasty_retries")
+@pytest.mark.parametrize(
+    ("problem", "arguments", "calls"),
+    [
+        (AWAY, {}, connection.RETRIES + 1),
+        (AWAY, {"retry": False}, 1),
+        (BUSY, {"retry": False}, 1),
+        (BUSY._replace(retry_after=1000.0), {"timeout": 30}, 1),
+        (INVALID, {}, 1),
+        (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), {}, 1),
+        (Problem("detector-failed", Code.INTERNAL, 500), {}, 1),
+    ],
+)
+def test_attempts_end(problem: Problem, arguments: Any, calls: int, failing, cloud) -> None:
+    client, server = failing(itertools.repeat(problem), **arguments)
+    with pytest.raises(dict(DESCRIBED).get(problem, GraspClientError)):
+        client.detect(cloud)
+    assert server.calls == calls
+
+
+def test_requests_of_a_stream_are_sent_once(failing, cloud) -> None:
+    client, server = failing([AWAY])
+    with pytest.raises(ServerUnavailableError):
+        [answer.result() for answer in client.detect_stream([StreamRequest(cloud)])]
+    assert server.calls == 1
+
+
+@pytest.fixture
+def closed_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as closing:
+        return int(closing.getsockname()[1])
+
+
+@pytest.mark.usefixtures("hasty_retries")
+@pytest.mark.parametrize("scheme", ["", "http://"])
+def test_no_server(scheme: str, closed_port: int, make_client, cloud) -> None:
+    client = make_client(f"{scheme}127.0.0.1:{closed_port}")
+    for call in (client.models, lambda: client.detect(cloud)):
+        with pytest.raises(ServerUnavailableError):
+            call()
+    assert not client.ready()
+    with pytest.raises(DeadlineError, match=r"not ready within 0\.2 s"):
+        client.wait_until_ready(0.2)
+
+
+@pytest.fixture(scope="module")
+def slow_server(start_server):
+    with start_server("--backend", "dummy", "--dummy-seconds", "0.5") as server:
+        yield server
+
+
+def test_deadline(transport: str, slow_server, make_client, cloud) -> None:
+    client = make_client(slow_server.address(transport), timeout=0.1)
+    with pytest.raises(DeadlineError):
+        client.detect(cloud)
+    assert client.detect(cloud, timeout=20).grasps
+    requests = [StreamRequest(cloud, timeout=0.1), StreamRequest(cloud)]
+    hasty, patient = client.detect_stream(requests, timeout=20.0)
+    assert isinstance(hasty.error, DeadlineError)
+    assert patient.error is None
+
+
+@pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
+def test_too_large(size: int, either_client) -> None:
+    with pytest.raises(PayloadTooLargeError):
+        either_client.detect(np.zeros((size, 3), np.float32))
+    assert either_client.ready()
+
+
+def test_every_exception_is_exported() -> None:
+    for name, kind in vars(errors).items():
+        if isinstance(kind, type) and issubclass(kind, GraspClientError):
+            assert getattr(edgegrasp_client, name) is kind
