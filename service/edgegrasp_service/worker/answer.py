@@ -18,6 +18,7 @@ from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
+from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
 from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
@@ -214,7 +215,7 @@ class _Work:
 
 def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
-    names = [name for name in ("edges", "hand_poses") if fields.get(name) is not None]
+    names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
         raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
     if len(names) == 2:

@@ -138,7 +138,7 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
             contents = {
                 name: _unzipped(archive, info, max_points) for name, info in members.items()
             }
-    except (InvalidRequest, PayloadTooLarge):
+    except (InvalidRequest, PayloadTooLarge, MemoryError):
         raise
     except Exception:  # zipfile, too, fails in a dozen ways
         value = f"{len(data)} bytes that are no whole .npz file"
