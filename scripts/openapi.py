@@ -3,23 +3,25 @@
 usage: scripts/openapi.py [FOLDER]    writes openapi.json there, or into proto/
 """
 
+import asyncio
 import json
 import sys
 from pathlib import Path
 
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.dummy import DummyCatalogue
-from edgegrasp_service.http_app import create_app
+from edgegrasp_service.front.http import create_app
+from edgegrasp_service.server import Server
+from edgegrasp_service.settings import Settings
 
 NAME = "openapi.json"
 
 
-def document() -> str:
+async def document() -> str:
     """The document; no limit of a server is in it."""
-    app = create_app(GraspService(DummyCatalogue))
+    server = Server(Settings(backend="dummy"))
+    app = create_app(server.service, server.metrics, server.reloader)
     return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
 
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "proto"
-    (folder / NAME).write_text(document())
+    (folder / NAME).write_text(asyncio.run(document()))

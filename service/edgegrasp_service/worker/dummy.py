@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.errors import UnknownModel
-from edgegrasp_model.given import check_edges, check_hand_poses
+from edgegrasp_model.errors import InvalidRequest, UnknownModel
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,
@@ -102,20 +101,24 @@ class DummyDetector:
         """Make up scores; an edge from a point to itself defines no grasp.
 
         Raises:
-            InvalidRequest: The cloud is none, an edge names a row that it does not have, or a pose
-                is none.
+            InvalidRequest: The cloud is none, or an edge names a row that it does not have.
         """
         start = time.perf_counter()
         checked = check_cloud(cloud)
         random = np.random.default_rng(options.seed)
-        if edges is not None:
+        if edges is not None:  # the model's own checks would import torch
+            outside = ((edges < 0) | (edges >= checked.rows_sent)).any(axis=1)
+            if outside.any():
+                fix = f"Send rows of the cloud, 0 to {checked.rows_sent - 1}."
+                bad = edges[int(np.argmax(outside))].tolist()
+                raise InvalidRequest("edges", str(bad), fix)
             contacts: list[Float32 | None] = [
                 None if approach == contact else _row(checked.points, checked.row, contact)
-                for approach, contact in check_edges(edges, checked.rows_sent)
+                for approach, contact in edges
             ]
         else:
-            poses = check_hand_poses(hand_poses)
-            contacts = list((poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
+            assert hand_poses is not None
+            contacts = list((hand_poses @ (0.0, 0.0, TCP_Z, 1.0))[:, :3].astype(np.float32))
         scores = random.random(len(contacts), dtype=np.float32)
         evaluations = [
             Evaluation(None, NoGrasp.TOO_SHORT)
