@@ -30,7 +30,7 @@ def serve(config: Path | None, print_config: bool, **flags: Any) -> None:
     try:
         settings, origins = load_settings_and_origins(config, **given)
         if print_config:
-            from edgegrasp_service.settings_text import config_text
+            from edgegrasp_service.settings import config_text
 
             print(config_text(settings, origins), end="")
             return

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.errors import UnknownModel
-from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,
@@ -21,7 +20,12 @@ from edgegrasp_model.results import (
     Outcome,
     Scoring,
 )
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.cloud import (
+    CloudInput,
+    check_cloud,
+    check_edges,
+    check_hand_poses,
+)
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
