@@ -32,33 +32,10 @@ MODEL_FACTS = (
 )  # fmt: skip
 
 
-class Detector(Protocol):
-    """Finds grasps in a cloud with one set of weights."""
-
-    def prepare(self, cloud: CloudInput, options: DetectOptions) -> Any:
-        """Everything before the network; its `batch` is None where there is nothing to score."""
-
-    def run(self, batch: Any) -> NDArray[Any]:
-        """The network: a logit for each candidate."""
-
-    def finish(self, prepared: Any, logits: NDArray[Any]) -> Detection:
-        """Everything after the network."""
-
-    def score(
-        self,
-        cloud: CloudInput,
-        options: DetectOptions,
-        *,
-        edges: NDArray[Any] | None = None,
-        hand_poses: NDArray[Any] | None = None,
-    ) -> Scoring:
-        """Score edges (M, 2) or hand poses (M, 4, 4)."""
-
-
 class Catalogue(Protocol):
-    """Detectors by the name of their weights."""
+    """Detectors by the name of their weights: a ModelCatalogue, or the dummy's."""
 
-    def get(self, name: str = "") -> Detector:
+    def get(self, name: str = "") -> Any:
         """The detector of that name, the default for ""; raises UnknownModel."""
 
     def describe(self) -> Sequence[Mapping[str, Any]]:
@@ -160,7 +137,7 @@ class _Work:
             logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
         prepared.seconds["network"] = self.facts.seconds["network"]
         with self._stage("finish"):
-            detection = detector.finish(prepared, logits)
+            detection: Detection = detector.finish(prepared, logits)
         self.facts.grasps = len(detection.grasps)
         return detection
 
@@ -168,7 +145,7 @@ class _Work:
         with self._stage("decode"):
             detector, cloud, options, given = self._decode()
         with self._stage("score"):
-            scoring = detector.score(cloud, options, **given)
+            scoring: Scoring = detector.score(cloud, options, **given)
         self.facts.grasps = len(scoring.evaluations)
         return scoring
 
@@ -178,7 +155,7 @@ class _Work:
         with self._stage("encode"):
             return write(result)
 
-    def _decode(self) -> tuple[Detector, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
+    def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
         job, limits = self._job, self._limits
         if job.transport == "grpc":

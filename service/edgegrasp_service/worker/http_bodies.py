@@ -5,7 +5,6 @@ A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 
 import gc
 import json
-import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from email.message import Message
@@ -17,7 +16,6 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
@@ -81,15 +79,15 @@ def read_body(method: Method, content_type: str, query: str, body: bytes) -> dic
 
 def write_detection(detection: Detection) -> bytes:
     """A detection as DetectionBody; every float is a float32 written out exactly."""
-    debug = None if detection.debug is None else _debug(detection.debug)
-    grasps = [_grasp(grasp) for grasp in detection.grasps]
+    debug = None if detection.debug is None else _plain(detection.debug)
+    grasps = [_plain(grasp) for grasp in detection.grasps]
     return orjson.dumps(vars(detection) | {"grasps": grasps, "debug": debug})
 
 
 def write_scoring(scoring: Scoring) -> bytes:
     """Evaluations as ScoringBody."""
     evaluations = [
-        {"grasp": None if each.grasp is None else _grasp(each.grasp), "reason": each.reason}
+        {"grasp": None if each.grasp is None else _plain(each.grasp), "reason": each.reason}
         for each in scoring.evaluations
     ]
     return orjson.dumps(vars(scoring) | {"evaluations": evaluations})
@@ -262,34 +260,14 @@ def _fields_of_form(parts: list[Part], known: tuple[str, ...]) -> dict[str, Any]
 # Answers
 
 
-def _grasp(grasp: Grasp) -> dict[str, object]:
-    return {
-        "score": float(np.float32(grasp.score)),
-        "T_cloud_hand": _floats(grasp.T_cloud_hand),
-        "T_cloud_tcp": _floats(grasp.T_cloud_tcp),
-        "width": float(np.float32(grasp.width)),
-        "approach_point": _floats(grasp.approach_point),
-        "contact_point": _floats(grasp.contact_point),
-        "approach_direction": _floats(grasp.approach_direction),
-        "collision_free": bool(grasp.collision_free),
-        "clearance": float(np.float32(grasp.clearance)),
-    }
-
-
-def _debug(debug: DebugInfo) -> dict[str, object]:
-    scores = debug.score.tolist()
-    plane = debug.support_plane
-    return {
-        "points": _floats(debug.points),
-        "normals": _floats(debug.normals),
-        "approach_index": debug.approach_index.tolist(),
-        "contact_index": debug.contact_index.tolist(),
-        "T_cloud_hand": _floats(debug.T_cloud_hand),
-        "score": [None if math.isnan(score) else score for score in scores],
-        "outcome": debug.outcome,
-        "support_plane": None if plane is None else _floats(plane),
-    }
-
-
-def _floats(array: NDArray[np.float32]) -> object:
-    return np.asarray(array, dtype=np.float32).tolist()
+def _plain(result: Grasp | DebugInfo) -> dict[str, Any]:
+    """Its fields as JSON has them; orjson writes NaN as null."""
+    fields: dict[str, Any] = {}
+    for name, value in vars(result).items():
+        if isinstance(value, np.ndarray | np.bool_):
+            fields[name] = value.tolist()
+        elif isinstance(value, float | np.floating):
+            fields[name] = float(np.float32(value))
+        else:
+            fields[name] = value
+    return fields

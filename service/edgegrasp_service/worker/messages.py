@@ -72,12 +72,12 @@ def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
 def write_detection(detection: Detection) -> bytes:
     """A detection as DetectGraspsResponse."""
     return grasp_pb2.DetectGraspsResponse(
-        grasps=[_grasp_message(grasp) for grasp in detection.grasps],
+        grasps=[grasp_pb2.Grasp(**_flat(grasp)) for grasp in detection.grasps],
         counts=detection.counts,
         seconds=detection.seconds,
         model=detection.model,
         warnings=detection.warnings,
-        debug=None if detection.debug is None else _debug_message(detection.debug),
+        debug=None if detection.debug is None else grasp_pb2.DebugInfo(**_flat(detection.debug)),
     ).SerializeToString()
 
 
@@ -86,7 +86,7 @@ def write_scoring(scoring: Scoring) -> bytes:
     return grasp_pb2.ScoreGraspsResponse(
         evaluations=[
             grasp_pb2.Evaluation(
-                grasp=None if each.grasp is None else _grasp_message(each.grasp),
+                grasp=None if each.grasp is None else grasp_pb2.Grasp(**_flat(each.grasp)),
                 reason=each.reason,
             )
             for each in scoring.evaluations
@@ -230,29 +230,9 @@ _FORMS: dict[type[Message], Callable[[Any], Any]] = {
 # Answers
 
 
-def _grasp_message(grasp: Grasp) -> grasp_pb2.Grasp:
-    return grasp_pb2.Grasp(
-        score=grasp.score,
-        T_cloud_hand=grasp.T_cloud_hand.ravel().tolist(),
-        T_cloud_tcp=grasp.T_cloud_tcp.ravel().tolist(),
-        width=grasp.width,
-        approach_point=grasp.approach_point.tolist(),
-        contact_point=grasp.contact_point.tolist(),
-        approach_direction=grasp.approach_direction.tolist(),
-        collision_free=grasp.collision_free,
-        clearance=grasp.clearance,
-    )
-
-
-def _debug_message(debug: DebugInfo) -> grasp_pb2.DebugInfo:
-    plane = debug.support_plane
-    return grasp_pb2.DebugInfo(
-        points=debug.points.ravel().tolist(),
-        normals=debug.normals.ravel().tolist(),
-        approach_index=debug.approach_index.tolist(),
-        contact_index=debug.contact_index.tolist(),
-        T_cloud_hand=debug.T_cloud_hand.ravel().tolist(),
-        score=debug.score.tolist(),
-        outcome=debug.outcome,
-        support_plane=[] if plane is None else plane.tolist(),
-    )
+def _flat(result: Grasp | DebugInfo) -> dict[str, Any]:
+    """Its fields as messages have them: arrays flat, in row-major order."""
+    return {
+        name: value.ravel().tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(result).items()
+    }
