@@ -23,9 +23,8 @@ requests = logging.getLogger("edgegrasp_service.requests")
 def log_call(call: Call) -> None:
     """Write one line about a call that has ended, and another about a fault of the server."""
     if call.facts.traceback:
-        requests.error(
-            "%s failed with %s\n%s", call.method, call.facts.options, call.facts.traceback
-        )
+        fault = {"traceback": call.facts.traceback}
+        requests.error("%s failed with %s", call.method, call.facts.options, extra=fault)
     level = logging.DEBUG if call.method in PROBES else logging.INFO
     if call.problem is not None and call.problem.status >= 500:
         level = logging.WARNING
@@ -65,8 +64,8 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
         }
         line |= getattr(record, "fields", {})
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
+        if trace := _traceback(self, record):
+            line["exception"] = trace
         return json.dumps(line, default=str)
 
 
@@ -76,13 +75,17 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The line of a record, and its traceback below."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(" ", "milliseconds")[:23]
-        message, _, below = record.getMessage().partition("\n")
         fields = getattr(record, "fields", {})
         words = " ".join(f"{name}={value}" for name, value in fields.items())
-        line = f"{time} {record.levelname} {record.name}: {message} {words}".rstrip()
-        if record.exc_info:
-            below = self.formatException(record.exc_info)
-        return one_line(line) + (f"\n{below}" if below else "")
+        line = f"{time} {record.levelname} {record.name}: {record.getMessage()} {words}"
+        trace = _traceback(self, record)
+        return one_line(line.rstrip()) + (f"\n{trace}" if trace else "")
+
+
+def _traceback(formatter: logging.Formatter, record: logging.LogRecord) -> str:
+    """Of this process, or of the worker that told of it; empty: there is none."""
+    told: str = getattr(record, "traceback", "")
+    return formatter.formatException(record.exc_info) if record.exc_info else told
 
 
 class LogQueue(logging.handlers.QueueHandler):

@@ -54,8 +54,8 @@ class Metrics:
                 self._seconds.labels(call.transport, method).observe(call.seconds)
         for stage, seconds in call.stages.items():
             self._stages.labels(stage).observe(seconds)
-        if call.problem is None and "candidates" in call.facts.counts:
-            self._candidates.observe(call.facts.counts["candidates"])
+        if call.problem is None and call.method.startswith("DetectGrasps") and call.facts.model:
+            self._candidates.observe(call.facts.counts.get("candidates", 0))
             self._grasps.observe(call.facts.grasps)
 
     def reloaded(self, succeeded: bool) -> None:

@@ -97,6 +97,7 @@ class Server:
         )
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(self.pool.pids))
+        watch("workers_resident_bytes", "memory of workers", lambda: self.pool.resident_bytes)
 
     async def serve(
         self,
@@ -221,7 +222,7 @@ def run(settings: Settings) -> None:
             provider = otlp_provider(settings.otlp_endpoint)
             ends.callback(provider.shutdown)
             observers.append(Tracer(provider).trace_call)
-        _warn(settings)
+        warn(settings)
         asyncio.run(_serve_until_signalled(settings, observers, log))
 
 
@@ -258,7 +259,7 @@ def _at_a_terminal() -> bool:
     return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
-def _warn(settings: Settings) -> None:
+def warn(settings: Settings) -> None:
     """Say what an operator may not have meant."""
     try:
         local = ipaddress.ip_address(settings.host).is_loopback

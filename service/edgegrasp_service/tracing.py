@@ -33,7 +33,7 @@ class Tracer:
             "edgegrasp.transport": call.transport,
             "edgegrasp.request_id": call.request_id,
             "edgegrasp.model": call.facts.model,
-            "edgegrasp.code": call.code if call.problem is None else call.problem.code,
+            "edgegrasp.code": "OK" if call.problem is None else call.problem.code,
         }
         for name, count in call.facts.counts.items():
             attributes[f"edgegrasp.count.{name}"] = count

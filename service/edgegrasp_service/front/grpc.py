@@ -78,6 +78,7 @@ class GrpcServer:
             ("grpc.so_reuseport", 0),
             # A cloud comes in one go, without waiting for leave to send the rest of it.
             ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
+            ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
             # A client that vanished without a word is found out, and its streams end.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),

@@ -95,8 +95,9 @@ class HttpProtocol(HttpToolsProtocol):
 
     def _refuse(self, error: EdgeGraspError) -> None:
         """Answer past the application, and close."""
-        if self.cycle is not None and self.cycle.response_started:
-            self.transport.abort()  # it has an answer, or half of one
+        pending = self.cycle is not None and not self.cycle.response_complete
+        if pending and self.cycle.response_started:
+            self.transport.abort()  # it has half an answer
             return
         problem = report(error)
         body = problem_document(problem)
@@ -105,7 +106,7 @@ class HttpProtocol(HttpToolsProtocol):
             "content-type: application/problem+json\r\n"
             f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
         )
-        if self.cycle is not None:
+        if pending:
             self.cycle.disconnected = True  # the application answers nothing any more
             self.cycle.message_event.set()
         self.transport.write(head.encode() + body)
