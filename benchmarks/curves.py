@@ -1,11 +1,10 @@
 """How time and memory grow: `python -m benchmarks.curves` writes scaling.json and scaling.png.
 
 The small network in the whole pipeline, against the points of the cloud, the approach points, the
-candidates, the scenes of a batch and the threads.
+candidates and the threads.
 """
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -15,22 +14,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.scenes import detector, observe, request
-from benchmarks.timing import interleaved, machine
+from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, write_results
+from benchmarks.speed import detector, observe, request
 
-from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 from edgegrasp_model.options import Collision
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 
-RESULTS = Path(__file__).parent / "results"
 POINTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 APPROACH_POINTS = (8, 16, 32, 64, 128, 256)
 CANDIDATES = (500, 1_000, 2_000, 4_000, 8_000, 16_000)
 MANY_APPROACH_POINTS = 256  # so that there are enough candidates, those that collide among them
-BATCHES = (1, 2, 4, 8)
 THREADS = (1, 2)
-RUNS = 5
 SCATTER = 2e-4  # metres between a point of the scene and those put in its place
 
 
@@ -49,21 +44,15 @@ def main() -> None:
         results["curves"][name] = measured(variants, given.runs)
         print(name, results["curves"][name], flush=True)
     results["minutes"] = (time.perf_counter() - start) / 60
-    given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / "scaling.json").write_text(json.dumps(results, indent=1) + "\n")
+    write_results(given.output, "scaling", results)
     draw(results["curves"], given.output / "scaling.png")
 
 
 def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]]]:
     """What to run for each value of each quantity."""
     small, cloud = detector(EDGEGRASP_SMALL), observation.cloud
-    batch = small.prepare(cloud, request(observation)).batch
-    assert isinstance(batch, BallBatch)
     clouds = {count: cloud_of(count, cloud) for count in POINTS}
     usual = request(observation)
-
-    def batched(count: int) -> None:
-        small.run(BallBatch.concatenate([batch] * count))
 
     def threaded(count: int) -> None:
         torch.set_num_threads(count)
@@ -84,7 +73,6 @@ def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]
         "points": {n: partial(small.detect, clouds[n], usual) for n in POINTS},
         "approach points": {n: around(n) for n in APPROACH_POINTS},
         f"candidates ({MANY_APPROACH_POINTS} approach points)": {n: scoring(n) for n in CANDIDATES},
-        "scenes in a batch": {n: partial(batched, n) for n in BATCHES},
         "threads": {n: partial(threaded, n) for n in THREADS},
     }
 

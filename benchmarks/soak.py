@@ -3,36 +3,71 @@
 Clouds of 32 to 20,000 points go through a dummy network, over unary gRPC, streams and REST, a few
 of them malformed and a few abandoned by their client. Each answer carries the CRC-32 of the cloud
 that the server saw, so an answer that belongs to another request is noticed. At the end every
-request must have come to something, the server's memory must not have grown, and it must stop.
+request must have an outcome, the server's memory must not have grown, and it must stop.
 """
 
 import argparse
+import http.client
+import io
 import json
 import queue
+import socket
 import sys
 import threading
 import time
+import urllib.parse
+import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import grpc
 import numpy as np
-from benchmarks.served import Served, served
-from benchmarks.soak_clients import ANSWERED, CANCELLED, REFUSED, STUCK, Plan, clients
-from benchmarks.soak_picture import draw
+from benchmarks.measuring import RESULTS, Served, served, write_results
+from numpy.typing import NDArray
 
-ROOT = Path(__file__).parents[1]
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+
+ANSWERED = "answered"
+REFUSED = "refused"
+CANCELLED = "cancelled"
+CROSSED = "another cloud's answer"
+STUCK = "no answer in time"
 EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED, ANSWERED}}
+SECONDS = 30.0  # until a request counts as stuck
+STREAM = 8  # requests of one stream
+EACH = 2  # clients of each kind
 SAMPLES = 100  # of memory
 WARM_UP = 0.2  # of the requests: memory grows while pools and caches fill
 MAX_SLOPE = 1.0  # MB per 1,000 requests
 
 
+@dataclass(frozen=True)
+class Plan:
+    """One request."""
+
+    number: int
+    kind: str  # good, malformed or cancelled
+    size: int  # points
+    wait: float  # seconds until its client leaves
+    seed: int
+
+    def points(self) -> NDArray[np.float32]:
+        """(N, 3) a cloud that no other plan has."""
+        random = np.random.default_rng([self.seed, self.number])
+        return random.uniform(-0.2, 0.2, (self.size, 3)).astype(np.float32)
+
+
+Report = Callable[[Plan, str, str, float], None]  # plan, transport, outcome, seconds
+NextPlans = Callable[[int], list[Plan]]
+
+
 def main() -> None:
-    """Send, write soak.json and soak.png, and fail where anything is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "results")
+    """Send, write soak.json, and fail where anything is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak")
+    parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--requests", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -42,9 +77,7 @@ def main() -> None:
         results["exit_code"] = server.stop()
         results["stop_seconds"] = round(time.monotonic() - begun, 2)
     results["faults"] = faults(results)
-    given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / "soak.json").write_text(json.dumps(results, indent=1) + "\n")
-    draw(results, given.output / "soak.png")
+    write_results(given.output, "soak", results)
     print(json.dumps({name: results[name] for name in results if name != "memory"}, indent=1))
     sys.exit(1 if results["faults"] else 0)
 
@@ -60,7 +93,7 @@ def plans(requests: int, seed: int) -> Iterator[Plan]:
 
 
 def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
-    """Send what is to be sent, from several threads; every plan has an outcome."""
+    """Send the plans, from several threads; every plan has an outcome."""
     outcomes: queue.Queue[tuple[Plan, str, str, float]] = queue.Queue()
     lock = threading.Lock()
 
@@ -68,9 +101,17 @@ def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
         with lock:
             return [plan for _, plan in zip(range(count), todo, strict=False)]
 
+    def report(plan: Plan, transport: str, came: str, seconds: float) -> None:
+        outcomes.put((plan, transport, came, seconds))
+
     threads = [
-        threading.Thread(target=client.work, args=(next_plans, outcomes.put), daemon=True)
-        for client in clients(server.http_url, server.grpc_address)
+        threading.Thread(target=work, args=(address, next_plans, report), daemon=True)
+        for work, address in (
+            (send_unary, server.grpc_address),
+            (send_streams, server.grpc_address),
+            (send_rest, server.http_url),
+        )
+        for _ in range(EACH)
     ]
     start = time.monotonic()
     for thread in threads:
@@ -104,7 +145,7 @@ def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
         "slowest_seconds": round(slowest, 3),
         "memory": memory,
         "memory_slope_mb_per_1000": slope(memory, requests),
-        "memory_peak_mb": round(server.peak_memory(), 1),
+        "memory_most_mb": round(max(used for _, used in memory), 1),
         "server_threads": server.threads(),
         "server_files": settled_files(server),
     }
@@ -129,7 +170,7 @@ def settled_files(server: Served) -> int:
 
 
 def faults(results: dict[str, Any]) -> list[str]:
-    """What is not as it should be."""
+    """What is wrong; empty: nothing."""
     found = []
     if results["wrong"]:
         found.append("requests with a wrong outcome, or none")
@@ -141,6 +182,182 @@ def faults(results: dict[str, Any]) -> list[str]:
     if results["exit_code"] != 0:
         found.append(f"the server ended with {results['exit_code']}")
     return found
+
+
+def message(plan: Plan) -> grasp_pb2.DetectGraspsRequest:
+    """A request as gRPC carries it; malformed in one of several ways."""
+    points = plan.points()
+    if plan.kind == "malformed":
+        match plan.number % 5:
+            case 0:
+                return grasp_pb2.DetectGraspsRequest()
+            case 1:
+                return grasp_pb2.DetectGraspsRequest(points=points.tobytes()[:-1])
+            case 2:
+                points[-1] = np.nan
+            case 3:
+                file = grasp_pb2.EncodedCloud(format="ply", data=points.tobytes())
+                return grasp_pb2.DetectGraspsRequest(encoded=file)
+            case _:
+                options = grasp_pb2.DetectOptions(seed=-1)
+                return grasp_pb2.DetectGraspsRequest(points=points.tobytes(), options=options)
+    return grasp_pb2.DetectGraspsRequest(points=points.tobytes())
+
+
+def outcome(plan: Plan, code: str, digest: int | None) -> str:
+    """What came of a request, by its status and the digest in its answer."""
+    if code == "OK":
+        return ANSWERED if digest == zlib.crc32(plan.points().tobytes()) else CROSSED
+    if code == "INVALID_ARGUMENT":
+        return REFUSED
+    return STUCK if code == "DEADLINE_EXCEEDED" else code
+
+
+def send_unary(address: str, next_plans: NextPlans, report: Report) -> None:
+    """One channel, one call at a time."""
+    with grpc.insecure_channel(address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        while plans := next_plans(1):
+            start = time.monotonic()
+            report(plans[0], "grpc", _unary(stub, plans[0]), time.monotonic() - start)
+
+
+def _unary(stub: Any, plan: Plan) -> str:
+    call = stub.DetectGrasps.future(message(plan), timeout=SECONDS)
+    if plan.kind == "cancelled":
+        time.sleep(plan.wait)
+        call.cancel()
+    try:
+        answer = call.result()
+    except grpc.FutureCancelledError:
+        return CANCELLED
+    except grpc.RpcError as error:
+        return outcome(plan, error.code().name, None)
+    return outcome(plan, "OK", answer.counts["crc32"])
+
+
+def send_streams(address: str, next_plans: NextPlans, report: Report) -> None:
+    """One stream after the other, of several requests each."""
+    with grpc.insecure_channel(address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        while plans := next_plans(STREAM):
+            # The stream is cancelled with those plans, so they come last.
+            plans.sort(key=lambda plan: plan.kind == "cancelled")
+            _stream(stub, plans, report)
+
+
+def _stream(stub: Any, plans: list[Plan], report: Report) -> None:
+    start = time.monotonic()
+    to_send: queue.SimpleQueue[Plan | None] = queue.SimpleQueue()
+    for plan in plans:
+        to_send.put(plan)
+    left = [plan for plan in plans if plan.kind == "cancelled"]
+    if not left:
+        to_send.put(None)
+    call = stub.DetectGraspsStream(_requests(to_send), timeout=SECONDS)
+    unanswered = plans[: len(plans) - len(left)]
+    try:
+        while unanswered:
+            came = _stream_answer(unanswered[0], next(call, None))
+            report(unanswered.pop(0), "stream", came, time.monotonic() - start)
+        if not left and next(call, None) is not None:
+            report(plans[-1], "stream", "an answer too many", time.monotonic() - start)
+    except grpc.RpcError as error:
+        for plan in unanswered:
+            came = outcome(plan, error.code().name, None)
+            report(plan, "stream", came, time.monotonic() - start)
+    if left:
+        time.sleep(left[0].wait)
+        call.cancel()
+        to_send.put(None)
+    for plan in left:
+        report(plan, "stream", CANCELLED, time.monotonic() - start)
+
+
+def _stream_answer(plan: Plan, response: grasp_pb2.DetectGraspsStreamResponse | None) -> str:
+    if response is None:
+        return "the stream ended"
+    if response.request_id != str(plan.number):
+        return CROSSED
+    if response.WhichOneof("answer") == "error":
+        codes = {code.value[0]: code.name for code in grpc.StatusCode}
+        return outcome(plan, codes[response.error.code], None)
+    return outcome(plan, "OK", response.detection.counts["crc32"])
+
+
+def _requests(
+    to_send: "queue.SimpleQueue[Plan | None]",
+) -> Iterator[grasp_pb2.DetectGraspsStreamRequest]:
+    while (plan := to_send.get()) is not None:
+        yield grasp_pb2.DetectGraspsStreamRequest(
+            request_id=str(plan.number), request=message(plan)
+        )
+
+
+def send_rest(http_url: str, next_plans: NextPlans, report: Report) -> None:
+    """One connection that is kept alive, and one more for each request that is abandoned."""
+    host = urllib.parse.urlsplit(http_url).netloc
+    connection = http.client.HTTPConnection(host, timeout=SECONDS)
+    while plans := next_plans(1):
+        start = time.monotonic()
+        if plans[0].kind == "cancelled":
+            came = _abandon(host, plans[0])
+        else:
+            try:
+                came = _post(connection, plans[0])
+            except TimeoutError:
+                came = STUCK
+            except (http.client.HTTPException, OSError) as error:
+                connection.close()
+                came = type(error).__name__
+        report(plans[0], "rest", came, time.monotonic() - start)
+    connection.close()
+
+
+def _post(connection: http.client.HTTPConnection, plan: Plan) -> str:
+    body, media_type, query = _body(plan)
+    headers = {"Content-Type": media_type, "X-Request-ID": str(plan.number)}
+    connection.request("POST", f"/v1/grasps{query}", body, headers)
+    response = connection.getresponse()
+    content = json.loads(response.read())
+    if response.getheader("X-Request-ID") not in (None, str(plan.number)):
+        return CROSSED
+    if response.status == 200:
+        return outcome(plan, "OK", content["counts"]["crc32"])
+    refused = response.status in (400, 415)
+    return outcome(plan, "INVALID_ARGUMENT" if refused else str(response.status), None)
+
+
+def _abandon(host: str, plan: Plan) -> str:
+    """Close the connection half way through the body, or before the answer."""
+    body, media_type, _ = _body(plan)
+    head = f"POST /v1/grasps HTTP/1.1\r\nHost: {host}\r\nContent-Type: {media_type}\r\n"
+    head += f"Content-Length: {len(body)}\r\n\r\n"
+    sent = body if plan.number % 2 else body[: len(body) // 2]
+    name, _, port = host.rpartition(":")
+    with socket.create_connection((name, int(port)), timeout=SECONDS) as connection:
+        connection.sendall(head.encode() + sent)
+        time.sleep(plan.wait)
+    return CANCELLED
+
+
+def _body(plan: Plan) -> tuple[bytes, str, str]:
+    """A request as HTTP carries it: body, media type, query; malformed in one of several ways."""
+    points = plan.points()
+    stream = io.BytesIO()
+    np.save(stream, points)
+    npy = stream.getvalue()
+    if plan.kind == "malformed":
+        return [
+            (npy[:-5], "application/x-npy", ""),
+            (npy, "application/x-pcd", ""),
+            (b'{"points": [[0, 0', "application/json", ""),
+            (npy, "text/plain", ""),
+            (npy, "application/x-npy", "?sead=1"),
+        ][plan.number % 5]
+    if plan.number % 4 == 0:
+        return json.dumps({"points": points.tolist()}).encode(), "application/json", ""
+    return npy, "application/x-npy", ""
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def _gripper_panel(ax: Axes, gripper: Gripper) -> None:
         (gripper.tip_z, "fingertips"),
         (gripper.tcp_z, "TCP"),
     ]
-    if gripper.swing is not None:
+    if gripper.linkage is not None:
         heights.append((gripper.tip_z + float(gripper.tip_advance(0.0)), "fingertips, closed"))
     _heights(ax, heights)
     half, below = gripper.max_opening / 2, -gripper.max_tip_z - 0.042

@@ -1,8 +1,8 @@
-"""Writes docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
+"""Writes the tables of docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
 
 Results found below RESULTS_DIR (folders of `edgegrasp benchmark`, `edgegrasp experiment` and
 `edgegrasp train`) are first boiled down to docs/results/, where what is found again replaces what
-was there; the page is written from that folder alone.
+was there; the tables are written from that folder alone.
 """
 
 import csv
@@ -17,103 +17,32 @@ from typing import Any
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from pages import filled, table
 
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_sim.experiment_report import experiment_table, percent, title_of
+from edgegrasp_sim.experiments import experiment_table, percent
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.published import published
-from edgegrasp_sim.record import record_of
-from edgegrasp_sim.results import ResultFolder
+from edgegrasp_sim.report import published
+from edgegrasp_sim.results import ResultFolder, planner_title, record_of
 from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
 
 DOCS = Path(__file__).parent
+PAGE = DOCS / "results.md"
 KEPT_CURVE_POINTS = 40
 SCENES = ("packed", "pile")
-INTRODUCTION = """\
-# Results
-
-Grasp success rate (GSR) and declutter rate (DR) of simulated clutter removal, in per cent with
-Wilson 95 % intervals; [benchmark.md](benchmark.md) says what a round is. `OBJECTS` are the
-reference system's test objects, which no weights were trained on. Published figures stand as their
-papers give them, mean ± standard deviation over seeds where they say so.
-
-Protocols are in version 2 (`giga` in 3). In version 1 the simulator's table was 12 mm thick: of
-1,000 objects dropped on heaps 100 were gone before the first view, where 43 are now, and others
-stuck in it, where no hand could lift them. Now it is 200 mm thick. The grasps that the reference
-simulator judged come out as before ([benchmark.md](benchmark.md#how-hard-the-simulator-is)).
-
-This page is written by `python docs/make_results.py RESULTS_DIR` from the folders that the
-commands below leave; what it keeps of them is in `docs/results/`.
-"""
-# Experiment: heading, command, and what is asked of it.
-EXPERIMENTS = {
-    "baselines": (
-        "Random candidates, and the best that could be made of them",
-        "edgegrasp experiment baselines --rounds 100 --objects OBJECTS --output DIR",
-        "Edge-Sample takes any of the paper's candidates, the oracle one that holds when tried in "
-        "a copy of the scene; `oracle-own` has the pipeline's own candidates to choose from.",
-    ),
-    "samples": (
-        "Approach points and candidates",
-        "edgegrasp experiment samples --rounds 100 --objects OBJECTS --output DIR",
-        "The paper's table: 16, 32 or 64 approach points with 1,000, 2,000 or 4,000 candidates.",
-    ),
-    "labels": (
-        "Labels",
-        "edgegrasp experiment labels --model runs/labels/NUMBER/edgegrasp-plus.safetensors "
-        "--rounds 100 --objects OBJECTS --output DIR",
-        "`edgegrasp-plus` trained alike on parts of the data (shares 0.01, 0.06, 0.3 and 1), by "
-        "`edgegrasp train DATA --training-share SHARE --steps 800 --schedule cosine "
-        "--views-per-step 24 --balls-per-view 4 --run runs/labels/NUMBER`; weights that ship had "
-        "4,500 steps.",
-    ),
-    "robustness": (
-        "Robustness",
-        "edgegrasp experiment robustness --rounds 100 --objects OBJECTS --output DIR",
-        "One thing is changed at a time; the protocol has 1 mm noise, a polar angle of 45 to 60 "
-        "degrees, the weights have a voxel size of their own. `giga` is a fixed side view with "
-        "noise that also moves a whole image by some 3 % of its depth (19 mm), which the table in "
-        "the view betrays: `support.max_depth_error`. Its camera alone has the protocol's noise.",
-    ),
-    "families": (
-        "Objects of other families",
-        "edgegrasp experiment families --rounds 100 --output DIR",
-        "Prisms: regular (30 to 80 mm), thin (at most 14 mm across), flat (8 to 14 mm high) and "
-        "large (60 to 70 mm across, in a hand that opens 80 mm).",
-    ),
-}
-# Methods whose published figures stand beside an experiment's.
-PUBLISHED = {
+# Experiment: methods whose published figures stand beside it.
+EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "baselines": ("Edge-Sample",),
     "samples": ("EdgeGraspNet", "VN-EdgeGraspNet", "Edge Grasp Network, 32-2k"),
+    "labels": (),
+    "robustness": (),
+    "families": (),
 }
-BENCHMARK = (
-    "edgegrasp benchmark --scene packed --rounds 100 --seed 0 --seed 1 --objects OBJECTS "
-    "--num-approach-points 32 --num-candidates 2000 --output DIR"
-)
 # Counted in the authors' checkpoint files.
 AUTHORS_PARAMETERS = {"edgegrasp": 3_048_993, "vn-edgegrasp": 1_702_268}
-NOT_YET = "Not measured yet."
-DIFFERENCES = """\
-- `edgegrasp` at 32-2k and, in 40 rounds, at 64-4k: the paper's figures lie within its intervals.
-- `vn-edgegrasp` is 3 to 4 points of GSR below the paper, in DR 2 below it (packed) and 1 above it
-  (piles). It saw 11,200 balls in half an hour of one processor core.
-- Random rotations: the paper's network needs them. Here they hold training back: detectors turn
-  every cloud upright and toward its camera before a network sees it, so that few rotations are
-  left to be learned.
-- NoBall: after as many steps, whole scenes do no worse than balls here. What stands around a ball
-  tells what a hand would hit. So short a run of one seed does not say which ends up better.
-- Edge-Sample depends on how dense clouds are: with the reference's fused clouds it does as in the
-  paper, with one point for each pixel it finds fewer contacts aslant
-  ([benchmark.md](benchmark.md)).
-- Labels: the first hundred thousand bring 1 to 3 points of GSR over 7,699, further ones hardly
-  anything: what the candidates offer and what one view hides sets the limit.
-- `edgegrasp-plus` has what the paper's networks have not: level grasps on low things, centred hands
-  on wide ones, and scores of hands where they are. What it fails on is about as wide as the hand
-  opens, or a ring, which the simulator takes for solid.
-"""
+NOT_YET = "Not measured yet.\n"
 
 
 def collect(results: Path, kept: Path) -> None:
@@ -143,41 +72,37 @@ def collect(results: Path, kept: Path) -> None:
         curves_figure(drawn).savefig(kept / "curves.png")
 
 
-def page(kept: Path) -> str:
-    """The whole page, from the folder of what is kept."""
-    return "\n".join([INTRODUCTION, *_sections(kept)])
+def page(kept: Path = DOCS / "results") -> str:
+    """The whole page, its tables from the folder of what is kept."""
+    return filled(PAGE.read_text(), blocks(kept))
 
 
-def _sections(kept: Path) -> Iterator[str]:
-    yield "## Shipped weights and ablations\n"
-    records = _read(kept / "benchmarks.json")
-    for scene in SCENES:
-        yield f"### {scene.capitalize()} scenes\n"
-        yield _benchmark_table([r for r in records.values() if r["scene"] == scene], scene)
-    yield "Each row by its command:\n"
-    commands = sorted({command_of(record) for record in records.values()}) or [BENCHMARK]
-    yield _console(commands)
-    for name, (heading, command, text) in EXPERIMENTS.items():
-        yield f"## {heading}\n"
-        yield text + "\n"
-        yield from _published_table(PUBLISHED.get(name, ()))
+def blocks(kept: Path) -> dict[str, str]:
+    """What the script writes into the page, by the name of its place."""
+    records = _read(kept / "benchmarks.json").values()
+    written = {
+        scene: _benchmark_table([r for r in records if r["scene"] == scene], scene)
+        for scene in SCENES
+    }
+    written["commands"] = _console(sorted({command_of(record) for record in records}))
+    for name, methods in EXPERIMENTS.items():
         found = _read(kept / f"{name}.json")
-        yield _console([found.get("command", command)])
-        if not found:
-            yield NOT_YET + "\n"
-            continue
-        rounds, seeds = found["cases"][0]["rounds"], found["cases"][0]["seeds"]
-        version = found["cases"][0]["protocol"]["version"]
-        under = "" if version == load_protocol("edgegrasp").version else f", version {version}"
-        yield f"{rounds} rounds for each of the seeds {', '.join(map(str, seeds))}{under}.\n"
-        yield experiment_table(found)
-        yield f"![{heading}](results/{name}.png)\n"
-    yield "## Parameters\n"
-    yield _parameters_table()
-    yield "## Training\n"
-    yield from _training(_read(kept / "curves.json"))
-    yield "## Where these differ from the paper\n"
-    yield DIFFERENCES
+        measured = _experiment(name, found) if found else [NOT_YET]
+        written[name] = "\n".join([*_published_table(methods), *measured])
+    written["parameters"] = _parameters_table()
+    written["training"] = _training(_read(kept / "curves.json"))
+    return written
+
+
+def _experiment(name: str, found: dict[str, Any]) -> Iterator[str]:
+    first = found["cases"][0]
+    version = first["protocol"]["version"]
+    under = "" if version == load_protocol("edgegrasp").version else f", version {version}"
+    seeds = ", ".join(map(str, first["seeds"]))
+    yield _console([found["command"]])
+    yield f"{first['rounds']} rounds for each of the seeds {seeds}{under}.\n"
+    yield experiment_table(found)
+    yield f"![{name.capitalize()}](results/{name}.png)\n"
 
 
 def command_of(record: dict[str, Any]) -> str:
@@ -199,7 +124,7 @@ def command_of(record: dict[str, Any]) -> str:
 
 def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
     head = ("weights or planner", "protocol", "samples", "rounds", "GSR", "DR", "planning")
-    lines = [head, ("---",) * len(head)]
+    lines: list[tuple[str, ...]] = []
     for record in records:
         options = record["planner"] | record["planner"].get("options", {})
         numbers = [str(options.get(n, "")) for n in ("num_approach_points", "num_candidates")]
@@ -207,7 +132,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         least = f", scores from {options['min_score']:g}" if "min_score" in options else ""
         lines.append(
             (
-                title_of(record["planner"]) + least,
+                planner_title(record["planner"]) + least,
                 _version(record["protocol"]),
                 "-".join(filter(None, numbers)) or "the protocol's",
                 f"{record['rounds']} for each of {', '.join(map(str, record['seeds']))}",
@@ -219,7 +144,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
     for row in published("edgegrasp", scene):
         title = f"*{row['method']}* ({row['source']})"
         lines.append((title, "edgegrasp", row.get("samples", ""), "", *_rates(row), ""))
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return table(head, lines)
 
 
 def _version(protocol: dict[str, Any]) -> str:
@@ -230,34 +155,22 @@ def _version(protocol: dict[str, Any]) -> str:
 
 def _parameters_table() -> str:
     """How many numbers each network learns, beside the checkpoints of the paper's authors."""
-    lines = ["| weights | parameters | in the authors' checkpoint |", "| --- | --- | --- |"]
+    lines = []
     for name, config in RECIPES.items():
         network = build_network(config, torch.Generator().manual_seed(0))
         count = sum(parameter.numel() for parameter in network.parameters())
         theirs = AUTHORS_PARAMETERS.get(name)
-        lines.append(f"| {name} | {count:,} | {'' if theirs is None else f'{theirs:,}'} |")
-    return "\n".join(lines) + "\n"
+        lines.append((name, f"{count:,}", "" if theirs is None else f"{theirs:,}"))
+    return table(("weights", "parameters", "in the authors' checkpoint"), lines)
 
 
-def _training(curves: Curves) -> Iterator[str]:
-    yield (
-        "How the loss on held-out scenes falls: with rotations, without, vector neurons, whole "
-        "clouds in place of balls. Each folder is one `edgegrasp train`.\n"
-    )
+def _training(curves: Curves) -> str:
     if not curves:
-        yield NOT_YET + "\n"
-        return
-    lines: list[tuple[str, ...]] = [
-        ("run", "steps", "validation loss", "accuracy", "AUROC"),
-        ("---",) * 5,
-    ]
-    for name, rows in curves.items():
-        last = rows[-1]
-        lines.append(
-            (name, *(f"{last[c]:g}" for c in ("step", "validation_loss", "accuracy", "auroc")))
-        )
-    yield "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    yield "![Loss curves](results/curves.png)\n"
+        return NOT_YET
+    columns = ("step", "validation_loss", "accuracy", "auroc")
+    last = [(name, *(f"{rows[-1][c]:g}" for c in columns)) for name, rows in curves.items()]
+    head = ("run", "steps", "validation loss", "accuracy", "AUROC")
+    return table(head, last) + "\n![Loss curves](results/curves.png)\n"
 
 
 def curves_figure(curves: Curves) -> Figure:
@@ -289,8 +202,7 @@ def _published_table(methods: Sequence[str]) -> Iterator[str]:
         lines.append((f"*{method}*", row.get("samples", ""), *cells))
     if lines:
         head = ("published", "samples", "packed: GSR", "DR", "pile: GSR", "DR")
-        table = [head, ("---",) * len(head), *lines]
-        yield "".join(f"| {' | '.join(line)} |\n" for line in table)
+        yield table(head, lines)
 
 
 def _rates(row: dict[str, Any]) -> tuple[str, str]:
@@ -332,10 +244,10 @@ def _write(file: Path, content: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Collect results where a folder is named, then write the page."""
+    """Collect results where a folder is named, then write the tables."""
     for folder in arguments:
         collect(Path(folder), DOCS / "results")
-    (DOCS / "results.md").write_text(page(DOCS / "results"))
+    PAGE.write_text(page())
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
-from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.simulation import ClutterSimulation
 

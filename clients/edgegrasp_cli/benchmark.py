@@ -1,23 +1,50 @@
-"""`edgegrasp benchmark`."""
+"""`edgegrasp benchmark`, and `edgegrasp compare` for what it wrote."""
 
+import json
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from edgegrasp_cli.connection import TlsCa, TlsCertificate, TlsKey, TokenFile, UseTls
+from edgegrasp_cli.flags import (
+    CONNECTION,
+    option_flags,
+    parse_option_flags,
+    takes_flags,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from edgegrasp_cli.planners.choice import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.trial import Round
 
 Option = typer.Option
 MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
 
+# Flags that `experiment` has too.
+Seeds = Annotated[
+    list[int] | None, Option("--seed", help="Seed of scenes, views and noise; may be repeated.")
+]
+Objects = Annotated[
+    Path | None,
+    Option(help="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects."),
+]
+Split = Annotated[str, Option(help="Which of its objects: test or train.")]
+Workers = Annotated[
+    int | None, Option(help="Processes that simulate; else one for each core. Same results.")
+]
+Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
+# Options of a detection that the simulation, the protocol or another flag decides.
+DECIDED = (
+    *("model", "gripper", "seed", "viewpoint", "up", "support", "workspace", "top_k", "debug"),
+)
 
+
+@takes_flags(connection=CONNECTION, options=option_flags(*DECIDED, defaults=False))
 def benchmark(
     scene: Annotated[str, Option(help="packed or pile.")] = "pile",
     protocol: Annotated[
@@ -31,42 +58,18 @@ def benchmark(
         ),
     ] = "server",
     rounds: Annotated[int | None, Option(help="Rounds for each seed; else the protocol's.")] = None,
-    seed: Annotated[
-        list[int] | None, Option(help="Seed of scenes, views and noise; may be repeated.")
-    ] = None,
-    objects: Annotated[
-        Path | None,
-        Option(help="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects."),
-    ] = None,
-    split: Annotated[str, Option(help="Which of its objects: test or train.")] = "test",
+    seeds: Seeds = None,
+    objects: Objects = None,
+    split: Split = "test",
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
-    token_file: TokenFile = None,
-    tls: UseTls = False,
-    tls_ca: TlsCa = None,
-    tls_certificate: TlsCertificate = None,
-    tls_key: TlsKey = None,
     weights: Annotated[list[Path] | None, Option(help="Weights besides those that ship.")] = None,
     model: Annotated[
         str, Option(help="Weights to use: a name or a .safetensors file; empty: the default.")
     ] = "",
-    num_approach_points: Annotated[
-        int | None, Option(help="Approach points sampled; else the protocol's.")
-    ] = None,
-    num_candidates: Annotated[
-        int | None, Option(help="Candidates scored at most; else the protocol's.")
-    ] = None,
-    collision: Annotated[str, Option(help="avoid, penalise or ignore.")] = "penalise",
-    min_score: Annotated[
-        float, Option(min=0.0, max=1.0, help="Least score of a grasp; below it, another view.")
-    ] = 0.0,
-    workers: Annotated[
-        int | None, Option(help="Processes that simulate; else one for each core. Same results.")
-    ] = None,
-    ray: Annotated[
-        str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")
-    ] = None,
+    workers: Workers = None,
+    ray: Ray = None,
     patience: Annotated[
         float, Option(help="Seconds to go on asking a server that is away.")
     ] = 300.0,
@@ -79,84 +82,188 @@ def benchmark(
         Path | None, Option(help="summary.json of a result that this one must not fall below.")
     ] = None,
     gui: Annotated[bool, Option(help="Show the simulator's window (one worker).")] = False,
+    *,
+    connection: dict[str, Any],
+    options: dict[str, Any],
 ) -> None:
     """Clear simulated clutter with a planner's grasps and count what succeeds.
 
     GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
+    Options of the detection are the protocol's, with collision penalise, unless a flag is given.
     """
-    from edgegrasp_cli.planners.making import PlannerChoice, planner_of
-    from edgegrasp_cli.progress import with_progress
-    from edgegrasp_client import GraspClientError
-    from edgegrasp_sim.benchmark import BenchmarkConfig, manifest, run_benchmark
-    from edgegrasp_sim.gate import below_gate
+    from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
     from edgegrasp_sim.results import ResultFolder, summarise
-    from edgegrasp_sim.trials import PlannerUnavailableError
 
-    choice = PlannerChoice(
-        planner,
-        model,
-        tuple(path.resolve() for path in weights or ()),
-        server,
-        (token_file, tls, tls_ca, tls_certificate, tls_key),
-        collision,
-        num_approach_points,
-        num_candidates,
-        min_score,
-    )
-    try:
+    with ending_with_a_sentence("benchmark", resumes=output is not None):
         rules = load_protocol(protocol)
+        choice = PlannerChoice(
+            planner,
+            model,
+            tuple(path.resolve() for path in weights or ()),
+            server,
+            connection,
+            parse_option_flags(options),
+        )
         config = BenchmarkConfig(
             SceneKind(scene),
             rules.rounds if rounds is None else rounds,
-            tuple(seed or rules.seeds),
+            tuple(seeds or rules.seeds),
             rules,
             objects.resolve() if objects is not None else None,
             split,
             patience,
         )
-        processes = _processes(
-            workers, gui=gui, ray=ray, own_server=planner == "server" and server is None
-        )
-        _prepare_objects(config)  # a wrong folder shall fail before a server is started
+        own_server = planner == "server" and server is None
+        processes = _processes(workers, gui=gui, ray=ray, own_server=own_server)
         folder = ResultFolder(output) if output is not None else None
-        with planner_of(choice, rules.planning) as made:
-            if folder is not None:
-                folder.open(manifest(config, made.facts))
-            done = with_progress(
-                config,
-                folder,
-                lambda on_round: run_benchmark(
-                    config,
-                    made.make,
-                    workers=processes,
-                    ray=ray,
-                    folder=folder,
-                    on_round=on_round,
-                    gui=gui,
-                ),
-            )
-    except (
-        GraspClientError,
-        PlannerUnavailableError,
-        ValueError,
-        FileNotFoundError,
-        RuntimeError,
-    ) as error:
-        sys.exit(f"edgegrasp benchmark: {error}")
-    except KeyboardInterrupt:
-        again = "; the same command goes on from there" if output is not None else ""
-        sys.exit(f"edgegrasp benchmark: interrupted{again}")
+        done, title = run_rounds(config, choice, folder, workers=processes, ray=ray, gui=gui)
     summary = {"scene": scene, "protocol": rules.name, "protocol_version": rules.version}
     summary |= summarise(done)
     if folder is not None:
         folder.finish(done)
         if report:
-            _write_report(folder)
-    _print_summary(summary, made.title)
+            from edgegrasp_sim.report import write_report
+
+            print(f"report: {write_report(folder)}")
+    _print_summary(summary, title)
     if gate is not None:
-        _check_gate(lambda: below_gate(summary, gate))
+        _check_gate(summary, gate)
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="Folder that `benchmark --output` wrote.")],
+    second: Annotated[Path, typer.Argument(help="Another, of the same scenes.")],
+    output: Annotated[Path | None, Option(help="JSON file for the figures as well.")] = None,
+) -> None:
+    """Compare two benchmarks scene by scene, with 95 % confidence intervals."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import compare as figures_of
+
+    with ending_with_a_sentence("compare"):
+        figures = figures_of(ResultFolder(first), ResultFolder(second))
+    if output is not None:
+        output.write_text(json.dumps(figures, indent=1) + "\n")
+    table = Table("", str(first), str(second), "difference, paired")
+    for name, label in (("grasp_success_rate", "GSR %"), ("declutter_rate", "DR %")):
+        row = figures[name]
+        table.add_row(
+            label,
+            _interval(row["first"]["value"], row["first"]["wilson_95"]),
+            _interval(row["second"]["value"], row["second"]["wilson_95"]),
+            _interval(row["difference"], row["difference_95"], sign="+"),
+        )
+    console = Console()
+    console.print(table)
+    better, worse = figures["second_better"], figures["second_worse"]
+    console.print(
+        f"{figures['scenes']} scenes: the second removed more objects in {better}, fewer in "
+        f"{worse}, as many in {figures['scenes'] - better - worse}.",
+        soft_wrap=True,
+    )
+
+
+@contextmanager
+def ending_with_a_sentence(command: str, *, resumes: bool = False) -> Iterator[None]:
+    """End the program with a message where its user can mend something, or has interrupted it."""
+    from edgegrasp_client import GraspClientError
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_sim.trial import PlannerUnavailableError
+
+    try:
+        yield
+    except (
+        *(EdgeGraspError, GraspClientError, PlannerUnavailableError),
+        *(ValueError, FileNotFoundError, RuntimeError),
+    ) as error:
+        sys.exit(f"edgegrasp {command}: {error}")
+    except KeyboardInterrupt:
+        again = "; the same command goes on from there" if resumes else ""
+        sys.exit(f"edgegrasp {command}: interrupted{again}")
+
+
+def run_rounds(
+    config: "BenchmarkConfig",
+    choice: "PlannerChoice",
+    folder: "ResultFolder | None",
+    *,
+    workers: int,
+    ray: str | None = None,
+    gui: bool = False,
+) -> "tuple[list[Round], str]":
+    """Run what is left of a benchmark behind a progress bar.
+
+    Returns:
+        All rounds, and the name of the weights or of the planner.
+    """
+    from rich.console import Console
+
+    from edgegrasp_cli.planners.choice import open_planner
+    from edgegrasp_sim.benchmark import manifest, run_benchmark
+
+    # A wrong folder fails before a server is started; meshes are split once for all workers.
+    with Console(stderr=True).status("reading objects"):
+        config.object_set()
+    with open_planner(choice, config.protocol.planning) as planner:
+        if folder is not None:
+            folder.open(manifest(config, planner.facts))
+        with _progress(config, folder) as on_round:
+            done = run_benchmark(
+                config,
+                planner.make,
+                workers=workers,
+                ray=ray,
+                folder=folder,
+                on_round=on_round,
+                gui=gui,
+            )
+    return done, planner.title
+
+
+@contextmanager
+def _progress(
+    config: "BenchmarkConfig", folder: "ResultFolder | None"
+) -> "Iterator[Callable[[Round], None]]":
+    """A bar with the time left; yields what to call after each round."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    tasks = config.tasks()
+    finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
+    attempts = successes = objects = retries = 0
+    with Progress(*columns) as progress:
+        bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
+
+        def on_round(done: "Round") -> None:
+            nonlocal attempts, successes, objects, retries
+            attempts += len(done.attempts)
+            successes += done.successes
+            objects += len(done.objects)
+            retries += done.retries
+            text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
+            if retries:
+                text += f" asked again {retries} times"
+            progress.update(bar, advance=1, description=text)
+
+        yield on_round
 
 
 def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: bool) -> int:
@@ -181,14 +288,6 @@ def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: b
     if workers is None:
         return MAX_RAY_WORKERS if ray is not None else available_cores()
     return workers
-
-
-def _prepare_objects(config: "BenchmarkConfig") -> None:
-    """Read the objects; meshes are taken apart at this moment, once for all workers."""
-    from rich.console import Console
-
-    with Console(stderr=True).status("reading objects"):
-        config.object_set()
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
@@ -220,17 +319,18 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         )
 
 
-def _write_report(folder: "ResultFolder") -> None:
-    from edgegrasp_sim.report import write_report
+def _check_gate(summary: dict[str, Any], gate: Path) -> None:
+    from edgegrasp_sim.results import below_gate
 
-    print(f"report: {write_report(folder)}")
-
-
-def _check_gate(compare: "Callable[[], list[str]]") -> None:
-    try:
-        below = compare()
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"edgegrasp benchmark: {error}")
+    with ending_with_a_sentence("benchmark"):
+        below = below_gate(summary, gate)
     if below:
         sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
     print("not below the gate")
+
+
+def _interval(value: float | None, interval: Any, sign: str = "") -> str:
+    if value is None:
+        return "undefined"
+    low, high = interval
+    return f"{100 * value:{sign}.1f} ({100 * low:{sign}.1f} to {100 * high:{sign}.1f})"

@@ -1,44 +1,38 @@
-"""`edgegrasp detect`."""
+"""The commands that ask a detector, on a server or in this process: detect and models."""
 
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
-from edgegrasp_cli.connection import (
-    FLAGS,
-    TlsCa,
-    TlsCertificate,
-    TlsKey,
-    TokenFile,
-    UseTls,
+from edgegrasp_cli.flags import (
+    CONNECTION,
+    Server,
+    Timeout,
     connect,
+    option_flags,
+    parse_option_flags,
+    takes_flags,
 )
-from edgegrasp_cli.detection_output import as_json, print_table
+
+if TYPE_CHECKING:
+    from edgegrasp_client import Model
 
 Option = typer.Option
-NOT_OPTIONS = (
-    *("file", "server", "timeout", *FLAGS, "weights", "grippers", "device"),
-    *("as_document", "options"),
-)
+WEIGHTS_HELP = "Weights file or folder besides those that ship, where there is no server."
 
 
+@takes_flags(connection=CONNECTION, options=option_flags())
 def detect(
     file: Annotated[Path, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")],
-    server: Annotated[
-        str | None, Option(help="host:port (gRPC) or http://host:port; else in this process.")
-    ] = None,
-    timeout: Annotated[float, Option(help="Seconds to wait for a server.")] = 60.0,
-    token_file: TokenFile = None,
-    tls: UseTls = False,
-    tls_ca: TlsCa = None,
-    tls_certificate: TlsCertificate = None,
-    tls_key: TlsKey = None,
-    weights: Annotated[
-        list[Path] | None, Option(help="Weights file or folder, where there is no server.")
-    ] = None,
+    server: Server = None,
+    timeout: Timeout = 60.0,
+    weights: Annotated[list[Path] | None, Option(help=WEIGHTS_HELP)] = None,
     grippers: Annotated[
         list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
     ] = None,
@@ -46,108 +40,164 @@ def detect(
         str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")
     ] = "cpu",
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
-    options: Annotated[
-        Path | None, Option(help="JSON file with options; those given beside it win.")
+    options_file: Annotated[
+        Path | None, Option("--options", help="JSON file with options; flags beside it win.")
     ] = None,
-    model: Annotated[str | None, Option(help="Weights to use.")] = None,
-    gripper: Annotated[str | None, Option(help="Name of a gripper, or one as JSON.")] = None,
-    num_approach_points: Annotated[int | None, Option(help="Approach points sampled.")] = None,
-    num_candidates: Annotated[int | None, Option(help="Candidates scored at most.")] = None,
-    sampling: Annotated[str | None, Option(help="farthest or uniform.")] = None,
-    seed: Annotated[int | None, Option(help="Seed of every random choice.")] = None,
-    viewpoint: Annotated[
-        str | None, Option(help="Camera position, m: x,y,z; several as JSON.")
-    ] = None,
-    up: Annotated[str | None, Option(help="Direction away from gravity: x,y,z.")] = None,
-    support: Annotated[
-        str | None,
-        Option(help='JSON: {"normal":[0,0,1],"offset":0} or {"kind":"ransac"}.'),
-    ] = None,
-    workspace: Annotated[str | None, Option(help='JSON: {"min":[0,0,0],"max":[1,1,1]}, m.')] = None,
-    approach_region: Annotated[
-        str | None,
-        Option(help='JSON: {"include":[{"kind":"sphere","center":[0,0,0],"radius":0.1}]}.'),
-    ] = None,
-    contact_region: Annotated[str | None, Option(help="JSON, as --approach-region.")] = None,
-    approach_direction: Annotated[
-        str | None,
-        Option(help='JSON: {"preset":"top-down"} or {"cones":[...]}, the way the hand moves.'),
-    ] = None,
-    collision: Annotated[
-        str | None, Option(help='avoid, penalise, ignore, or JSON: {"margin":0.005}.')
-    ] = None,
-    min_score: Annotated[float | None, Option(help="Lowest score returned.")] = None,
-    top_k: Annotated[int | None, Option(help="Grasps returned at most.")] = None,
-    suppression: Annotated[
-        str | None, Option(help='JSON: {"translation":0.01,"rotation":0.5}, m and rad; or null.')
-    ] = None,
-    order: Annotated[str | None, Option(help="score, highest or clearance.")] = None,
-    debug: Annotated[
-        bool | None, Option("--debug", help="Return every candidate; with --json.")
-    ] = None,
+    *,
+    connection: dict[str, Any],
+    options: dict[str, Any],
 ) -> None:
     """Find grasps in a point cloud file, by a server or in this process.
 
-    Options are written as in query parameters of the HTTP API.
+    Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
-    given = {
-        name: value if isinstance(value, str) else json.dumps(value)
-        for name, value in locals().items()
-        if name not in NOT_OPTIONS and value is not None
-    }
-    fields = _options(options, given)
-    connection = (timeout, token_file, tls, tls_ca, tls_certificate, tls_key)
-    if server:
-        detection = _by_server(server, file, connection, fields)
-    else:
-        detection = _in_this_process(file, weights or [], grippers or [], device, fields)
+    with _ending_with_a_sentence("detect"):
+        fields = _options(options_file, options)
+        if server:
+            with connect(server, timeout, **connection) as client:
+                detection: Any = client.detect(file, **fields)
+        else:
+            detection = _detect_here(file, weights or [], grippers or [], device, fields)
     if as_document:
-        print(json.dumps(as_json(detection)))
+        print(json.dumps(_json_document(detection)))
     else:
-        print_table(detection)
+        _print_detection(detection)
 
 
-def _options(file: Path | None, given: dict[str, str]) -> dict[str, Any]:
-    """What the flags say, and the file where they do not."""
+@takes_flags(connection=CONNECTION)
+def models(
+    server: Server = None,
+    timeout: Timeout = 60.0,
+    weights: Annotated[list[Path] | None, Option(help=WEIGHTS_HELP)] = None,
+    *,
+    connection: dict[str, Any],
+) -> None:
+    """List the weights that can be used, here or on a server."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
+    )
+    with _ending_with_a_sentence("models"):
+        if server:
+            with connect(server, timeout, **connection) as client:
+                found = client.models()
+        else:
+            found = _models_here(weights or [])
+    for row in found:
+        table.add_row(
+            f"{row.name} (default)" if row.default else row.name,
+            row.architecture,
+            f"{row.parameters:,}",
+            f"{row.crop_radius:g}",
+            row.gripper,
+            row.device,
+            row.digest[:12],
+        )
+    Console().print(table)
+
+
+@contextmanager
+def _ending_with_a_sentence(command: str) -> Iterator[None]:
+    """End the program with the message of an error that the caller can mend."""
+    from edgegrasp_client import GraspClientError
     from edgegrasp_model.errors import EdgeGraspError
-    from edgegrasp_service.options_text import options_from_query
 
+    try:
+        yield
+    except (GraspClientError, EdgeGraspError, OSError) as error:
+        sys.exit(f"edgegrasp {command}: {error}")
+
+
+def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
+    """The options of the flags, and of the file where there is no flag."""
     try:
         fields = json.loads(file.read_text()) if file else {}
         if not isinstance(fields, dict):
             raise ValueError("a JSON object is needed")
-        return fields | options_from_query(given.items())
-    except (EdgeGraspError, OSError, ValueError) as error:
-        sys.exit(f"edgegrasp detect: {file or 'options'}: {error}")
+    except ValueError as error:
+        sys.exit(f"edgegrasp detect: {file}: {error}")
+    return fields | parse_option_flags(given)
 
 
-def _by_server(
-    address: str, file: Path, connection: tuple[Any, ...], options: dict[str, Any]
-) -> Any:
-    from edgegrasp_client import GraspClientError
-
-    try:
-        with connect(address, *connection) as client:
-            return client.detect(file, **options)
-    except GraspClientError as error:
-        sys.exit(f"edgegrasp detect: {error}")
-
-
-def _in_this_process(
+def _detect_here(
     file: Path, weights: list[Path], grippers: list[Path], device: str, options: dict[str, Any]
 ) -> Any:
-    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.cloud_decoding import decode_file
+    from edgegrasp_service.worker.formats import read_file
 
-    try:
-        parsed = parse_options(options)
-        data = file.read_bytes()
-        cloud = decode_file(file.suffix[1:].lower(), data, max_points=sys.maxsize)
+    parsed = parse_options(options)
+    cloud = read_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
 
-        from edgegrasp_model.detector import ModelCatalogue, choose_device
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
 
-        catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
-        return catalogue.get(parsed.model).detect(cloud, parsed)
-    except (EdgeGraspError, OSError) as error:
-        sys.exit(f"edgegrasp detect: {error}")
+    catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
+    return catalogue.get(parsed.model).detect(cloud, parsed)
+
+
+def _models_here(weights: list[Path]) -> "list[Model]":
+    from edgegrasp_client import Model
+    from edgegrasp_model.detector import ModelCatalogue
+
+    facts = ModelCatalogue.load(weights).describe()
+    return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
+
+
+def _json_document(detection: Any) -> dict[str, Any]:
+    """The same document as the HTTP API's.
+
+    Args:
+        detection: From the detector or from the client; their fields have the same names.
+    """
+    grasps = [_plain(vars(grasp)) for grasp in detection.grasps]
+    debug = None if detection.debug is None else _plain(vars(detection.debug))
+    return dict(vars(detection)) | {"grasps": grasps, "debug": debug}
+
+
+def _plain(fields: dict[str, Any]) -> dict[str, Any]:
+    """Arrays as lists, floats as float32, NaN as None."""
+    return {name: _plain_value(value) for name, value in fields.items()}
+
+
+def _plain_value(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(np.float32(value))
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.kind in "iu":
+        return value.tolist()
+    floats = value.astype(np.float32)
+    if np.isnan(floats).any():  # of scores, which are flat
+        return [None if np.isnan(number) else number for number in floats.tolist()]
+    return floats.tolist()
+
+
+def _print_detection(detection: Any) -> None:
+    """Print the ranked grasps, then counts and warnings."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        "#", "score", "TCP x y z (m)", "approach direction", "width (m)", "clearance (m)", "free"
+    )
+    for rank, grasp in enumerate(detection.grasps, start=1):
+        table.add_row(
+            str(rank),
+            f"{grasp.score:.3f}",
+            _numbers(grasp.T_cloud_tcp[:3, 3]),
+            _numbers(grasp.approach_direction),
+            f"{grasp.width:.3f}",
+            f"{grasp.clearance:+.3f}",
+            "yes" if grasp.collision_free else "no",
+        )
+    console = Console()
+    console.print(table)
+    console.print(", ".join(f"{count} {name}" for name, count in detection.counts.items()))
+    console.print(f"{detection.model}: {detection.seconds.get('total', 0.0):.2f} s")
+    for warning in detection.warnings:
+        console.print(f"Warning: {warning}")
+
+
+def _numbers(vector: Any) -> str:
+    return " ".join(f"{value:+.3f}" for value in vector)

@@ -12,19 +12,18 @@ try:
 except ModuleNotFoundError:
     sys.exit("edgegrasp: the command line is not installed. pip install 'edgegrasp[cli]'")
 
-# Command: extra it needs, one-line help. `generate-data` is generate_data() in generate_data.py.
+# Command: its module, the extra it needs, one-line help. `generate-data` is generate_data().
 COMMANDS = {
-    "serve": ("service", "Answer requests over HTTP and gRPC."),
-    "detect": ("service", "Find grasps in a point cloud file."),
-    "models": ("service", "List the weights that can be used."),
-    "benchmark": ("sim", "Clear simulated clutter with a planner's grasps and count successes."),
-    "experiment": ("train", "Run benchmarks that differ in one thing each, side by side."),
-    "replay": ("sim", "Make one recorded attempt of a benchmark again."),
-    "compare": ("sim", "Compare two benchmarks scene by scene."),
-    "generate-data": ("train", "Make labelled edge grasps in simulation."),
-    "train": ("train", "Train weights on generated data."),
-    "quantise": ("train", "Make weights in int8 of edgegrasp weights."),
-    "import-checkpoint": ("model", "Convert the authors' checkpoints to safetensors."),
+    "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
+    "detect": ("detect", "service", "Find grasps in a point cloud file."),
+    "models": ("detect", "service", "List the weights that can be used."),
+    "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
+    "experiment": ("experiment", "train", "Run benchmarks that differ in one thing each."),
+    "compare": ("benchmark", "train", "Compare two benchmarks scene by scene."),
+    "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
+    "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
+    "train": ("train", "train", "Train weights on generated data."),
+    "import-checkpoint": ("train", "model", "Convert the authors' checkpoints to safetensors."),
 }
 
 
@@ -43,11 +42,12 @@ def load_command(name: str) -> Any:
     Raises:
         SystemExit: It needs packages that are not installed.
     """
-    module = name.replace("-", "_")
+    module, _, _ = COMMANDS[name]
     try:
-        function = getattr(importlib.import_module(f"edgegrasp_cli.{module}"), module)
+        found = importlib.import_module(f"edgegrasp_cli.{module}")
     except ModuleNotFoundError as error:
         sys.exit(_missing(name, error))
+    function = getattr(found, name.replace("-", "_"))
     if isinstance(function, typer.Typer):  # a group of commands
         for command in function.registered_commands:
             if command.callback is not None:
@@ -59,7 +59,7 @@ def load_command(name: str) -> Any:
 
 
 def _naming_missing_packages(name: str, function: Callable[..., None]) -> Callable[..., None]:
-    """The function, but a package missing at run time ends it with a sentence."""
+    """The function; a package that turns out to be missing ends the program with a message."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -72,7 +72,7 @@ def _naming_missing_packages(name: str, function: Callable[..., None]) -> Callab
 
 
 def _missing(name: str, error: ModuleNotFoundError) -> str:
-    extra, _ = COMMANDS[name]
+    _, extra, _ = COMMANDS[name]
     return f"edgegrasp {name}: {error}. pip install 'edgegrasp[{extra}]'"
 
 
@@ -84,7 +84,7 @@ def _program() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for name, (_, text) in COMMANDS.items():
+    for name, (_, _, text) in COMMANDS.items():
         program.command(name, help=text, cls=TyperCommand)(lambda: None)
     return program
 

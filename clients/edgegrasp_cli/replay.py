@@ -1,21 +1,19 @@
-"""`edgegrasp replay attempt`."""
+"""`edgegrasp replay`: make an attempt of a benchmark again, or a request that a server recorded."""
 
+import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 Option = typer.Option
 
 replay = typer.Typer(
-    help="Make what a benchmark recorded again.", no_args_is_help=True, add_completion=False
+    help="Make what was recorded again: an attempt of a benchmark, or a request.",
+    no_args_is_help=True,
+    add_completion=False,
 )
-
-
-@replay.callback()
-def _group() -> None:
-    """Keeps `attempt` a command of its own."""
 
 
 @replay.command()
@@ -32,11 +30,9 @@ def attempt(
     picture: Annotated[
         Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
     ] = None,
-    film: Annotated[Path | None, Option(help="GIF to write, of the whole round.")] = None,
     gui: Annotated[bool, Option(help="Show the simulator's window.")] = False,
 ) -> None:
     """Make one recorded attempt again, in the scene and view it was made in."""
-    from edgegrasp_sim.film import film_round
     from edgegrasp_sim.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
     from edgegrasp_sim.report import DrawnAttempt, attempt_title
@@ -48,26 +44,59 @@ def attempt(
         with Replay(folder, objects, gui=gui) as repeated:
             done = repeated.find(first if seed is None else seed, round, number)
             now, seen = repeated.repeat(done.seed, round, number)
-            before = done.attempts[number]
-            if picture is not None:
-                draw_grasps(
-                    picture,
-                    seen.cloud,
-                    [DrawnAttempt.of(before)],
-                    camera_position=seen.camera_position,
-                    title=attempt_title(done, number),
-                )
-            if film is not None:
-                film_round(repeated, done, film)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"edgegrasp replay: {error}")
-    print(attempt_title(done, number))
-    same = (now.outcome, now.cause, now.object, now.opening) == (
-        before.outcome,
-        before.cause,
-        before.object,
-        before.opening,
-    )
-    if not same:
-        sys.exit(f"edgegrasp replay: it came out otherwise: {now.cause or now.outcome}")
-    print("it came out the same")
+    before, title = done.attempts[number], attempt_title(done, number)
+    if picture is not None:
+        drawn = [DrawnAttempt.of(before)]
+        draw_grasps(picture, seen.cloud, drawn, camera_position=seen.camera_position, title=title)
+    print(title)
+    if any(
+        getattr(now, name) != getattr(before, name)
+        for name in ("outcome", "cause", "object", "opening")
+    ):
+        sys.exit(f"edgegrasp replay: the result differs: {now.cause or now.outcome}")
+    print("the result is the same")
+
+
+@replay.command()
+def request(
+    file: Annotated[Path, typer.Argument(help="A file that a server with --record-folder wrote.")],
+    config: Annotated[Path | None, Option(help="TOML file with the server's settings.")] = None,
+) -> None:
+    """Answer a recorded request again, in this process, and compare with the answer of then.
+
+    Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
+    """
+    from edgegrasp_service.recording import replay as answer_again
+
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_service.settings import load_settings
+
+    try:
+        again = answer_again(file, load_settings(config))
+    except (EdgeGraspError, ValueError, OSError) as error:
+        sys.exit(f"edgegrasp replay: {error}")
+    refused = again.answer.error
+    print(f"{again.answer.facts.grasps} grasps" if refused is None else refused.detail)
+    before, now = (_without_times(again.job, body) for body in (again.recorded, again.answer.body))
+    if now != before:
+        sys.exit("edgegrasp replay: the answer differs from the recorded one")
+    print("the answer is the same")
+
+
+def _without_times(job: Any, body: bytes) -> Any:
+    """An answer but for the seconds it took; None for an error, whose body is empty."""
+    from google.protobuf import json_format
+
+    from edgegrasp.v1 import grasp_pb2
+
+    if not body:
+        return None
+    if job.transport == "http":
+        answer = json.loads(body)
+    else:
+        message = getattr(grasp_pb2, f"{job.method}Response").FromString(body)
+        answer = json_format.MessageToDict(message)
+    answer.pop("seconds", None)
+    return answer

@@ -1,4 +1,4 @@
-"""`edgegrasp train`."""
+"""`edgegrasp generate-data`, `train` and `import-checkpoint`: from simulation to weights."""
 
 import shlex
 import sys
@@ -10,6 +10,52 @@ from typing import Annotated, Any, Literal
 import typer
 
 Option = typer.Option
+
+
+def generate_data(
+    output: Annotated[Path, typer.Argument(help="Folder for the views, one file each.")],
+    objects: Annotated[
+        Path | None, Option(help="Folder packed/train, pile/train; else the built-in objects.")
+    ] = None,
+    scenes: Annotated[int, Option(min=1, help="Scenes.")] = 100,
+    scene: Annotated[
+        Literal["packed", "pile"] | None,
+        Option(help="Kind of the scenes; else half packed, half piles."),
+    ] = None,
+    views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
+    grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,
+    seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 1,
+    weights: Annotated[
+        Path | None,
+        Option(help="Network that chooses half of the grasps: its best, and its least certain."),
+    ] = None,
+    workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
+) -> None:
+    """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
+
+    Views that are there already are kept, so that the same command goes on where it stopped.
+    """
+    from rich.progress import track
+
+    from edgegrasp_sim.objects import SceneKind
+    from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+    from edgegrasp_training.views import find_views, write_data_card
+
+    kind = None if scene is None else SceneKind(scene)
+    options = GenerationOptions(
+        scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights, kind=kind
+    )
+    missing = len(missing_scenes(output, options))
+    tried = held = 0
+    try:
+        finished = generate(output, objects, options, workers)
+        for _, grasps, successes in track(finished, "scenes", total=missing):
+            tried, held = tried + grasps, held + successes
+    except FileNotFoundError as error:
+        sys.exit(f"edgegrasp generate-data: {error}")
+    write_data_card(output, find_views([output]), _command())
+    share = f", {100 * held / tried:.1f} % held" if tried else ""
+    print(f"{missing} scenes made, {scenes - missing} kept; {tried} grasps tried{share}.")
 
 
 def train(
@@ -33,7 +79,9 @@ def train(
     ] = "plateau",
     rotations: Annotated[
         Literal["any", "upright", "none"],
-        Option(help="Turn training balls: any way, about up, or not; edgegrasp and its kin only."),
+        Option(
+            help="Random rotations of training balls: any, about up only, none; edgegrasp networks."
+        ),
     ] = "any",
     teacher: Annotated[
         Path | None,
@@ -44,7 +92,7 @@ def train(
         Option(
             min=0.01,
             max=0.99,
-            help="Of the balls, metres, in place of the recipe's; 0.5: the paper's NoBall.",
+            help="Radius of the balls, metres; else the recipe's. 0.5: the paper's NoBall.",
         ),
     ] = None,
     evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
@@ -61,8 +109,8 @@ def train(
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again goes on from the last state. What a teacher
-    says is kept beside the run folder, in `taught`.
+    done a model card. Running the same command again goes on from the last state. The scores of a
+    teacher are kept beside the run folder, in `taught`.
     """
     from edgegrasp_model.errors import InvalidCheckpoint
     from edgegrasp_training.recipes import recipe
@@ -95,10 +143,37 @@ def train(
     print(f"{len(training_views)} training and {len(validation_views)} validation views")
     _run(trainer, until)
     if trainer.finished:
-        evaluation = trainer.finish(_provenance(data), shlex.join(["edgegrasp", *sys.argv[1:]]))
+        evaluation = trainer.finish(_provenance(data), _command())
         print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {run}")
     else:
         print(f"paused at step {trainer.step}; the same command goes on")
+
+
+def import_checkpoint(
+    directory: Annotated[Path, typer.Argument(help="Holds the authors' *-ckpt-N.pt files.")],
+    output: Annotated[
+        Path | None, typer.Argument(help="File to write; else ARCHITECTURE.safetensors here.")
+    ] = None,
+    voxel_size: Annotated[float, Option(help="Of the clouds it was trained on, m.")] = 0.0045,
+    crop_radius: Annotated[float, Option(help="Ball radius, m.")] = 0.05,
+    gripper: Annotated[str, Option(help="Gripper it was trained for.")] = "panda",
+) -> None:
+    """Convert a checkpoint in the authors' layout to one safetensors file."""
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_model.gripper import load_gripper
+    from edgegrasp_model.networks.checkpoint import save_checkpoint
+    from edgegrasp_model.networks.import_checkpoint import import_checkpoint as convert
+
+    try:
+        load_gripper(gripper)
+        network, metadata = convert(
+            directory, voxel_size=voxel_size, crop_radius=crop_radius, gripper=gripper
+        )
+    except (EdgeGraspError, ValueError) as error:
+        sys.exit(f"edgegrasp import-checkpoint: {error}")
+    path = output or Path(f"{metadata.name}.safetensors")
+    save_checkpoint(path, network, metadata)
+    print(f"{path}: {metadata.network.architecture}, use it with --weights {path}")
 
 
 def _run(trainer: Any, until: int | None) -> None:
@@ -115,3 +190,8 @@ def _run(trainer: Any, until: int | None) -> None:
 
 def _provenance(data: list[Path]) -> dict[str, Any]:
     return {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
+
+
+def _command() -> str:
+    """The command as it was typed, for cards of data and of models."""
+    return shlex.join(["edgegrasp", *sys.argv[1:]])

@@ -1,40 +1,34 @@
-"""Many rounds of clutter removal, in one process or several, resumable."""
+"""Many rounds of clutter removal, resumable: in this process, in several, or on a Ray cluster."""
 
-from __future__ import annotations
-
-import hashlib
+import importlib
 import multiprocessing
 import os
 import platform
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path
+from typing import Any, TypeAlias
 
-from edgegrasp_sim import grasping, gripper, scene, trials, world
+from edgegrasp_sim import engine, hand, objects, scene, trial
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trials import PATIENCE, Closes, Planner, Round, run_round
-from edgegrasp_sim.window import ShownPlanner, Window
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from edgegrasp_sim.results import ResultFolder
+from edgegrasp_sim.trial import PATIENCE, Closes, Planner, Round, run_round
+from edgegrasp_sim.window import Window
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
-
-MAX_CRASHES = 3  # in a row without a finished round between them
+MAX_CRASHES = 3  # in a row, without a finished round between them
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
+LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +42,7 @@ class BenchmarkConfig:
         seeds: with a round's number, a seed gives the round's scene, views and noise.
         objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
         split: of that folder.
-        patience: seconds to go on asking a planner that is unavailable.
+        patience: seconds to keep asking a planner that is unavailable.
     """
 
     scene: SceneKind
@@ -92,17 +86,17 @@ def run_benchmark(
     on_round: Callable[[Round], None] | None = None,
     gui: bool = False,
 ) -> list[Round]:
-    """Run all rounds that `folder` does not hold yet, wherever: outcomes stay the same.
+    """Run all rounds that `folder` does not hold yet; outcomes do not depend on where.
 
     Args:
         config: what to run.
         make_planner: called once in every process.
-        workers: processes; with 1 all runs in this one. The rounds of a worker process that
-            dies are run again by another.
-        ray: address of a Ray cluster to run the workers on; see `run_on_ray`.
+        workers: processes; with 1 all runs in this one. If a worker dies, another runs its
+            rounds again.
+        ray: address of a Ray cluster to run the workers on; see `_run_on_ray`.
         folder: keeps each round as it finishes; opened by the caller.
-        on_round: told of every round as it is done, in any order.
-        gui: show PyBullet's window; with one worker only.
+        on_round: called with every round as it finishes, in any order.
+        gui: show the simulator's window; with one worker only.
 
     Returns:
         All rounds of `config`, by seed and index.
@@ -115,16 +109,14 @@ def run_benchmark(
     """
     if workers < 1:
         raise ValueError(f"workers is {workers}; use at least 1")
-    config.object_set()  # a wrong folder shall fail here, not in every worker
+    config.object_set()  # fail here on a wrong folder, not in every worker
     tasks = config.tasks()
     kept = folder.rounds() if folder is not None else []
     rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
     missing = [task for task in tasks if task not in rounds]
     workers = max(1, min(workers, len(missing)))
     if ray is not None:
-        from edgegrasp_sim.ray_cluster import run_on_ray
-
-        run = run_on_ray(ray, config, make_planner, missing, workers)
+        run = _run_on_ray(ray, config, make_planner, missing, workers)
     elif workers == 1:
         run = _run_here(config, make_planner, missing, gui)
     else:
@@ -139,21 +131,21 @@ def run_benchmark(
 
 
 def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]:
-    """What is needed to get the same figures again.
+    """All that is needed to reproduce the figures.
 
     Args:
         config: what is run.
         planner: how grasps are planned: its name, the weights' name and digest, options.
     """
-    objects = config.object_set()
+    drawn = config.object_set()
     return {
         "run": {
             "scene": config.scene.value,
             "protocol": config.protocol.to_json(),
             "objects": {
-                "name": objects.name,
-                "models": len(objects.models),
-                "digest": objects_digest(objects),
+                "name": drawn.name,
+                "models": len(drawn.models),
+                "digest": drawn.digest,
             },
             "planner": planner,
             "constants": constants(),
@@ -178,41 +170,31 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 def constants() -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
     return {
-        "time_step": world.TIME_STEP,
-        "solver_iterations": world.SOLVER_ITERATIONS,
-        "gravity": world.GRAVITY,
+        "time_step": engine.TIME_STEP,
+        "solver_iterations": engine.SOLVER_ITERATIONS,
+        "gravity": engine.GRAVITY,
         "table_friction": scene.TABLE_FRICTION,
-        "object_mass": scene.OBJECT_MASS,
-        "object_friction": scene.OBJECT_FRICTION,
+        "object_mass": objects.OBJECT_MASS,
+        "object_friction": objects.OBJECT_FRICTION,
         "packed_attempts": scene.PACKED_ATTEMPTS,
         "pile_drop_height": scene.PILE_DROP_HEIGHT,
         "rest_speed": scene.REST_SPEED,
-        "max_opening": gripper.MAX_OPENING,
-        "hand_mass": gripper.HAND_MASS,
-        "finger_friction": gripper.FINGER_FRICTION,
-        "finger_spinning_friction": gripper.FINGER_SPINNING_FRICTION,
-        "finger_force": gripper.FINGER_FORCE,
-        "gear_force": gripper.GEAR_FORCE,
-        "tool_force": gripper.TOOL_FORCE,
-        "close_seconds": gripper.CLOSE_SECONDS,
-        "collision_depth": gripper.COLLISION_DEPTH,
-        "pregrasp_distance": grasping.PREGRASP_DISTANCE,
-        "retreat_distance": grasping.RETREAT_DISTANCE,
-        "side_grasp_angle": grasping.SIDE_GRASP_ANGLE,
-        "step_length": grasping.STEP_LENGTH,
-        "min_opening": grasping.MIN_OPENING,
-        "min_points": trials.MIN_POINTS,
+        "max_opening": hand.MAX_OPENING,
+        "hand_mass": hand.HAND_MASS,
+        "finger_friction": hand.FINGER_FRICTION,
+        "finger_spinning_friction": hand.FINGER_SPINNING_FRICTION,
+        "finger_force": hand.FINGER_FORCE,
+        "gear_force": hand.GEAR_FORCE,
+        "tool_force": hand.TOOL_FORCE,
+        "close_seconds": hand.CLOSE_SECONDS,
+        "collision_depth": hand.COLLISION_DEPTH,
+        "pregrasp_distance": hand.PREGRASP_DISTANCE,
+        "retreat_distance": hand.RETREAT_DISTANCE,
+        "side_grasp_angle": hand.SIDE_GRASP_ANGLE,
+        "step_length": hand.STEP_LENGTH,
+        "min_opening": hand.MIN_OPENING,
+        "min_points": trial.MIN_POINTS,
     }
-
-
-def objects_digest(objects: ObjectSet) -> str:
-    """SHA-256 of the names, scales and descriptions of a set's objects."""
-    digest = hashlib.sha256()
-    for model in objects.models:
-        digest.update(f"{model.name} {model.scale}".encode())
-        for file in model.files:
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
 
 
 def available_cores() -> int:
@@ -222,24 +204,37 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _version(distribution: str) -> str | None:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return None
-
-
 class RoundRunner:
-    """A simulation with a planner, for one process."""
+    """A simulation with a planner, for one process.
+
+    Args:
+        config: what to run.
+        make_planner: called once.
+        gui: show the simulator's window.
+        digest: that the objects must have, if they are read on another machine.
+
+    Raises:
+        ValueError: the objects have another digest.
+    """
 
     def __init__(
-        self, config: BenchmarkConfig, make_planner: PlannerFactory, gui: bool = False
+        self,
+        config: BenchmarkConfig,
+        make_planner: PlannerFactory,
+        *,
+        gui: bool = False,
+        digest: str | None = None,
     ) -> None:
+        objects = config.object_set()
+        if digest not in (None, objects.digest):
+            raise ValueError(
+                f"the objects in {config.objects} differ between the machines of the cluster; put "
+                "the same folder at the same path on each"
+            )
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: config.object_set()}, gui=gui)
-        if gui:
-            self.planner = ShownPlanner(self.planner, Window(self.simulation.world))
+        self.simulation = ClutterSimulation({config.scene: objects}, gui=gui)
+        self.window = Window(self.simulation.world) if gui else None
 
     def run(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
@@ -253,10 +248,11 @@ class RoundRunner:
             seed=seed,
             index=index,
             patience=config.patience,
+            on_grasp=self.window.show if self.window is not None else None,
         )
 
     def close(self) -> None:
-        """Give back what simulation and planner hold."""
+        """Release what simulation and planner hold."""
         self.simulation.close()
         if isinstance(self.planner, Closes):
             self.planner.close()
@@ -267,31 +263,17 @@ def _run_here(
 ) -> Iterator[Round]:
     if not tasks:
         return
-    runner = RoundRunner(config, make_planner, gui)
+    runner = RoundRunner(config, make_planner, gui=gui)
     try:
         yield from map(runner.run, tasks)
     finally:
         runner.close()
 
 
-_worker: RoundRunner | None = None  # one in each worker process, made by its initialiser
-
-
-def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    _worker = RoundRunner(config, make_planner)
-
-
-def _run_in_worker(task: Task) -> Round:
-    assert _worker is not None
-    return _worker.run(task)
-
-
 def _run_pools(
     config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
-    """Run rounds in processes; where one dies, the pool breaks and another takes its place."""
+    """Run rounds in processes; if one dies, the pool breaks and a new one takes its place."""
     missing, crashes = list(tasks), 0
     while missing:
         finished = 0
@@ -309,23 +291,10 @@ def _run_pools(
                 ) from None
 
 
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile use one thread each: with all cores busy, more only wait."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update({name: value or "1" for name, value in before.items()})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-
-
 def _run_pool(
     config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
-    # Forked children would share the parent's physics servers and threads.
+    # Forked children would share the parent's physics servers.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(
         workers, context, initializer=_start_worker, initargs=(config, make_planner)
@@ -337,3 +306,112 @@ def _run_pool(
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+_worker: RoundRunner | None = None  # of a worker process, made by its initialiser
+
+
+def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
+    global _worker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    _worker = RoundRunner(config, make_planner)
+
+
+def _run_in_worker(task: Task) -> Round:
+    assert _worker is not None
+    return _worker.run(task)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Make processes started meanwhile use one thread each: all cores are busy anyway."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update({name: value or "1" for name, value in before.items()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
+def _run_on_ray(
+    address: str,
+    config: BenchmarkConfig,
+    make_planner: PlannerFactory,
+    tasks: Sequence[Task],
+    workers: int,
+) -> Iterator[Round]:
+    """Run rounds in the actors of a Ray cluster.
+
+    Each of its machines needs this package, the same objects at the same path, and what the
+    planner needs. An actor that dies is restarted, and so is its round.
+
+    Args:
+        address: of the cluster, as `ray.init` takes it; `local` starts one on this machine.
+        config: what to run.
+        make_planner: called once in every actor.
+        tasks: the rounds.
+        workers: actors at most; no more are started than the cluster has processors.
+
+    Yields:
+        The rounds, in the order in which they finish.
+
+    Raises:
+        RuntimeError: Ray is not installed, there is no such cluster, or actors keep dying.
+    """
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ModuleNotFoundError:
+        raise RuntimeError("ray is not installed: pip install 'edgegrasp[ray]'") from None
+    if not tasks:
+        return
+    _connect_ray(ray, address, workers)
+    try:
+        workers = max(1, min(workers, int(ray.cluster_resources().get("CPU", 1))))
+        actor: Any = ray.remote(
+            num_cpus=1, max_restarts=MAX_CRASHES * len(tasks), max_task_retries=MAX_CRASHES
+        )(RoundRunner)
+        digest = config.object_set().digest
+        idle = [actor.remote(config, make_planner, digest=digest) for _ in range(workers)]
+        waiting = list(reversed(tasks))
+        running: dict[Any, Any] = {}
+        while waiting or running:
+            while idle and waiting:
+                runner = idle.pop()
+                running[runner.run.remote(waiting.pop())] = runner
+            (done,), _ = ray.wait(list(running))
+            idle.append(running.pop(done))
+            yield _ray_result(ray, done)
+    finally:
+        ray.shutdown()
+
+
+def _connect_ray(ray: Any, address: str, workers: int) -> None:
+    quiet = {"log_to_driver": False, "logging_level": "ERROR"}
+    try:
+        if address == LOCAL_RAY:
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
+            ray.init(address=LOCAL_RAY, num_cpus=workers, include_dashboard=False, **quiet)
+        else:
+            ray.init(address=address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
+
+
+def _ray_result(ray: Any, done: Any) -> Round:
+    """A finished round; raises the errors that a worker process would have raised."""
+    try:
+        result: Round = ray.get(done)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    except ray.exceptions.RayActorError as error:
+        raise RuntimeError(f"a Ray actor died again and again: {error}") from error
+    return result
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return None

@@ -1,31 +1,64 @@
-"""The depth camera: intrinsics, viewpoints, rendering, and the way from depth to points."""
+"""The depth camera: viewpoints, noise, the way from depth to points, and what planners are shown.
 
-from __future__ import annotations
+The surfaces of a depth image may be resampled. Its pixels lie farther apart on a surface seen at a
+slant; a volume of signed distances, from which the reference system takes its clouds, has one point
+wherever the distance changes its sign between two neighbours of a grid.
+"""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import Literal, TypeVar
 
 import numpy as np
-import pybullet
+from numpy.typing import NDArray
+from scipy.ndimage import zoom
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.poses import Matrix
+from edgegrasp_sim.scene import SIZE, TABLE_HEIGHT
 
-    from edgegrasp_sim.poses import Matrix
-    from edgegrasp_sim.world import World
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+
+TRUNCATION = 4  # voxels; a point farther from a surface has no signed distance
+_NEAR = 0.98  # of the truncation, within which a distance counts as one to a surface
+TableView = Literal["known", "ransac", "seen"]
+# Lowest and highest corner of where grasps are looked for; the table itself is cut off.
+WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
+_WITH_TABLE = np.array([[0.02, 0.02, TABLE_HEIGHT - 0.01], WORKSPACE[1]])
+_AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
+WORKSPACE_BOX = {"known": WORKSPACE, "ransac": _WITH_TABLE, "seen": WORKSPACE}
+CLOUD_BOX = {"known": WORKSPACE, "ransac": _WITH_TABLE, "seen": _WITH_TABLE + _AROUND}
+Float = TypeVar("Float", bound=np.floating)
 
 
 @dataclass(frozen=True, slots=True)
-class Intrinsics:
-    """A pinhole camera; lengths in pixels, clipping distances in metres."""
+class Observation:
+    """The point cloud that one or several depth images show, and what a planner may know besides.
 
-    width: int = 640
-    height: int = 480
-    focal_length: float = 540.0
-    centre_x: float = 320.0
-    centre_y: float = 240.0
-    near: float = 0.1
-    far: float = 2.0
+    Attributes:
+        cloud: (N, 3) float32, world frame, metres; order of the pixels, one image after another.
+        T_world_camera: (4, 4) pose of the first camera (z along the line of sight, y down).
+        camera_position: (3,) float32, that of the first camera, world frame, metres.
+        workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for.
+        table_height: metres; not to be used where `table` is `ransac`.
+        camera_positions: (V, 3) float32, every camera, world frame, metres.
+        view_ids: (N,) int32, which camera saw each point.
+        table: whether the cloud is cut off above the table (`known`) or holds it too: to be found
+            (`ransac`), or to correct the depth scale by (`seen`; then the cloud is not cut off at
+            the sides of the workspace either).
+        failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
+    """
+
+    cloud: NDArray[np.float32]
+    T_world_camera: Matrix
+    camera_position: NDArray[np.float32]
+    workspace: NDArray[np.float32]
+    table_height: float
+    camera_positions: NDArray[np.float32]
+    view_ids: NDArray[np.int32]
+    table: TableView = "known"
+    failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +77,11 @@ class ViewRange:
     azimuth: tuple[float, float]
     target: tuple[float, float, float] = (0.15, 0.15, 0.25)
 
-    def sample(self, rng: np.random.Generator) -> Matrix:
-        """Draw one pose `T_world_camera`, uniform in each coordinate: (4, 4)."""
-        return self.sample_ring(rng, 1)[0]
+    def sample(self, rng: np.random.Generator, views: int = 1) -> list[Matrix]:
+        """Draw a pose `T_world_camera` (4, 4), and spread others evenly over a full turn from it.
 
-    def sample_ring(self, rng: np.random.Generator, views: int) -> list[Matrix]:
-        """Draw one pose as `sample` does, and others spread evenly over a full turn from it."""
+        The first is uniform in each coordinate.
+        """
         radius = rng.uniform(*self.radius)
         polar = rng.uniform(*self.polar_angle)
         first = rng.uniform(*self.azimuth)
@@ -90,53 +122,126 @@ def look_at(eye: Matrix, target: Matrix) -> Matrix:
     return T
 
 
-class Camera:
-    """A depth camera in a world."""
-
-    def __init__(self, world: World, intrinsics: Intrinsics | None = None) -> None:
-        self.world = world
-        self.intrinsics = intrinsics if intrinsics is not None else Intrinsics()
-
-    def render_depth(self, T_world_camera: Matrix) -> NDArray[np.float64]:
-        """Distance along the line of sight for every pixel: (height, width) metres.
-
-        Pixels that show nothing read `far`.
-        """
-        k = self.intrinsics
-        view = np.linalg.inv(T_world_camera)
-        view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
-        _, _, _, z_buffer, _ = pybullet.getCameraImage(
-            k.width,
-            k.height,
-            viewMatrix=view.flatten(order="F").tolist(),
-            projectionMatrix=_projection(k).flatten(order="F").tolist(),
-            renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self.world.client,
-        )
-        z = np.asarray(z_buffer, dtype=np.float64).reshape(k.height, k.width)
-        return k.far * k.near / (k.far - (k.far - k.near) * z)
-
-    def points(self, depth: NDArray[np.float64], T_world_camera: Matrix) -> NDArray[np.float64]:
-        """The points of a depth image nearer than `far`, world frame: (N, 3) metres."""
-        k = self.intrinsics
-        row, column = np.nonzero(depth < 0.999 * k.far)
-        z = depth[row, column]
-        # The renderer samples a pixel at its lower left corner.
-        x = (column - k.centre_x) * z / k.focal_length
-        y = (row + 1.0 - k.centre_y) * z / k.focal_length
-        in_camera = np.stack((x, y, z), axis=1)
-        return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+def points_of(
+    depth: NDArray[np.float64], T_world_camera: Matrix, camera: Intrinsics
+) -> NDArray[np.float64]:
+    """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
+    row, column = np.nonzero(depth < 0.999 * camera.far)
+    z = depth[row, column]
+    # The renderer samples a pixel at its lower left corner.
+    x = (column - camera.centre_x) * z / camera.focal_length
+    y = (row + 1.0 - camera.centre_y) * z / camera.focal_length
+    in_camera = np.stack((x, y, z), axis=1)
+    return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def _projection(k: Intrinsics) -> Matrix:
-    """OpenGL's projection matrix of a pinhole camera (row-major)."""
-    matrix = np.zeros((4, 4))
-    matrix[0, 0] = 2.0 * k.focal_length / k.width
-    matrix[1, 1] = 2.0 * k.focal_length / k.height
-    matrix[0, 2] = 1.0 - 2.0 * k.centre_x / k.width
-    matrix[1, 2] = 2.0 * k.centre_y / k.height - 1.0
-    matrix[2, 2] = -(k.far + k.near) / (k.far - k.near)
-    matrix[2, 3] = -2.0 * k.far * k.near / (k.far - k.near)
-    matrix[3, 2] = -1.0
-    return matrix
+@dataclass(frozen=True, slots=True)
+class DepthNoise:
+    """Noise of depth images: a random factor on each, and smooth Gaussian noise on some.
+
+    Attributes:
+        gamma_shape: shape of the gamma distribution of the factor; 0: no factor.
+        gamma_scale: its scale.
+        correlated_std: standard deviation of the smooth noise, metres.
+        correlated_pixels: pixels between its independent values, interpolated in between.
+        correlated_share: share of the images that have it.
+    """
+
+    gamma_shape: float
+    gamma_scale: float
+    correlated_std: float
+    correlated_pixels: int
+    correlated_share: float
+
+    def apply(self, depth: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """A noisy copy of a depth image: (height, width) metres."""
+        noisy: NDArray[np.float64] = depth
+        if self.gamma_shape > 0:
+            noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)
+        if self.correlated_std > 0 and rng.random() < self.correlated_share:
+            height, width = depth.shape
+            step = self.correlated_pixels
+            coarse = rng.normal(0.0, self.correlated_std, (height // step, width // step))
+            factors = (height / coarse.shape[0], width / coarse.shape[1])
+            noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
+        return noisy
+
+
+def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:
+    """The points (N, 3) in a box (2, 3), lowest and highest corner, grown by a margin."""
+    inside = (points >= box[0] - margin) & (points <= box[1] + margin)
+    kept: NDArray[Float] = points[inside.all(axis=1)]
+    return kept
+
+
+def resample_surfaces(
+    depth: Float64, T_world_camera: Matrix, intrinsics: Intrinsics, box: Matrix, voxel: float
+) -> Float64:
+    """Points where the signed distance along the line of sight changes its sign.
+
+    Args:
+        depth: (height, width) metres along the line of sight.
+        T_world_camera: (4, 4) pose of the camera.
+        intrinsics: of the camera.
+        box: (2, 3) lowest and highest corner of the grid, world frame, metres.
+        voxel: edge of the grid's cells, metres.
+
+    Returns:
+        (N, 3) metres, world frame, ordered by axis and cell.
+    """
+    first = np.floor(box[0] / voxel).astype(int)
+    shape = np.ceil(box[1] / voxel).astype(int) - first + 1
+    axes = [((first[k] + np.arange(shape[k]) + 0.5) * voxel).astype(np.float32) for k in range(3)]
+    distance = _distances(depth, T_world_camera, intrinsics, axes, TRUNCATION * voxel)
+    points = []
+    for axis in range(3):
+        here = np.moveaxis(distance, axis, 0)[:-1]
+        there = np.moveaxis(distance, axis, 0)[1:]
+        # NaN, the distance far from any surface, compares as false.
+        crossed = np.moveaxis(here * there < 0, 0, axis)
+        cell = np.nonzero(crossed)
+        start = distance[cell]
+        end = distance[tuple(index + (k == axis) for k, index in enumerate(cell))]
+        place = np.stack([axes[k][index] for k, index in enumerate(cell)], axis=1)
+        place[:, axis] += voxel * start / (start - end)
+        points.append(place)
+    return np.concatenate(points)
+
+
+def _distances(
+    depth: Float64,
+    T_world_camera: Matrix,
+    intrinsics: Intrinsics,
+    axes: list[Float32],
+    truncation: float,
+) -> Float32:
+    """Signed distance at each point of a grid, positive before a surface, NaN far from any.
+
+    It is measured along the line of sight, to the depth of the nearest pixel.
+    """
+    k, T_camera_world = intrinsics, np.linalg.inv(T_world_camera).astype(np.float32)
+    x, y, z = (_along(T_camera_world[row], axes) for row in range(3))
+    x /= z
+    y /= z
+    # The renderer samples a pixel at its lower left corner.
+    column = np.rint(x * k.focal_length + k.centre_x).astype(np.int32)
+    row = np.rint(y * k.focal_length + k.centre_y - 1.0).astype(np.int32)
+    height, width = depth.shape
+    outside = (column < 0) | (column >= width) | (row < 0) | (row >= height)
+    column[outside] = row[outside] = 0
+    distance: Float32 = depth.astype(np.float32)[row, column] - z
+    distance *= np.sqrt(1.0 + x * x + y * y)
+    distance[outside | (np.abs(distance) > _NEAR * truncation)] = np.nan
+    return distance
+
+
+def _along(row: Float32, axes: list[Float32]) -> Float32:
+    """One coordinate, in another frame, of every point of a grid.
+
+    Args:
+        row: (4,) of the transform into that frame.
+        axes: the grid's coordinates along each of its axes.
+    """
+    first, second, third = (row[axis] * values for axis, values in enumerate(axes))
+    whole: Float32 = first[:, None, None] + second[:, None] + third + row[3]
+    return whole

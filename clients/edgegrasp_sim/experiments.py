@@ -1,19 +1,17 @@
-"""Experiments: many benchmarks that differ in one thing each, and what comes of them together."""
-
-from __future__ import annotations
+"""Experiments: benchmarks that differ in one thing each, and their table and figure."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import PurePath
-from typing import TYPE_CHECKING, Any, TypeAlias
+from pathlib import Path, PurePath
+from typing import Any, TypeAlias
 
-from edgegrasp_sim.families import FAMILIES, write_family
-from edgegrasp_sim.objects import SceneKind
+import numpy as np
+from matplotlib.figure import Figure
+
+from edgegrasp_sim.objects import FAMILIES, SceneKind, write_family
 from edgegrasp_sim.protocol import Protocol, load_protocol
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from edgegrasp_sim.results import planner_title
 
 NOISE_MILLIMETRES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 VOXEL_MILLIMETRES = (3.0, 4.0, 5.0, 6.0, 8.0)
@@ -22,6 +20,9 @@ FLIPPED_PERCENT = (0.0, 5.0, 10.0, 25.0, 50.0)
 # Approach points and candidates, named as in the paper's table.
 SAMPLES = {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
 BASELINES = ("edge-sample", "oracle", "oracle-own")
+RATES = (("grasp_success_rate", "GSR"), ("declutter_rate", "DR"))
+COLOURS = {"packed": "#2f6db3", "pile": "#e08a1e"}
+STYLES = ("-", "--", ":", "-.")  # of the models
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +30,11 @@ class Case:
     """One benchmark of an experiment.
 
     Attributes:
-        group: what is varied.
-        value: to what; a number, or a name.
+        group: what varies.
+        value: its value here, a number or a name.
         scene: kind of the scenes.
-        protocol: the constants, the changed one among them.
-        planner: fields of the planner that are changed.
+        protocol: the constants, with the one that varies.
+        planner: fields of the planner that vary.
         objects: folder of the objects; None: the experiment's.
     """
 
@@ -84,16 +85,6 @@ def robustness(
     return cases
 
 
-def _views(protocol: Protocol) -> list[Protocol]:
-    """A protocol, the same with the camera of `giga`, and `giga` with its noise."""
-    giga = load_protocol("giga")
-    return [
-        protocol,
-        replace(protocol, name=f"{protocol.name}, giga's camera", camera=giga.camera),
-        giga,
-    ]
-
-
 def samples(
     protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
 ) -> list[Case]:
@@ -116,10 +107,10 @@ def samples(
 def labels(
     protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
 ) -> list[Case]:
-    """Success against the labels that weights learned from: what the folder of each file says.
+    """Success against the number of training labels, which names the folder of each weights file.
 
     Raises:
-        ValueError: a model is no file in a folder that is named by a number.
+        ValueError: a model is not a file in a folder named by a number.
     """
     del folder
     numbers = {model: PurePath(model).parent.name for model in models}
@@ -139,7 +130,7 @@ def labels(
 def families(
     protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
 ) -> list[Case]:
-    """Success on thin, flat and large objects, which are written into the experiment's folder."""
+    """Success on thin, flat and large objects, written into the experiment's folder."""
     whole = replace(protocol.scene, packed_scale=(1.0, 1.0), pile_scale=(1.0, 1.0))
     changed = replace(protocol, name=f"{protocol.name}, families", scene=whole)
     folders = {name: write_family(name, folder / "objects" / name) for name in FAMILIES}
@@ -154,7 +145,7 @@ def families(
 def baselines(
     protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
 ) -> list[Case]:
-    """What random candidates are worth, and the best that could be made of them."""
+    """Success of random candidates, and of the best choice among them."""
     del models, folder
     numbers = {
         "num_approach_points": protocol.planning.num_approach_points,
@@ -174,3 +165,118 @@ EXPERIMENTS: dict[str, Plan] = {
     "families": families,
     "baselines": baselines,
 }
+
+
+def experiment_table(results: dict[str, Any]) -> str:
+    """Markdown tables of an experiment, one for each group; per cent with 95 % intervals.
+
+    Args:
+        results: as in `experiment.json`.
+    """
+    parts = []
+    for group in _unique(case["group"] for case in results["cases"]):
+        cases = [case for case in results["cases"] if case["group"] == group]
+        columns = _unique((c["scene"], planner_title(c["planner"])) for c in cases)
+        if group == "planner":  # the rows name the planner
+            columns = _unique((c["scene"], "") for c in cases)
+        heads = [f"{scene}, {model}" if model else scene for scene, model in columns]
+        lines = [
+            f"| {group} | " + " | ".join(f"{head}: GSR | DR" for head in heads) + " |",
+            "| --- |" + " --- | --- |" * len(columns),
+        ]
+        for value in _unique(case["value"] for case in cases):
+            cells = []
+            for scene, model in columns:
+                found = [
+                    case
+                    for case in cases
+                    if (case["value"], case["scene"]) == (value, scene)
+                    and model in ("", planner_title(case["planner"]))
+                ]
+                cells += [percent(found[0][name]) if found else "" for name, _ in RATES]
+            lines.append(f"| {value_text(value)} | " + " | ".join(cells) + " |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def experiment_figure(results: dict[str, Any]) -> Figure:
+    """GSR and DR of an experiment with 95 % intervals: a row of axes for each group."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    groups = _unique(case["group"] for case in results["cases"])
+    figure = Figure(figsize=(9.6, 3.0 * len(groups)), dpi=90, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.subplots(len(groups), len(RATES), squeeze=False, sharey=True)
+    for row, group in zip(axes, groups, strict=True):
+        cases = [case for case in results["cases"] if case["group"] == group]
+        for place, (name, label) in zip(row, RATES, strict=True):
+            _draw(place, cases, name)
+            place.set(xlabel=group, ylabel=f"{label} (%)", ylim=(0, 102))
+            place.grid(alpha=0.25)
+            if group == "labels":
+                place.set_xscale("log")
+            place.spines[["top", "right"]].set_visible(False)
+    axes[0, 0].legend(fontsize=8, loc="best")
+    return figure
+
+
+def percent(rate: dict[str, Any]) -> str:
+    """A rate with its 95 % interval, in per cent."""
+    if rate["value"] is None:
+        return "none"
+    low, high = rate["wilson_95"]
+    return f"{100 * rate['value']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def value_text(value: float | str) -> str:
+    """A case's value as text."""
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _views(protocol: Protocol) -> list[Protocol]:
+    """A protocol, the same with the camera of `giga`, and `giga` with its noise."""
+    giga = load_protocol("giga")
+    return [
+        protocol,
+        replace(protocol, name=f"{protocol.name}, giga's camera", camera=giga.camera),
+        giga,
+    ]
+
+
+def _draw(axes: Any, cases: list[dict[str, Any]], name: str) -> None:
+    values = _unique(case["value"] for case in cases)
+    numbers = all(not isinstance(value, str) for value in values)
+    baselines = cases[0]["group"] == "planner"
+    lines = _unique((c["scene"], "" if baselines else planner_title(c["planner"])) for c in cases)
+    models = _unique(model for _, model in lines)
+    for number, (scene, model) in enumerate(lines):
+        told = [
+            case
+            for case in cases
+            if case["scene"] == scene
+            and model in ("", planner_title(case["planner"]))
+            and case[name]["value"] is not None
+        ]
+        rates = np.array([[case[name]["value"], *case[name]["wilson_95"]] for case in told])
+        if len(rates) == 0:
+            continue
+        at = np.array(
+            [case["value"] if numbers else values.index(case["value"]) for case in told], float
+        )
+        if not numbers:
+            at += 0.12 * (number - (len(lines) - 1) / 2)  # side by side
+        middle, low, high = 100 * rates.T
+        spread = np.maximum(np.stack((middle - low, high - middle)), 0.0)
+        axes.errorbar(
+            at, middle, spread, capsize=3, marker="o", markersize=4, color=COLOURS[scene],
+            linestyle=STYLES[models.index(model) % len(STYLES)] if numbers else "none",
+            label=f"{scene}, {model}" if model else scene,
+        )  # fmt: skip
+    if not numbers:
+        axes.set_xticks(range(len(values)), values)
+        axes.set_xlim(-0.5, len(values) - 0.5)
+
+
+def _unique(items: Iterable[Any]) -> list[Any]:
+    return list(dict.fromkeys(items))

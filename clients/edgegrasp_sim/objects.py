@@ -1,20 +1,41 @@
-"""Object sets: folders of URDF files, and a set made from what ships with PyBullet."""
+"""Objects to make scenes of: folders of URDF files or meshes, built-in ones, computed ones.
 
-from __future__ import annotations
+A mesh is scaled to the hand, decomposed into convex parts and cached on disk.
+"""
 
+import contextlib
 import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 from xml.etree import ElementTree
 
-import pybullet_data
+import numpy as np
+from numpy.typing import NDArray
 
-from edgegrasp_sim.meshes import MESH_SUFFIXES, prepare_mesh
+from edgegrasp_sim.engine import ASSETS
 
-if TYPE_CHECKING:
-    import numpy as np
+OBJECT_MASS = 0.5  # kg
+OBJECT_FRICTION = 1.0
+MESH_SUFFIXES = (".obj", ".stl")
+LAYOUT = 1  # of a cached object; raised whenever what is written changes
+SHORTEST_SIDE = 0.06  # metres, of the box around an object; fits between the fingers
+LONGEST_SIDE = 0.15  # metres; five such objects fit into the workspace
+# How closely convex parts follow a concave surface, as a share of its size (coacd's threshold).
+CONCAVITY = 0.05
+# A short search for cuts: a second or two for a closed mesh, a minute for a torn one.
+SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
+CACHE_FOLDER = "edgegrasp"
+Size = tuple[float, float, float]
+logger = logging.getLogger(__name__)
 
 
 class SceneKind(StrEnum):
@@ -32,13 +53,13 @@ class ObjectModel:
         name: unique within its set.
         urdf: its description.
         scale: factor that brings it to the size of the hand, before a scene's own scale.
-        origin: the object that it is another shape of, if it is one.
+        origin: the object that it is a stretched copy of, if it is one.
     """
 
     name: str
     urdf: Path
     scale: float = 1.0
-    origin: ObjectModel | None = None
+    origin: "ObjectModel | None" = None
 
     @property
     def files(self) -> list[Path]:
@@ -70,12 +91,22 @@ class ObjectSet:
         if not self.models:
             raise ValueError(f"object set {self.name!r} is empty; pass at least one object")
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the names, scales and files of the objects, in hex."""
+        digest = hashlib.sha256()
+        for model in self.models:
+            digest.update(f"{model.name} {model.scale}".encode())
+            for file in model.files:
+                digest.update(file.read_bytes())
+        return digest.hexdigest()
+
     def sample(self, rng: np.random.Generator) -> ObjectModel:
         """Draw one object, uniformly."""
         return self.models[int(rng.integers(len(self.models)))]
 
     @classmethod
-    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> ObjectSet:
+    def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name.
 
         These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), or in `root` itself
@@ -108,23 +139,146 @@ class ObjectSet:
         return cls(name, tuple(models))
 
     @classmethod
-    def builtin(cls, scene: SceneKind) -> ObjectSet:
-        """Graspable objects that ship with PyBullet, scaled to the hand."""
-        root = Path(pybullet_data.getDataPath())
+    def builtin(cls, scene: SceneKind) -> "ObjectSet":
+        """Graspable objects that ship with the engine, scaled to the hand."""
+        known = list(_BUILTIN)
+        for blobs, stands in ((_STANDING_BLOBS, True), (_OTHER_BLOBS, False)):
+            for number, scale in blobs.items():
+                file = f"random_urdfs/{number:03d}/{number:03d}.urdf"
+                known.append((f"blob_{number:03d}", file, scale, stands))
         models = tuple(
-            ObjectModel(name, root / file, scale)
-            for name, file, scale, stands in _BUILTIN
+            ObjectModel(name, ASSETS / file, scale)
+            for name, file, scale, stands in known
             if stands or scene is SceneKind.PILE
         )
         return cls(f"builtin/{scene}", models)
 
 
-def _blob(number: int, scale: float, *, stands: bool) -> tuple[str, str, float, bool]:
-    name = f"{number:03d}"
-    return f"blob_{name}", f"random_urdfs/{name}/{name}.urdf", scale, stands
+def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
+    """Make a simulated object of a mesh, or look it up in the cache.
+
+    The mesh is scaled so that the box around it has a shortest side of `SHORTEST_SIDE`, and no
+    side over `LONGEST_SIDE`. Its own unit does not matter; its z axis points up in packed scenes.
+    The camera sees the mesh itself; contacts use its convex parts.
+
+    Args:
+        mesh: `.obj` or `.stl` file.
+        cache: folder of prepared objects, each by the digest of its file and of how it is
+            prepared; the user's cache folder by default.
+
+    Returns:
+        The object's URDF file.
+
+    Raises:
+        ValueError: the file holds no solid mesh.
+        RuntimeError: coacd or trimesh is not installed.
+    """
+    _require_packages()
+    folder = (cache or cache_folder()) / _digest(mesh)
+    urdf = folder / "object.urdf"
+    if urdf.is_file():
+        return urdf
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
+    try:
+        parts = _write_object(mesh, unfinished)
+        with contextlib.suppress(OSError):  # another process was faster, with the same result
+            unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    logger.info("%s: %d convex parts", mesh.name, parts)
+    return urdf
 
 
-# Name, file under pybullet_data, scale, and whether it stands upright in a packed scene.
+def cache_folder() -> Path:
+    """Where prepared objects are kept: below `$XDG_CACHE_HOME`, else below `~/.cache`."""
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / CACHE_FOLDER / "meshes"
+
+
+def write_object(name: str, surface: str, folder: Path) -> Path:
+    """Write a computed object; the engine takes the convex hull of its surface.
+
+    Args:
+        name: of the object.
+        surface: OBJ file, metres.
+        folder: gets `<name>.obj` and `<name>.urdf`; created if missing.
+
+    Returns:
+        The URDF file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.obj").write_text(surface)
+    urdf = folder / f"{name}.urdf"
+    urdf.write_text(_hull_urdf(name))
+    return urdf
+
+
+def as_obj(
+    meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]],
+    *,
+    decimals: int = 6,
+    named: bool = False,
+) -> str:
+    """Meshes as one OBJ file.
+
+    Args:
+        meshes: points (P, 3) and triangles (F, 3) of each.
+        decimals: of coordinates.
+        named: make each mesh an object of its own; the engine takes the convex hull of each.
+    """
+    lines, before = [], 1
+    for number, (points, faces) in enumerate(meshes):
+        if named:
+            lines.append(f"o part_{number}")
+        lines += [f"v {x:.{decimals}f} {y:.{decimals}f} {z:.{decimals}f}" for x, y, z in points]
+        lines += [f"f {a} {b} {c}" for a, b, c in faces + before]
+        before += len(points)
+    return "\n".join(lines) + "\n"
+
+
+def write_family(name: str, folder: Path) -> Path:
+    """Write the objects of a family into a folder, for `ObjectSet.from_folder`; returns it.
+
+    Args:
+        name: one of `FAMILIES`.
+        folder: created if missing.
+    """
+    for number, shape in enumerate(FAMILIES[name]):
+        write_object(f"{name}-{number}", shape.obj(), folder)
+    return folder
+
+
+@dataclass(frozen=True, slots=True)
+class Prism:
+    """A prism with a regular base, which unlike a cylinder does not roll.
+
+    Attributes:
+        sides: of the base, 4 or more.
+        size: full extents along x, y and z, metres.
+        axis: 0, 1 or 2, along which the prism extends.
+    """
+
+    sides: int
+    size: Size
+    axis: int = 2
+
+    def obj(self) -> str:
+        """Its surface as an OBJ file, metres."""
+        angles = np.pi / self.sides * (2 * np.arange(self.sides) + 1)
+        base = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        base /= np.ptp(base, axis=0)  # extents of one
+        corners = np.concatenate([np.insert(base, 2, end, axis=1) for end in (-0.5, 0.5)])
+        corners = np.roll(corners, self.axis - 2, axis=1) * self.size
+        n = self.sides
+        faces = [(k, (k + 1) % n, (k + 1) % n + n) for k in range(n)]
+        faces += [(k, (k + 1) % n + n, k + n) for k in range(n)]
+        faces += [(0, k + 1, k) for k in range(1, n - 1)]
+        faces += [(n, n + k, n + k + 1) for k in range(1, n - 1)]
+        return as_obj([(corners, np.array(faces))])
+
+
+# Name, file among the engine's assets, scale, and whether it stands upright in a packed scene.
 _BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
     ("cube", "cube_small.urdf", 1.2, True),
     ("brick", "lego/lego.urdf", 2.0, True),
@@ -134,20 +288,152 @@ _BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
     ("block", "block.urdf", 1.5, False),
     ("duck", "duck_vhacd.urdf", 1.0, False),
     ("teddy", "teddy_vhacd.urdf", 1.0, False),
-    _blob(3, 1.0, stands=True),
-    _blob(8, 0.8, stands=True),
-    _blob(21, 1.0, stands=True),
-    _blob(36, 1.1, stands=True),
-    _blob(41, 0.8, stands=True),
-    _blob(45, 1.0, stands=True),
-    _blob(51, 1.0, stands=True),
-    _blob(61, 1.0, stands=True),
-    _blob(0, 0.75, stands=False),
-    _blob(2, 0.75, stands=False),
-    _blob(9, 1.2, stands=False),
-    _blob(14, 1.1, stands=False),
-    _blob(16, 0.8, stands=False),
-    _blob(39, 0.75, stands=False),
-    _blob(59, 0.8, stands=False),
-    _blob(66, 0.8, stands=False),
 )
+# Scales of objects of random shape, by number: those that stand upright, and others.
+_STANDING_BLOBS = {3: 1.0, 8: 0.8, 21: 1.0, 36: 1.1, 41: 0.8, 45: 1.0, 51: 1.0, 61: 1.0}
+_OTHER_BLOBS = {0: 0.75, 2: 0.75, 9: 1.2, 14: 1.1, 16: 0.8, 39: 0.75, 59: 0.8, 66: 0.8}
+
+
+def _boxes(*sizes: Size) -> tuple[Prism, ...]:
+    return tuple(Prism(4, size) for size in sizes)
+
+
+def _cans(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
+    """Upright prisms of a diameter and a height."""
+    return tuple(Prism(10, (diameter, diameter, height)) for diameter, height in sizes)
+
+
+def _rods(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
+    """Lying prisms of a diameter and a length."""
+    return tuple(Prism(6, (length, diameter, diameter), axis=0) for diameter, length in sizes)
+
+
+# Families that common object sets hardly hold, and a regular one. Sizes in metres as they come into
+# a scene, upright as they stand in a packed one. Thin: at most 14 mm across, lying. Flat: 8 to
+# 14 mm high. Large: 60 to 70 mm in a hand that opens 80 mm.
+FAMILIES: dict[str, tuple[Prism, ...]] = {
+    "regular": _boxes((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07))
+    + _cans((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
+    "thin": _boxes((0.09, 0.008, 0.008), (0.12, 0.012, 0.012), (0.10, 0.014, 0.010))
+    + _rods((0.008, 0.09), (0.010, 0.12), (0.014, 0.10)),
+    "flat": _boxes((0.05, 0.07, 0.008), (0.06, 0.06, 0.011), (0.05, 0.10, 0.014))
+    + _cans((0.06, 0.008), (0.06, 0.011), (0.07, 0.014)),
+    "large": _boxes((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07))
+    + _cans((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
+}
+
+
+def _require_packages() -> None:
+    try:
+        import coacd  # noqa: F401
+        import trimesh  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise RuntimeError(
+            f"{error.name} is not installed, and meshes need it: pip install 'edgegrasp[meshes]'"
+        ) from None
+
+
+def _digest(mesh: Path) -> str:
+    """SHA-256 of a mesh and of everything that decides how it is prepared."""
+    recipe = {
+        "layout": LAYOUT,
+        "shortest_side": SHORTEST_SIDE,
+        "longest_side": LONGEST_SIDE,
+        "concavity": CONCAVITY,
+        "search": SEARCH,
+        "mass": OBJECT_MASS,
+        "friction": OBJECT_FRICTION,
+        "coacd": version("coacd"),
+        "suffix": mesh.suffix.lower(),
+    }
+    digest = hashlib.sha256(json.dumps(recipe, sort_keys=True).encode())
+    digest.update(mesh.read_bytes())
+    return digest.hexdigest()
+
+
+def _write_object(mesh: Path, folder: Path) -> int:
+    """Write URDF, visual and collision meshes into a folder; returns the number of convex parts."""
+    import trimesh
+
+    surface = _read(mesh)
+    sides = np.sort(surface.bounding_box_oriented.primitive.extents)
+    surface.apply_scale(min(SHORTEST_SIDE / sides[0], LONGEST_SIDE / sides[2]))
+    surface.apply_translation(-surface.bounds.mean(axis=0))
+    parts = _convex_parts(surface)
+    solid: Any = trimesh.util.concatenate(parts)
+    solid.density = OBJECT_MASS / solid.volume
+    for kind, meshes in (("visual", [surface]), ("collision", parts)):
+        text = as_obj(((m.vertices, m.faces) for m in meshes), decimals=7, named=True)
+        (folder / f"object_{kind}.obj").write_text(text)
+    urdf = _parts_urdf(solid.center_mass, solid.moment_inertia)
+    (folder / "object.urdf").write_text(urdf)
+    return len(parts)
+
+
+def _read(mesh: Path) -> Any:
+    """The triangles of a file as one mesh.
+
+    Raises:
+        ValueError: there are none, they cannot be read, or they lie in a plane.
+    """
+    import trimesh
+
+    try:
+        surface: Any = trimesh.load(mesh, force="mesh", process=True, skip_materials=True)
+    except Exception as error:  # readers of meshes raise whatever they stumble over
+        raise ValueError(f"{mesh} cannot be read as a mesh: {error}") from error
+    if len(surface.faces) == 0 or surface.extents is None:
+        raise ValueError(f"{mesh} holds no triangles; export the object as a triangle mesh")
+    if not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9:
+        raise ValueError(f"{mesh} is no solid object (its extents are {surface.extents.tolist()})")
+    return surface
+
+
+def _convex_parts(surface: Any) -> list[Any]:
+    """Convex meshes that together fill a mesh."""
+    import coacd
+    import trimesh
+
+    coacd.set_log_level("error")
+    mesh = coacd.Mesh(np.asarray(surface.vertices), np.asarray(surface.faces))
+    parts = coacd.run_coacd(mesh, threshold=CONCAVITY, seed=0, **SEARCH)
+    return [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in parts]
+
+
+def _parts_urdf(centre: NDArray[np.float64], inertia: NDArray[np.float64]) -> str:
+    """The URDF file of an object with this centre of mass and inertia, metres and kg."""
+    xyz = " ".join(f"{value:.7f}" for value in centre)
+    names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2),
+             ("izz", 2, 2))  # fmt: skip
+    moments = " ".join(f'{name}="{inertia[row, column]:.9f}"' for name, row, column in names)
+    return f"""<?xml version="1.0"?>
+<robot name="object">
+  <link name="base_link">
+    <contact><lateral_friction value="{OBJECT_FRICTION}"/></contact>
+    <inertial>
+      <origin xyz="{xyz}"/>
+      <mass value="{OBJECT_MASS}"/>
+      <inertia {moments}/>
+    </inertial>
+    <visual><geometry><mesh filename="object_visual.obj"/></geometry></visual>
+    <collision><geometry><mesh filename="object_collision.obj"/></geometry></collision>
+  </link>
+</robot>
+"""
+
+
+def _hull_urdf(name: str) -> str:
+    """The URDF file of the object whose surface is `<name>.obj`."""
+    shape = f'<mesh filename="{name}.obj"/>'
+    return f"""<?xml version="1.0"?>
+<robot name="{name}">
+  <link name="base_link">
+    <inertial>
+      <mass value="{OBJECT_MASS}"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+    </inertial>
+    <visual><geometry>{shape}</geometry></visual>
+    <collision><geometry>{shape}</geometry></collision>
+  </link>
+</robot>
+"""

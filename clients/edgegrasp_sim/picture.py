@@ -1,24 +1,20 @@
 """A picture of a cloud and the grasps found in it, as a person would want to see them."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
+Points = NDArray[np.float64]
 
-    from numpy.typing import ArrayLike, NDArray
-
-    Points = NDArray[np.float64]
 
 PALM_Z = 0.0658  # metres along the hand's z: the palm's surface
 TIP_Z = 0.1122  # metres along the hand's z: the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
 MARGIN = 0.02  # metres around everything drawn
-MAX_CLOUD_POINTS = 12_000  # more only hide each other
+MAX_CLOUD_POINTS = 12_000  # more would only hide each other
 LABELLED = 5  # grasps that carry their rank
 CAPTION = (
     "grey: the cloud, lighter is higher    forks: palm and opened fingers, "
@@ -29,7 +25,7 @@ OUTLINE = "black"
 
 
 class Drawable(Protocol):
-    """What a grasp must have to be drawn; the client's and the detector's grasps do."""
+    """A grasp that can be drawn, such as the client's or the detector's."""
 
     @property
     def score(self) -> float: ...  # noqa: D102
@@ -137,7 +133,7 @@ def _draw_perspective(axes: Any, points: Points, camera: Points, low: Points, hi
     centre = (low + high) / 2
     x, y, z = camera - centre
     axes.set_proj_type("persp")
-    axes.computed_zorder = False  # hands in front: they are what the picture is about
+    axes.computed_zorder = False  # grippers in front of the cloud
     axes.view_init(
         elev=np.degrees(np.arctan2(z, np.hypot(x, y))), azim=np.degrees(np.arctan2(y, x))
     )

@@ -1,15 +1,11 @@
 """Rigid transforms as 4 x 4 matrices; a name `T_a_b` maps coordinates of frame b to frame a."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-Matrix: TypeAlias = "NDArray[np.float64]"
+Matrix: TypeAlias = NDArray[np.float64]
 
 
 def quaternion_xyzw(T: Matrix) -> list[float]:

@@ -1,29 +1,22 @@
-"""Protocols: everything besides planner and objects that decides what a benchmark's figures mean.
+"""Protocols: the constants of a benchmark besides planner and objects.
 
-A protocol is a data file in `protocols/`, named and versioned; its constants go into every result.
+A protocol is a named and versioned file in `protocols/`; its constants go into every result.
 """
-
-from __future__ import annotations
 
 import tomllib
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from edgegrasp_sim import scene
-from edgegrasp_sim.camera import ViewRange
-from edgegrasp_sim.noise import DepthNoise
-from edgegrasp_sim.observation import TableView
-
-if TYPE_CHECKING:
-    from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.camera import DepthNoise, TableView, ViewRange
+from edgegrasp_sim.objects import SceneKind
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
 SELECTIONS = ("best", "highest", "elsewhere")
-
 Range = tuple[float, float]
 
 
@@ -46,7 +39,7 @@ class SceneRules:
     pile_scale: Range
 
     def __post_init__(self) -> None:
-        # The simulated workspace is built to this size; a protocol states it for the record.
+        # The simulated workspace has a fixed size; a protocol only records it.
         if (self.workspace_size, self.table_height) != (scene.SIZE, scene.TABLE_HEIGHT):
             raise ValueError(
                 f"workspace_size is {self.workspace_size} and table_height {self.table_height}; "
@@ -83,8 +76,8 @@ class CameraRules:
         polar_degrees: from world z.
         azimuth_degrees: from world x.
         target: the point looked at, world frame, metres.
-        surface_voxel: metres between the points of a surface, however aslant it is seen; 0: one
-            point for each pixel.
+        surface_voxel: metres between the points of a surface, at whatever slant it is seen; 0:
+            one point for each pixel.
     """
 
     views: int
@@ -104,42 +97,24 @@ class CameraRules:
 
 
 @dataclass(frozen=True, slots=True)
-class NoiseRules:
-    """Noise of the depth image and of the points made from it; see `DepthNoise`.
+class NoiseRules(DepthNoise):
+    """Noise of the depth image, see `DepthNoise`, and of the points made from it.
 
     Attributes:
         point_std: standard deviation of each coordinate of each point, metres.
-        gamma_shape: of one factor per image; 0: no factor.
-        gamma_scale: of the same.
-        correlated_std: of smooth Gaussian noise on the image, metres.
-        correlated_pixels: between its independent values.
-        correlated_share: of the images.
     """
 
     point_std: float
-    gamma_shape: float
-    gamma_scale: float
-    correlated_std: float
-    correlated_pixels: int
-    correlated_share: float
-
-    def depth_noise(self) -> DepthNoise | None:
-        """The noise of the images; None where they have none."""
-        if self.gamma_shape == 0 and self.correlated_std == 0:
-            return None
-        values = asdict(self)
-        del values["point_std"]
-        return DepthNoise(**values)
 
 
 @dataclass(frozen=True, slots=True)
 class PlanningRules:
-    """What a planner is given and how many candidates it may look at.
+    """What a planner is given, and how many candidates it may score.
 
     Attributes:
         table: `known`: the cloud is cut off above it and its plane is told; `ransac`: it is in
             the cloud and has to be found; `seen`: it is in the cloud and its plane is told, so
-            that depths can be put right.
+            that the depth scale can be corrected.
         voxel_size: metres; network weights carry their own.
         num_approach_points: approach points sampled.
         num_candidates: candidates scored at most.
@@ -169,7 +144,7 @@ class Protocol:
     Attributes:
         name: of the protocol.
         version: raised whenever a constant changes.
-        source: where the constants come from.
+        source: where its constants come from.
         rounds: how many rounds for each seed make a full run.
         seeds: of a full run.
         scene: what stands on the table.
@@ -195,16 +170,11 @@ class Protocol:
         return self.scene.num_objects[index % len(self.scene.num_objects)]
 
     def to_json(self) -> dict[str, Any]:
-        """Every constant, ready for JSON."""
+        """All constants, ready for JSON."""
         table = asdict(self)
-        if self.camera.surface_voxel == 0:  # results from before it was known go on
+        if self.camera.surface_voxel == 0:  # so that earlier results can be resumed
             del table["camera"]["surface_voxel"]
         return table
-
-
-def protocol_names() -> list[str]:
-    """The protocols that ship, sorted."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def load_protocol(name: str) -> Protocol:
@@ -228,6 +198,11 @@ def load_protocol(name: str) -> Protocol:
         return protocol_from(table)
     except (ValueError, TypeError) as error:
         raise ValueError(f"protocol {name}: {error}") from error
+
+
+def protocol_names() -> list[str]:
+    """The protocols that ship, sorted."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def protocol_from(table: dict[str, Any]) -> Protocol:

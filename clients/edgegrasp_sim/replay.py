@@ -1,33 +1,24 @@
-"""Repeat what a benchmark recorded: any attempt, in the scene and view it was made in."""
-
-from __future__ import annotations
+"""Repeat any attempt that a benchmark recorded, in the scene and view it was made in."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Self
 
-from edgegrasp_sim.benchmark import objects_digest
+from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import protocol_from
+from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trials import PlannedGrasp, RoundDriver
+from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 from edgegrasp_sim.window import Window
-
-if TYPE_CHECKING:
-    from types import TracebackType
-    from typing import Self
-
-    from edgegrasp_sim.observation import Observation
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Attempt, Round
 
 
 class Replay:
-    """The rounds of a result folder, to be gone through again.
+    """The recorded rounds of a result folder, to be repeated.
 
     Args:
         folder: a benchmark's.
         objects: where its object folder is now; by default where it was.
-        gui: show PyBullet's window.
+        gui: show the simulator's window.
 
     Raises:
         FileNotFoundError: the folder holds no benchmark, or its objects are not there.
@@ -48,25 +39,19 @@ class Replay:
             if objects is None
             else ObjectSet.from_folder(objects, self.scene, facts["split"])
         )
-        if objects_digest(models) != run["objects"]["digest"]:
+        if models.digest != run["objects"]["digest"]:
             raise ValueError(
                 f"the objects in {objects} are not those of the benchmark in {folder.path}; "
                 "pass the folder it was run with"
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
         self.simulation = ClutterSimulation({self.scene: models}, gui=gui)
-        if gui:
-            Window(self.simulation.world)
+        self.window = Window(self.simulation.world) if gui else None
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.simulation.close()
 
     def find(self, seed: int, index: int, attempt: int = 0) -> Round:
@@ -86,52 +71,23 @@ class Replay:
             )
         return done
 
-    def start(self, done: Round) -> RoundDriver:
-        """The round's scene, before its first view."""
-        return RoundDriver(
-            self.simulation, self.scene, self.protocol, seed=done.seed, index=done.index
-        )
-
-    def advance(
-        self, driver: RoundDriver, done: Round, attempt: int, executed: int = 0
-    ) -> Observation:
-        """Go on to the view of an attempt, repeating the attempts before it.
-
-        Args:
-            driver: of the round.
-            done: the recorded round.
-            attempt: its attempt to stop before.
-            executed: how many attempts `driver` has made already.
-
-        Returns:
-            What was seen when the attempt was planned.
-        """
-        for number in range(executed, attempt):
-            self._look(driver, done.attempts[number].view)
-            driver.execute(recorded_grasp(done.attempts[number]))
-        return self._look(driver, done.attempts[attempt].view)
-
     def repeat(self, seed: int, index: int, attempt: int) -> tuple[Attempt, Observation]:
-        """Make an attempt again.
+        """Repeat a round up to and including an attempt.
 
         Returns:
-            What came of it now, and what was seen before it.
+            The attempt as it comes out now, and what was seen before it.
 
         Raises:
             ValueError: there is no such attempt.
         """
         done = self.find(seed, index, attempt)
-        driver = self.start(done)
-        seen = self.advance(driver, done, attempt)
-        return driver.execute(recorded_grasp(done.attempts[attempt])), seen
-
-    def _look(self, driver: RoundDriver, view: int) -> Observation:
-        while True:  # views without a grasp lie between those with one
+        driver = RoundDriver(self.simulation, self.scene, self.protocol, seed=seed, index=index)
+        for recorded in done.attempts[: attempt + 1]:
             seen = driver.look()
-            if driver.view >= view:
-                return seen
-
-
-def recorded_grasp(attempt: Attempt) -> PlannedGrasp:
-    """The grasp of a recorded attempt."""
-    return PlannedGrasp(attempt.T_world_hand, attempt.score, attempt.width)
+            while driver.view < recorded.view:  # views in which no grasp was found
+                seen = driver.look()
+            grasp = PlannedGrasp(recorded.T_world_hand, recorded.score, recorded.width)
+            if self.window is not None:
+                self.window.show(grasp)
+            repeated = driver.execute(grasp)
+        return repeated, seen

@@ -1,35 +1,33 @@
-"""The report of a benchmark: one HTML file with tables, plots, pictures and a film."""
-
-from __future__ import annotations
+"""The report of a benchmark: one HTML file with tables, plots and pictures."""
 
 import base64
 import tempfile
+import tomllib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from textwrap import fill
+from typing import Any, Self
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from edgegrasp_sim.film import film_round
-from edgegrasp_sim.grasping import FailureCause
+from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.picture import draw_grasps
-from edgegrasp_sim.plots import failures_plot, rates_plot, scores_plot, times_plot
-from edgegrasp_sim.published import published as published_results
 from edgegrasp_sim.replay import Replay
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from matplotlib.figure import Figure
-    from numpy.typing import NDArray
-
-    from edgegrasp_sim.results import ResultFolder
-    from edgegrasp_sim.trials import Attempt, Round
+from edgegrasp_sim.results import ResultFolder, planner_title
+from edgegrasp_sim.trial import Attempt, Round
 
 PICTURES = 6
 PICTURE_WIDTH = 1250  # pixels
+PUBLISHED = Path(__file__).parent / "published.toml"
+BLUE, ORANGE, GREY, RED = "#2f6db3", "#e08a1e", "#9aa3ad", "#b3372f"
+BINS = 10
+LABEL_WIDTH = 13  # letters
+MIN_IN_BIN = 5  # attempts; fewer say nothing about a score
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; max-width: 1120px;
        margin: 2em auto; padding: 0 1.2em; }
@@ -49,31 +47,6 @@ figcaption { color: #56606d; font-size: .93em; } code { overflow-wrap: anywhere;
 """
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnAttempt:
-    """An attempt's grasp as `draw_grasps` takes it."""
-
-    score: float
-    T_cloud_hand: NDArray[np.float32]  # (4, 4), the cloud being in the world's frame
-    width: float
-
-    @classmethod
-    def of(cls, attempt: Attempt) -> Self:
-        """The grasp of an attempt."""
-        return cls(attempt.score, np.asarray(attempt.T_world_hand, np.float32), attempt.width)
-
-
-def attempt_title(done: Round, number: int) -> str:
-    """One line that says what an attempt was and what came of it."""
-    attempt = done.attempts[number]
-    outcome = f"{attempt.object} removed" if attempt.success else str(attempt.cause)
-    target = attempt.target or "nothing between the fingers"
-    return (
-        f"seed {done.seed}, round {done.index}, attempt {number}: {outcome} "
-        f"(aimed at {target}; score {attempt.score:.2f})"
-    )
-
-
 def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     """Write `report.html` into a result folder.
 
@@ -88,16 +61,15 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     facts = folder.manifest()
     summary = folder.finish(rounds)
     attempts = [attempt for item in rounds for attempt in item.attempts]
-    published = published_results(facts["run"]["protocol"]["name"], summary["scene"])
+    reported = published(facts["run"]["protocol"]["name"], summary["scene"])
     with Replay(folder, objects) as replay:
-        film = _film(replay, rounds)
         pictures = list(_failure_pictures(replay, rounds))
-    plots = [rates_plot(summary, published), failures_plot(summary)]
+    plots = [rates_plot(summary, reported), failures_plot(summary)]
     if attempts:
         plots.append(times_plot(attempts))
     if len({attempt.score for attempt in attempts}) > 1:
         plots.append(scores_plot(attempts))
-    title = f"{_planner_name(facts)} on {summary['scene']} scenes"
+    title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p class=about>Protocol {escape(summary['protocol'])}, version "
@@ -105,7 +77,7 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
         f"{_seeds(facts['seeds'])}; objects: {escape(facts['run']['objects']['name'])}.</p>",
         _key_figures(summary),
         "<h2>Beside published figures</h2>",
-        _published_table(summary, published),
+        _published_table(summary, reported),
         "<h2>Plots</h2><div class=plots>",
         *(f"<img src='{_plot_source(plot)}' alt='plot'>" for plot in plots),
         "</div>",
@@ -114,8 +86,6 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
         "<h2>Failures</h2>",
         _failure_table(summary),
         *pictures,
-        "<h2>A round</h2>",
-        film,
         "<h2>Objects</h2>",
         _object_table(summary),
         "<h2>Conditions</h2>",
@@ -132,9 +102,47 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     return path
 
 
-def _planner_name(facts: dict[str, Any]) -> str:
-    planner = facts["run"]["planner"]
-    return str(planner.get("model") or planner["name"])
+@dataclass(frozen=True, slots=True)
+class DrawnAttempt:
+    """An attempt's grasp as `draw_grasps` takes it."""
+
+    score: float
+    T_cloud_hand: NDArray[np.float32]  # (4, 4), the cloud being in the world's frame
+    width: float
+
+    @classmethod
+    def of(cls, attempt: Attempt) -> Self:
+        """The grasp of an attempt."""
+        return cls(attempt.score, np.asarray(attempt.T_world_hand, np.float32), attempt.width)
+
+
+def attempt_title(done: Round, number: int) -> str:
+    """One line about an attempt and its outcome."""
+    attempt = done.attempts[number]
+    outcome = f"{attempt.object} removed" if attempt.success else str(attempt.cause)
+    target = attempt.target or "nothing between the fingers"
+    return (
+        f"seed {done.seed}, round {done.index}, attempt {number}: {outcome} "
+        f"(aimed at {target}; score {attempt.score:.2f})"
+    )
+
+
+def published(protocol: str, scene: str, samples: str | None = None) -> list[dict[str, Any]]:
+    """The published results of a protocol and scene, in the file's order; rates in per cent.
+
+    Args:
+        protocol: its name; a variant, named `<protocol>-<variant>`, includes those of `<protocol>`.
+        scene: kind of the scenes.
+        samples: only those at these approach points and candidates, such as `32-2k`.
+    """
+    rows: list[dict[str, Any]] = tomllib.loads(PUBLISHED.read_text())["result"]
+    return [
+        row
+        for row in rows
+        if f"{protocol}-".startswith(f"{row['protocol']}-")
+        and row["scene"] == scene
+        and samples in (None, row.get("samples"))
+    ]
 
 
 def _seeds(seeds: Sequence[int]) -> str:
@@ -172,25 +180,14 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int) 
 
 
 def _key_figures(summary: dict[str, Any]) -> str:
-    gsr, dr, times = (
-        summary["grasp_success_rate"],
-        summary["declutter_rate"],
-        summary["planning_seconds"],
-    )
+    gsr, dr = summary["grasp_success_rate"]["value"], summary["declutter_rate"]["value"]
+    held, times = summary["successes"], summary["planning_seconds"]
+    waited = summary["planner_waited_seconds"]
     boxes = [
-        (
-            f"{_percent(gsr['value'])} %",
-            f"GSR: {summary['successes']} of {summary['attempts']} grasps held",
-        ),
-        (
-            f"{_percent(dr['value'])} %",
-            f"DR: {summary['successes']} of {summary['objects']} objects removed",
-        ),
+        (f"{_percent(gsr)} %", f"GSR: {held} of {summary['attempts']} grasps held"),
+        (f"{_percent(dr)} %", f"DR: {held} of {summary['objects']} objects removed"),
         (f"{times['median']:.2f} s" if times else "-", "planning, median"),
-        (
-            str(summary["planner_retries"]),
-            f"times asked again; {summary['planner_waited_seconds']:.1f} s waited",
-        ),
+        (str(summary["planner_retries"]), f"times asked again; {waited:.1f} s waited"),
     ]
     inner = "".join(f"<div><b>{escape(b)}</b><span>{escape(t)}</span></div>" for b, t in boxes)
     return f"<div class=key>{inner}</div>"
@@ -216,11 +213,8 @@ def _seed_table(summary: dict[str, Any]) -> str:
         (seed, _percent(gsr["by_seed"][seed]), _percent(dr["by_seed"][seed]))
         for seed in gsr["by_seed"]
     ]
-    return _table(
-        ("seed", "GSR %", "DR %"),
-        [*rows, ("mean ± standard deviation", _spread(gsr), _spread(dr))],
-        2,
-    )
+    rows.append(("mean ± standard deviation", _spread(gsr), _spread(dr)))
+    return _table(("seed", "GSR %", "DR %"), rows, 2)
 
 
 def _failure_table(summary: dict[str, Any]) -> str:
@@ -278,7 +272,7 @@ def _conditions_table(facts: dict[str, Any]) -> str:
 
 
 def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterable[str]:
-    """One picture for each cause of failure, and more of the common ones while there is room."""
+    """Pictures of failed attempts: one for each cause, then more, `PICTURES` in all."""
     failed = [
         (done, number)
         for done in rounds
@@ -303,22 +297,6 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterable[str]:
         yield f"<figure><img src='{source}' alt='{escape(title, quote=True)}'></figure>"
 
 
-def _film(replay: Replay, rounds: Sequence[Round]) -> str:
-    tried = [done for done in rounds if done.attempts]
-    if not tried:
-        return "<p>No grasp was executed.</p>"
-    done = max(tried, key=lambda item: (item.successes, -len(item.attempts)))
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "round.gif"
-        film_round(replay, done, file)
-        source = _source("gif", file.read_bytes())
-    caption = f"seed {done.seed}, round {done.index}: {done.successes} of {len(done.objects)}"
-    return (
-        f"<figure><img src='{source}' alt='film of a round'>"
-        f"<figcaption>{caption} objects removed</figcaption></figure>"
-    )
-
-
 def _small_picture(file: Path) -> str:
     from PIL import Image
 
@@ -338,3 +316,97 @@ def _plot_source(figure: Figure) -> str:
 
 def _source(kind: str, content: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def rates_plot(summary: dict[str, Any], published: Sequence[dict[str, Any]]) -> Figure:
+    """GSR and DR with Wilson intervals, each seed as a dot, published figures beside them."""
+    figure, axes = _figure(6.4, 3.4)
+    names = (("grasp_success_rate", "GSR"), ("declutter_rate", "DR"))
+    labels = []
+    for place, (name, label) in enumerate(names):
+        rate = summary[name]
+        labels.append(label)
+        if rate["value"] is None:
+            continue
+        low, high = rate["wilson_95"]
+        value = rate["value"]
+        axes.bar(place, 100 * value, 0.5, color=BLUE, alpha=0.85, label="this run" * (not place))
+        axes.errorbar(
+            place, 100 * value, [[max(0.0, 100 * (value - low))], [max(0.0, 100 * (high - value))]],
+            color="black", capsize=5, label="95 % interval" * (not place),
+        )  # fmt: skip
+        seeds = [100 * v for v in rate["by_seed"].values() if v is not None]
+        axes.scatter(
+            np.full(len(seeds), place + 0.15), seeds, s=16, color="white", edgecolor="black",
+            zorder=3, label="each seed" * (not place),
+        )  # fmt: skip
+    for row in published:
+        mean, *deviation = row["grasp_success_rate"]
+        place = len(labels)
+        labels.append(fill(f"{row['method']}, published", LABEL_WIDTH))
+        axes.bar(place, mean, 0.5, color=GREY)
+        if deviation:
+            axes.errorbar(place, mean, deviation, color="black", capsize=5)
+    axes.set(ylim=(0, 100), ylabel="%", xticks=range(len(labels)))
+    axes.set_xticklabels(labels, fontsize=7.5)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def failures_plot(summary: dict[str, Any]) -> Figure:
+    """How often each cause of failure occurred."""
+    figure, axes = _figure(6.4, 3.0)
+    causes = list(reversed(summary["failures"].items()))
+    bars = axes.barh([cause for cause, _ in causes], [count for _, count in causes], color=RED)
+    axes.bar_label(bars, padding=3)
+    axes.margins(x=0.12)
+    axes.set_xlabel("grasps (no candidate: views)")
+    return figure
+
+
+def scores_plot(attempts: Sequence[Attempt]) -> Figure:
+    """Calibration: success against score, and the distribution of scores."""
+    figure, axes = _figure(6.4, 3.4)
+    scores = np.array([attempt.score for attempt in attempts])
+    held = np.array([attempt.success for attempt in attempts])
+    edges = np.linspace(min(0.0, scores.min()), max(1.0, scores.max()), BINS + 1)
+    bins = np.clip(np.digitize(scores, edges) - 1, 0, BINS - 1)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    counts = np.bincount(bins, minlength=BINS)
+    rates = np.bincount(bins, held, BINS) / np.maximum(counts, 1)
+    width = edges[1] - edges[0]
+    axes.bar(
+        middles, 100 * counts / counts.sum(), width, color=GREY, alpha=0.5,
+        label="share of the grasps", edgecolor="white",
+    )  # fmt: skip
+    told = counts >= MIN_IN_BIN
+    axes.plot(middles[told], 100 * rates[told], "o-", color=BLUE, label="that held")
+    axes.plot([0, 1], [0, 100], "--", color="black", linewidth=0.8, label="as a probability")
+    axes.set(xlabel="score", ylabel="%", ylim=(0, 103))
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize=8, frameon=False)
+    return figure
+
+
+def times_plot(attempts: Sequence[Attempt]) -> Figure:
+    """The distribution of planning times."""
+    figure, axes = _figure(6.4, 3.0)
+    seconds = [attempt.planning_seconds for attempt in attempts]
+    longest = float(np.percentile(seconds, 99))
+    axes.hist(seconds, bins=30, range=(0.0, longest), color=ORANGE)
+    axes.axvline(float(np.median(seconds)), color="black", linestyle="--", label="median")
+    axes.set(xlabel="planning time (s), without the longest 1 %", ylabel="grasps")
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: Any = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25, axis="both")
+    axes.set_axisbelow(True)
+    return figure, axes

@@ -1,23 +1,21 @@
-"""What comes of a benchmark: its figures, and the folder it is kept in."""
-
-from __future__ import annotations
+"""The results of a benchmark: its folder, figures with intervals, comparison and gate."""
 
 import csv
 import hashlib
 import json
 import os
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import fmean, median, stdev
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from edgegrasp_sim.grasping import FailureCause, GraspOutcome
-from edgegrasp_sim.intervals import wilson
-from edgegrasp_sim.trials import Attempt, Round, RoundEnd
+import numpy as np
+from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-    from pathlib import Path
+from edgegrasp_sim.hand import FailureCause, GraspOutcome
+from edgegrasp_sim.trial import Attempt, Round, RoundEnd
 
 CSV_COLUMNS = (
     "seed",
@@ -26,122 +24,11 @@ CSV_COLUMNS = (
     *(name for name in Attempt.__dataclass_fields__ if name != "T_world_hand"),
     "T_world_hand",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """What GSR and DR are made of."""
-
-    successes: int
-    attempts: int
-    objects: int
-
-    @classmethod
-    def of(cls, rounds: Iterable[Round]) -> Counts:
-        """Count over rounds."""
-        rounds = tuple(rounds)
-        return cls(
-            sum(item.successes for item in rounds),
-            sum(len(item.attempts) for item in rounds),
-            sum(len(item.objects) for item in rounds),
-        )
-
-    @property
-    def grasp_success_rate(self) -> float | None:
-        """GSR: successes / attempts; None without attempts."""
-        return self.successes / self.attempts if self.attempts else None
-
-    @property
-    def declutter_rate(self) -> float | None:
-        """DR: successes / objects present after the resets; None without objects."""
-        return self.successes / self.objects if self.objects else None
-
-
-def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
-    """The figures of a benchmark, ready for JSON; shares are 0 to 1."""
-    counts = Counts.of(rounds)
-    seeds = sorted({item.seed for item in rounds})
-    by_seed = {seed: Counts.of(r for r in rounds if r.seed == seed) for seed in seeds}
-    attempts = [attempt for item in rounds for attempt in item.attempts]
-    planning = sorted(attempt.planning_seconds for attempt in attempts)
-    return {
-        "rounds": len(rounds),
-        "successes": counts.successes,
-        "attempts": counts.attempts,
-        "objects": counts.objects,
-        "grasp_success_rate": _rate(
-            counts.successes,
-            counts.attempts,
-            {seed: c.grasp_success_rate for seed, c in by_seed.items()},
-        ),
-        "declutter_rate": _rate(
-            counts.successes,
-            counts.objects,
-            {seed: c.declutter_rate for seed, c in by_seed.items()},
-        ),
-        "failures": {
-            **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
-            "no candidate": sum(item.no_grasp for item in rounds),
-        },
-        "wrong_object_successes": sum(attempt.wrong_object for attempt in attempts),
-        "start_contacts": sum(attempt.start_contact for attempt in attempts),
-        "round_ends": dict(Counter(item.end.value for item in rounds)),
-        "planning_seconds": {
-            "mean": fmean(planning),
-            "median": median(planning),
-            "p95": planning[int(0.95 * (len(planning) - 1))],
-        }
-        if planning
-        else None,
-        "planner_retries": sum(item.retries for item in rounds),
-        "planner_waited_seconds": sum(item.waited_seconds for item in rounds),
-        "objects_by_name": by_object(rounds),
-        "attempts_digest": attempts_digest(rounds),
-    }
-
-
-def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
-    """For each object: how often present, removed, aimed at, and aimed at with success."""
-    attempts = [attempt for item in rounds for attempt in item.attempts]
-    present = Counter(name for item in rounds for name in item.objects)
-    removed = Counter(attempt.object for attempt in attempts if attempt.object is not None)
-    aimed = Counter(attempt.target for attempt in attempts)
-    held = Counter(a.target for a in attempts if a.success and not a.wrong_object)
-    return {
-        name: {
-            "present": present[name],
-            "removed": removed[name],
-            "attempts": aimed[name],
-            "successes": held[name],
-        }
-        for name in sorted(present)
-    }
-
-
-def attempts_digest(rounds: Sequence[Round]) -> str:
-    """SHA-256 of everything but wall-clock times: equal for equal attempts."""
-    plain = [_without_times(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
-
-
-def round_from_json(table: dict[str, Any]) -> Round:
-    """Rebuild a round from the JSON of its dataclass."""
-    attempts = tuple(
-        Attempt(
-            **item
-            | {
-                "outcome": GraspOutcome(item["outcome"]),
-                "cause": FailureCause(item["cause"]) if item["cause"] is not None else None,
-            }
-        )
-        for item in table["attempts"]
-    )
-    changed = {
-        "objects": tuple(table["objects"]),
-        "attempts": attempts,
-        "end": RoundEnd(table["end"]),
-    }
-    return Round(**table | changed)
+PAIRED = ("scene", "protocol", "objects", "constants")  # of the manifest, equal in paired runs
+RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
+GATED = ("scene", "protocol", "protocol_version")
+Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
+RESAMPLES = 10_000
 
 
 class ResultFolder:
@@ -155,10 +42,10 @@ class ResultFolder:
         self.path = path
 
     def open(self, manifest: dict[str, Any]) -> None:
-        """Start a benchmark in this folder, or go on with one that was interrupted.
+        """Start a benchmark in this folder, or resume one that was interrupted.
 
         Args:
-            manifest: its entry `run` must be that of the benchmark begun here before.
+            manifest: its entry `run` must equal that of a benchmark already in the folder.
 
         Raises:
             ValueError: the folder holds another benchmark.
@@ -231,6 +118,270 @@ class ResultFolder:
         return self.path / "rounds" / f"{seed}-{index}.json"
 
 
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """The counts that GSR and DR are ratios of."""
+
+    successes: int
+    attempts: int
+    objects: int
+
+    @classmethod
+    def of(cls, rounds: Iterable[Round]) -> "Counts":
+        """Count over rounds."""
+        rounds = tuple(rounds)
+        return cls(
+            sum(item.successes for item in rounds),
+            sum(len(item.attempts) for item in rounds),
+            sum(len(item.objects) for item in rounds),
+        )
+
+    @property
+    def grasp_success_rate(self) -> float | None:
+        """GSR: successes / attempts; None without attempts."""
+        return self.successes / self.attempts if self.attempts else None
+
+    @property
+    def declutter_rate(self) -> float | None:
+        """DR: successes / objects present after the resets; None without objects."""
+        return self.successes / self.objects if self.objects else None
+
+
+def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
+    """The figures of a benchmark, ready for JSON; shares are 0 to 1."""
+    counts = Counts.of(rounds)
+    seeds = sorted({item.seed for item in rounds})
+    by_seed = {seed: Counts.of(r for r in rounds if r.seed == seed) for seed in seeds}
+    attempts = [attempt for item in rounds for attempt in item.attempts]
+    planning = sorted(attempt.planning_seconds for attempt in attempts)
+    return {
+        "rounds": len(rounds),
+        "successes": counts.successes,
+        "attempts": counts.attempts,
+        "objects": counts.objects,
+        "grasp_success_rate": _rate(
+            counts.successes,
+            counts.attempts,
+            {seed: c.grasp_success_rate for seed, c in by_seed.items()},
+        ),
+        "declutter_rate": _rate(
+            counts.successes,
+            counts.objects,
+            {seed: c.declutter_rate for seed, c in by_seed.items()},
+        ),
+        "failures": {
+            **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
+            "no candidate": sum(item.no_grasp for item in rounds),
+        },
+        "wrong_object_successes": sum(attempt.wrong_object for attempt in attempts),
+        "start_contacts": sum(attempt.start_contact for attempt in attempts),
+        "round_ends": dict(Counter(item.end.value for item in rounds)),
+        "planning_seconds": {
+            "mean": fmean(planning),
+            "median": median(planning),
+            "p95": planning[int(0.95 * (len(planning) - 1))],
+        }
+        if planning
+        else None,
+        "planner_retries": sum(item.retries for item in rounds),
+        "planner_waited_seconds": sum(item.waited_seconds for item in rounds),
+        "objects_by_name": by_object(rounds),
+        "attempts_digest": attempts_digest(rounds),
+    }
+
+
+def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
+    """For each object: how often it was present, removed, aimed at, and held when aimed at."""
+    attempts = [attempt for item in rounds for attempt in item.attempts]
+    present = Counter(name for item in rounds for name in item.objects)
+    removed = Counter(attempt.object for attempt in attempts if attempt.object is not None)
+    aimed = Counter(attempt.target for attempt in attempts)
+    held = Counter(a.target for a in attempts if a.success and not a.wrong_object)
+    return {
+        name: {
+            "present": present[name],
+            "removed": removed[name],
+            "attempts": aimed[name],
+            "successes": held[name],
+        }
+        for name in sorted(present)
+    }
+
+
+def attempts_digest(rounds: Sequence[Round]) -> str:
+    """SHA-256 of everything but wall-clock times; equal for equal attempts."""
+    plain = [_without_times(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def round_from_json(table: dict[str, Any]) -> Round:
+    """Rebuild a round from the JSON of its dataclass."""
+    attempts = tuple(
+        Attempt(
+            **item
+            | {
+                "outcome": GraspOutcome(item["outcome"]),
+                "cause": FailureCause(item["cause"]) if item["cause"] is not None else None,
+            }
+        )
+        for item in table["attempts"]
+    )
+    changed = {
+        "objects": tuple(table["objects"]),
+        "attempts": attempts,
+        "end": RoundEnd(table["end"]),
+    }
+    return Round(**table | changed)
+
+
+def record_of(folder: ResultFolder) -> dict[str, Any]:
+    """Conditions and figures of a finished benchmark, small enough to commit; ready for JSON."""
+    manifest = folder.manifest()
+    summary = json.loads((folder.path / "summary.json").read_text())
+    run = manifest["run"]
+    times = summary["planning_seconds"]
+    return {
+        "scene": run["scene"],
+        "protocol": {name: run["protocol"][name] for name in ("name", "version")},
+        "planner": run["planner"],
+        "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
+        "rounds": manifest["rounds"],
+        "seeds": manifest["seeds"],
+        "attempts": summary["attempts"],
+        "successes": summary["successes"],
+        "objects_present": summary["objects"],
+        "grasp_success_rate": summary["grasp_success_rate"],
+        "declutter_rate": summary["declutter_rate"],
+        "failures": summary["failures"],
+        "planning_seconds_median": times["median"] if times else None,
+        "attempts_digest": summary["attempts_digest"],
+    }
+
+
+def planner_title(planner: dict[str, Any]) -> str:
+    """The weights of a manifest's planner, or its name if it has none."""
+    return str(planner.get("model") or planner["name"])
+
+
+def compare(first: ResultFolder, second: ResultFolder, seed: int = 0) -> dict[str, Any]:
+    """Differences of GSR and DR over the scenes that two benchmarks share.
+
+    Args:
+        first: the reference.
+        second: compared with it.
+        seed: of the bootstrap.
+
+    Returns:
+        Figures ready for JSON: for `grasp_success_rate` and `declutter_rate` the value and
+        interval of each and the difference, second minus first, with its paired 95 % interval.
+
+    Raises:
+        FileNotFoundError: a folder holds no benchmark.
+        ValueError: they were run under different conditions or share no scene.
+    """
+    runs = [folder.manifest()["run"] for folder in (first, second)]
+    if different := [name for name in PAIRED if runs[0][name] != runs[1][name]]:
+        raise ValueError(
+            f"{first.path} and {second.path} differ in {', '.join(different)}; only benchmarks "
+            "with the same scenes can be paired"
+        )
+    rounds = [{(r.seed, r.index): r for r in folder.rounds()} for folder in (first, second)]
+    shared = sorted(rounds[0].keys() & rounds[1].keys())
+    if not shared:
+        raise ValueError(f"{first.path} and {second.path} share no round; use the same seeds")
+    counts = [[Counts.of([run[key]]) for key in shared] for run in rounds]
+    successes = np.array([[c.successes for c in run] for run in counts])
+    figures: dict[str, Any] = {
+        "first": runs[0]["planner"],
+        "second": runs[1]["planner"],
+        "scenes": len(shared),
+        "second_better": int((successes[1] > successes[0]).sum()),
+        "second_worse": int((successes[1] < successes[0]).sum()),
+    }
+    for name, below in (("grasp_success_rate", "attempts"), ("declutter_rate", "objects")):
+        trials = np.array([[getattr(c, below) for c in run] for run in counts])
+        found = paired_difference(successes, trials, np.random.default_rng(seed))
+        figures[name] = {
+            "first": _share(successes[0], trials[0]),
+            "second": _share(successes[1], trials[1]),
+            "difference": found[0] if found else None,
+            "difference_95": found[1] if found else None,
+        }
+    return figures
+
+
+def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
+    """Which rates of a result fall below a committed one, in words; empty if none does.
+
+    Args:
+        summary: of the result, as in `summary.json`.
+        gate: `summary.json` of the committed one; each rate may be as low as the lower end of
+            its interval.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no summary, or one of another scene or protocol.
+    """
+    try:
+        committed = json.loads(gate.read_text())
+        limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
+        differing = [name for name in GATED if committed[name] != summary[name]]
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{gate} is no summary.json of a benchmark: {error!r}") from error
+    if differing:
+        raise ValueError(
+            f"{gate} is of another benchmark: "
+            + ", ".join(f"{name} {committed[name]!r}, not {summary[name]!r}" for name in differing)
+        )
+    found = []
+    for name, label in RATE_LABELS.items():
+        value, limit = summary[name]["value"], limits[name]
+        if limit is not None and (value is None or value < limit[0]):
+            shown = "undefined" if value is None else f"{100 * value:.1f} %"
+            found.append(
+                f"{label} {shown} is below {100 * limit[0]:.1f} %, the lower end of the "
+                f"committed {100 * committed[name]['value']:.1f} %"
+            )
+    return found
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float] | None:
+    """Wilson's 95 % interval of a share; None without trials."""
+    if trials == 0:
+        return None
+    share = successes / trials
+    spread = Z_95**2 / trials
+    centre = (share + spread / 2) / (1 + spread)
+    half = Z_95 / (1 + spread) * ((share * (1 - share) + spread / 4) / trials) ** 0.5
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def paired_difference(
+    numerators: ArrayLike, denominators: ArrayLike, rng: np.random.Generator
+) -> tuple[float, tuple[float, float]] | None:
+    """How a ratio of sums differs between two runs over the same scenes, by the bootstrap.
+
+    Scenes are resampled, so that differences between scenes cancel out.
+
+    Args:
+        numerators: (2, S) counts of each run in each scene.
+        denominators: (2, S) likewise.
+        rng: source of the resampling.
+
+    Returns:
+        Second run's ratio minus the first's, and its 95 % interval; None if a run has no counts.
+    """
+    above, below = np.asarray(numerators, float), np.asarray(denominators, float)
+    if (below.sum(axis=1) == 0).any():
+        return None
+    picks = rng.integers(above.shape[1], size=(RESAMPLES, above.shape[1]))
+    with np.errstate(invalid="ignore"):
+        ratios = above[:, picks].sum(axis=-1) / below[:, picks].sum(axis=-1)  # (2, resamples)
+    low, high = np.nanpercentile(ratios[1] - ratios[0], [2.5, 97.5]).tolist()
+    first, second = (above.sum(axis=1) / below.sum(axis=1)).tolist()
+    return second - first, (low, high)
+
+
 def _rate(successes: int, trials: int, by_seed: dict[int, float | None]) -> dict[str, Any]:
     values = [value for value in by_seed.values() if value is not None]
     return {
@@ -251,8 +402,13 @@ def _without_times(item: Round) -> dict[str, Any]:
     return plain
 
 
+def _share(successes: Any, trials: Any) -> dict[str, Any]:
+    above, below = int(successes.sum()), int(trials.sum())
+    return {"value": above / below if below else None, "wilson_95": wilson(above, below)}
+
+
 def _write(path: Path, text: str) -> None:
-    # A killed process shall leave the whole file or none.
+    # A killed process must not leave a partial file.
     unfinished = path.with_suffix(f".{os.getpid()}.tmp")
     unfinished.write_text(text)
     unfinished.replace(path)

@@ -1,28 +1,19 @@
 """Making packed and pile scenes, and bringing them to rest."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_sim.engine import TIME_STEP, Body, World
+from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
 from edgegrasp_sim.poses import yaw_quaternion_xyzw
-from edgegrasp_sim.world import TIME_STEP
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from edgegrasp_sim.objects import ObjectModel, ObjectSet
-    from edgegrasp_sim.world import Body, World
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
-TABLE_EXTENT = (1.2, 1.2, 0.2)  # metres; what is dropped or pressed sinks through a thin one
+TABLE_EXTENT = (1.2, 1.2, 0.2)  # metres; objects would sink through a thin one
 TABLE_FRICTION = 0.5
-OBJECT_MASS = 0.5  # kg
-OBJECT_FRICTION = 1.0
 
 PACKED_ATTEMPTS = 12
 PACKED_RANGE = (0.08, 0.22)  # metres, for x and y
@@ -53,7 +44,7 @@ class SceneObject:
 def add_table(world: World) -> Body:
     """Add the table, its top at `TABLE_HEIGHT`."""
     centre = (SIZE / 2, SIZE / 2, TABLE_HEIGHT - TABLE_EXTENT[2] / 2)
-    return world.add_box(TABLE_EXTENT, centre, lateral_friction=TABLE_FRICTION)
+    return world.add_box(TABLE_EXTENT, centre, friction=TABLE_FRICTION)
 
 
 def load_object(
@@ -67,11 +58,10 @@ def load_object(
 
     Raises:
         FileNotFoundError: the model's file is missing.
-        ValueError: PyBullet cannot read it.
+        ValueError: the engine cannot read it.
     """
     body = world.load_urdf(model.urdf, position, quaternion_xyzw, scale * model.scale)
-    # A given mass also makes the engine compute the inertia from the collision shape.
-    body.change_dynamics(mass=OBJECT_MASS, lateralFriction=OBJECT_FRICTION)
+    body.set_dynamics(mass=OBJECT_MASS, friction=OBJECT_FRICTION)
     return SceneObject(model, scale, body)
 
 
@@ -133,7 +123,7 @@ def make_pile(
 
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
-    """Let time pass until all objects rest, or `seconds` are over."""
+    """Simulate until all objects rest, for at most `seconds`."""
     elapsed = 0.0
     while elapsed < seconds:
         world.step(REST_CHECK_STEPS)
@@ -176,4 +166,4 @@ def _add_box_walls(world: World) -> list[Body]:
         ((length, PILE_BOX_WALL, height), (middle, low + half, z)),
         ((length, PILE_BOX_WALL, height), (middle, low + width - half, z)),
     )
-    return [world.add_box(extent, centre, lateral_friction=0.5) for extent, centre in plan]
+    return [world.add_box(extent, centre, friction=0.5) for extent, centre in plan]

@@ -1,20 +1,30 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from pathlib import Path
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from edgegrasp_sim.camera import EVALUATION_VIEWS, Camera, ViewRange
-from edgegrasp_sim.grasping import GraspResult, run_grasp
-from edgegrasp_sim.gripper import Gripper
+from edgegrasp_sim.camera import (
+    CLOUD_BOX,
+    EVALUATION_VIEWS,
+    WORKSPACE_BOX,
+    DepthNoise,
+    Observation,
+    TableView,
+    ViewRange,
+    crop,
+    points_of,
+    resample_surfaces,
+)
+from edgegrasp_sim.engine import Intrinsics, World
+from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.observation import CLOUD_BOX, WORKSPACE_BOX, Observation, crop
-from edgegrasp_sim.poses import require_pose
-from edgegrasp_sim.resampling import resample_surfaces
+from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
@@ -26,21 +36,9 @@ from edgegrasp_sim.scene import (
     make_pile,
     settle,
 )
-from edgegrasp_sim.world import World
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-    from pathlib import Path
-    from types import TracebackType
-
-    from numpy.typing import ArrayLike
-
-    from edgegrasp_sim.noise import DepthNoise
-    from edgegrasp_sim.observation import TableView
-    from edgegrasp_sim.poses import Matrix
-    from edgegrasp_sim.world import Body
 
 NOISE_STD = 0.001  # metres
+CAMERA = Intrinsics()
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
@@ -68,7 +66,7 @@ class ClutterSimulation:
 
     Args:
         objects: what to make scenes from, for each kind; the built-in sets by default.
-        gui: show PyBullet's window.
+        gui: show the engine's window.
         start_contact_fails: call a grasp failed (`PREGRASP`) if the open hand overlaps anything
             at its start pose. The reference simulator asks for contacts there before the engine
             has looked for any, so that it never fails a grasp for this and lets the engine push
@@ -89,7 +87,6 @@ class ClutterSimulation:
         )
         self.start_contact_fails = start_contact_fails
         self.world = World(gui=gui)
-        self.camera = Camera(self.world)
         self._objects: list[SceneObject] = []
         self._gripper: Gripper | None = None
         self._rest_state: int | None = None
@@ -99,12 +96,7 @@ class ClutterSimulation:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -125,13 +117,8 @@ class ClutterSimulation:
 
     @property
     def object_models(self) -> list[ObjectModel]:
-        """What the objects that are left were made from."""
+        """Models of the objects that are left."""
         return [item.model for item in self._objects]
-
-    @property
-    def object_bodies(self) -> list[Body]:
-        """Bodies of the objects that are left, to paint or to measure."""
-        return [item.body for item in self._objects]
 
     @property
     def placements(self) -> list[ObjectPlacement]:
@@ -183,11 +170,11 @@ class ClutterSimulation:
         return self.num_objects
 
     def reset_from_poses(self, placements: Sequence[ObjectPlacement]) -> None:
-        """Put objects exactly where they are said to be, at rest, without letting time pass.
+        """Put objects exactly at the given poses, at rest, without simulating.
 
         Raises:
             FileNotFoundError: an object's file is missing.
-            ValueError: PyBullet cannot read it.
+            ValueError: the engine cannot read it.
         """
         self._clear()
         for placement in placements:
@@ -224,7 +211,7 @@ class ClutterSimulation:
             surface_voxel: see `observe_from`.
         """
         return self.observe_from(
-            views.sample_ring(rng_camera, num_views),
+            views.sample(rng_camera, num_views),
             rng_noise,
             noise_std=noise_std,
             depth_noise=depth_noise,
@@ -250,21 +237,19 @@ class ClutterSimulation:
             noise_std: see `observe`, as for what follows.
             depth_noise: of the images.
             table: see `observe`.
-            surface_voxel: metres between the points of a surface, however aslant it is seen; 0:
-                one point for each pixel.
+            surface_voxel: metres between the points of a surface, at whatever slant it is seen;
+                0: one point for each pixel.
         """
         box = CLOUD_BOX[table]
         clouds = []
         for T_world_camera in T_world_cameras:
-            depth = self.camera.render_depth(T_world_camera)
+            depth = self.world.render_depth(T_world_camera, CAMERA)
             if depth_noise is not None:
                 depth = depth_noise.apply(depth, rng_noise)
-            points = crop(self.camera.points(depth, T_world_camera), box, _CROP_MARGIN)
+            points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
             if surface_voxel > 0 and len(points) > 0:
                 around = np.stack((points.min(axis=0), points.max(axis=0)))
-                points = resample_surfaces(
-                    depth, T_world_camera, self.camera.intrinsics, around, surface_voxel
-                )
+                points = resample_surfaces(depth, T_world_camera, CAMERA, around, surface_voxel)
             points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             clouds.append(crop(points, box, 0.0).astype(np.float32))
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
@@ -280,24 +265,24 @@ class ClutterSimulation:
         )
 
     def save_state(self) -> int:
-        """Keep the scene's present state; valid until an object or the scene is removed."""
+        """Keep the scene's present state; valid until an object is removed or the scene changes."""
         return self.world.save_state()
 
     def restore_state(self, state: int) -> None:
-        """Return to a state of this scene, exactly: what follows depends on nothing else."""
+        """Return to a state of this scene exactly; nothing simulated since leaves a trace."""
         self._forget_rest_state()
         self._restore(state)
 
     def try_grasp(
         self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
     ) -> GraspResult:
-        """See what would come of a grasp; the scene stays as it is.
+        """Simulate a grasp and return to the scene as it was.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-            shake: also shake what is held, see `GraspResult.held_after_shaking`.
-            to_the_end: take every step of it, as `execute_grasp` does. Without, the try ends once
-                its outcome is clear: twice as fast, and another outcome for 1 grasp in 100.
+            shake: also shake a held object, see `GraspResult.held_after_shaking`.
+            to_the_end: simulate every step, as `execute_grasp` does. Otherwise the try ends once
+                its outcome is clear: twice as fast, with another outcome for 1 grasp in 100.
 
         Raises:
             ValueError: `T_world_hand` is no rigid transform.
@@ -307,7 +292,7 @@ class ClutterSimulation:
         return result
 
     def try_in_copy(self, T_world_hand: ArrayLike) -> GraspResult:
-        """See what would come of a grasp, in another world with the objects where they are here.
+        """Simulate a grasp in another world with the objects where they are here.
 
         Unlike after `try_grasp`, not even the engine's hidden state changes here, so that what
         follows is the same with and without the try. The two may disagree on a close call.
@@ -328,7 +313,7 @@ class ClutterSimulation:
         return self._copy.try_grasp(T_world_hand, to_the_end=True)
 
     def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
-        """Grasp: what is held leaves the scene, the rest comes to rest.
+        """Grasp for real: a held object leaves the scene, and the others come to rest.
 
         The outcome is that of `try_grasp(..., to_the_end=True)`.
 

@@ -1,16 +1,10 @@
 """A planner without a network: grasp the highest thing from above, across its narrow side."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from edgegrasp_sim.gripper import FINGERTIP, MAX_OPENING
-from edgegrasp_sim.trials import PlannedGrasp
-
-if TYPE_CHECKING:
-    from edgegrasp_sim.observation import Observation
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import FINGERTIP, MAX_OPENING
+from edgegrasp_sim.trial import PlannedGrasp
 
 REACH = 0.04  # metres around the highest point that count as the thing to grasp
 DEPTH = 0.025  # metres that the fingertips go below its top

@@ -1,35 +1,49 @@
-"""Generate labelled views: observe random clutter, try edge grasps in it, keep what happened."""
+"""Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
+from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
-from edgegrasp_sim.camera import TRAINING_VIEWS
+from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_model.scene.scene import Scene, build_scene
+from edgegrasp_sim.camera import TRAINING_VIEWS, Observation
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
-from edgegrasp_training.labelling import SURE, Choice, Question, detector, label
-from edgegrasp_training.varied_objects import varied_objects
+from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
+from edgegrasp_training.shapes import varied_objects
 from edgegrasp_training.views import LabelledView
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
-APPROACH_POINTS = 12  # few balls with many tried grasps each cost the trainer least per label
+APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
 MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
-OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects: shapes of every sort
-VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and made objects
-WIDER_SCALES = 0.85, 1.15  # factors on both ends of the scales of a scene
-HARD_SHARE = 0.8  # of the scenes, in which a network's surest grasp is looked for that fails
-HARD_LOOKS = 3  # scenes that are looked through for it
-OTHER_NOISE = 0.3  # share of the views that have another noise than the benchmark's
-NOISIEST = 0.003  # metres, the most
+OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
+VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
+WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
+HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding network finds hard
+HARD_TRIES = 3  # scenes looked through for a hard one
+OTHER_NOISE = 0.3  # share of the views with another noise than the benchmark's
+MAX_NOISE = 0.003  # metres
+
+BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
+UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
+SURE = 0.99  # score of the best grasp from which on a view teaches little
+EASY_SHARE = 0.4  # of the grasps, tried in a view whose best grasp is sure
+FREE_SHARE = 0.75  # of the grasps chosen at random, those free of collision with the cloud
+GUIDED_SHARE = 0.5  # of the tried grasps, the network's best and unsure ones
 
 
 @dataclass(frozen=True)
@@ -48,22 +62,11 @@ class GenerationOptions:
         return self.kind or (SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE)
 
 
-def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -> Path:
-    """File of a view."""
-    kind = options.kind_of(index).value
-    return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
+class Query(NamedTuple):
+    """A view of a scene and a request for grasps in it."""
 
-
-def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
-    """Indices of the scenes that lack a view."""
-    return [
-        index
-        for index in range(options.scenes)
-        if not all(
-            view_path(folder, index, view, options).is_file()
-            for view in range(options.views_per_scene)
-        )
-    ]
+    observation: Observation
+    request: DetectOptions
 
 
 def generate(
@@ -72,7 +75,7 @@ def generate(
     """Generate the scenes that are missing, in any order; the number of workers changes nothing.
 
     Args:
-        folder: Gets one file per view.
+        folder: Where the views go, one file each.
         objects: Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
         options: What to generate.
         workers: Processes.
@@ -96,10 +99,28 @@ def generate(
             yield futures[future], *future.result()
 
 
+def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
+    """Indices of the scenes that lack a view."""
+    return [
+        index
+        for index in range(options.scenes)
+        if not all(
+            view_path(folder, index, view, options).is_file()
+            for view in range(options.views_per_scene)
+        )
+    ]
+
+
+def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -> Path:
+    """File of a view."""
+    kind = options.kind_of(index).value
+    return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
+
+
 def generate_scene(
     folder: Path, objects: Path | None, options: GenerationOptions, index: int
 ) -> tuple[int, int]:
-    """Generate all views of one scene; how many grasps were tried and how many held."""
+    """Generate all views of one scene; returns how many grasps were tried and how many held."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
     kind = options.kind_of(index)
     source, scales = _variety(kind, streams[SCENE_STREAM])
@@ -117,10 +138,19 @@ def generate_scene(
     return tried, held
 
 
+def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:
+    """Which kind's objects a scene is made of, and the range of their scales."""
+    source = kind
+    if rng.random() < OTHER_OBJECTS:
+        source = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
+    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
+    return source, (low * WIDER_SCALES[0], high * WIDER_SCALES[1])
+
+
 def _drawn_objects(
     objects: Path, source: SceneKind, folder: Path, rng: np.random.Generator
 ) -> ObjectSet:
-    """The objects of a scene as they are, or varied ones, whose files the folder gets."""
+    """The objects of a scene: plain ones, or varied ones whose files go into `folder`."""
     plain = ObjectSet.from_folder(objects, source, "train")
     if rng.random() >= VARIED_SHARE:
         return plain
@@ -133,13 +163,13 @@ def _make_scene(
     scales: tuple[float, float],
     options: GenerationOptions,
     streams: list[np.random.Generator],
-) -> Question | None:
-    """Make a scene; where there are weights, mostly one with a view that they find hard."""
+) -> Query | None:
+    """Make a scene; with weights mostly one that they find hard, and return the hard view."""
     rng = streams[SCENE_STREAM]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
-    for _ in range(1 if guide is None else HARD_LOOKS):
+    for _ in range(1 if guide is None else HARD_TRIES):
         simulation.reset(kind, rng, 1 + int(rng.poisson(MEAN_FURTHER_OBJECTS)), scales)
         hard = None if guide is None else _hard_view(simulation, guide, options, streams)
         if hard is not None:
@@ -152,20 +182,20 @@ def _hard_view(
     guide: GraspDetector,
     options: GenerationOptions,
     streams: list[np.random.Generator],
-) -> Question | None:
+) -> Query | None:
     """The first view in which the network is unsure of its best grasp, or sure and wrong.
 
-    Until then its grasps are executed, so that what it finds easy is gone. None if all is easy.
+    Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
     for _ in range(simulation.num_objects):
-        question = _ask(simulation, options, streams)
-        if len(question.observation.cloud) == 0:
+        query = _ask(simulation, options, streams)
+        if len(query.observation.cloud) == 0:
             return None
-        grasps = guide.detect(question.observation.cloud, question.request).grasps
+        grasps = guide.detect(query.observation.cloud, query.request).grasps
         if not grasps or grasps[0].score < SURE:
-            return question
+            return query
         if not simulation.try_grasp(grasps[0].T_cloud_hand).success:
-            return question
+            return query
         if simulation.num_objects == 1:
             return None
         simulation.execute_grasp(grasps[0].T_cloud_hand)
@@ -174,8 +204,8 @@ def _hard_view(
 
 def _ask(
     simulation: ClutterSimulation, options: GenerationOptions, streams: list[np.random.Generator]
-) -> Question:
-    """Look at the scene, and ask for grasps as a benchmark does, around fewer points."""
+) -> Query:
+    """Look at the scene, and request grasps as a benchmark does, around fewer points."""
     observation = simulation.observe(
         streams[CAMERA_STREAM],
         streams[NOISE_STREAM],
@@ -191,37 +221,138 @@ def _ask(
         workspace=Workspace(min=tuple(low), max=tuple(high)),
         collision=Collision(mode="penalise"),
     )
-    return Question(observation, request)
+    return Query(observation, request)
+
+
+def _noise_std(rng: np.random.Generator) -> float:
+    """Noise of a view in metres, mostly the benchmark's."""
+    return rng.uniform(0.0, MAX_NOISE) if rng.random() < OTHER_NOISE else NOISE_STD
 
 
 def _views(
     simulation: ClutterSimulation,
-    hard: Question | None,
+    hard: Query | None,
     options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Iterator[LabelledView]:
     """Labelled views of the scene that stands in the simulation, the hard one first."""
-    choice = Choice(options.grasps_per_view, options.weights, hard is not None)
     models = [model.origin or model for model in simulation.object_models]
     names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
     for number in range(options.views_per_scene):
-        question = hard if hard and number == 0 else _ask(simulation, options, streams)
+        query = hard if hard and number == 0 else _ask(simulation, options, streams)
         yield replace(
-            label(simulation, question, choice, streams[CHOICE_STREAM]),
+            label(simulation, query, options, streams[CHOICE_STREAM], hard=hard is not None),
             objects=names,
             object_digests=digests,
         )
 
 
-def _noise_std(rng: np.random.Generator) -> float:
-    """Noise of a view, metres: mostly the benchmark's."""
-    return rng.uniform(0.0, NOISIEST) if rng.random() < OTHER_NOISE else NOISE_STD
+def label(
+    simulation: ClutterSimulation,
+    query: Query,
+    options: GenerationOptions,
+    rng: np.random.Generator,
+    *,
+    hard: bool,
+) -> LabelledView:
+    """Sample candidates as the detector does and try some of them.
+
+    Args:
+        simulation: Holds the scene.
+        query: A view of it and the request.
+        options: How many to try, and the weights that guide the choice.
+        rng: Chooses among the candidates.
+        hard: Whether the scene is known to be hard, even where the best grasp is sure.
+    """
+    observation, request = query
+    if len(observation.cloud) == 0:
+        return _empty(observation)
+    guide = None if options.weights is None else detector(options.weights)
+    if guide is None:
+        scene, sample, score = *_sampled(observation, request), None
+    else:
+        prepared = guide.prepare(observation.cloud, request)
+        scene, sample = prepared.scene, prepared.sample
+        score = None if prepared.batch is None else guide.run(prepared.batch)
+    if scene is None or sample is None:
+        return _empty(observation)
+    candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
+    T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
+    return LabelledView(
+        points=scene.points_in_cloud,
+        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
+        camera_position=observation.camera_position,
+        approach_index=candidates.approach_index,
+        contact_index=candidates.contact_index,
+        T_world_hand=T_world_hand,
+        success=np.asarray([result.success for result in results], dtype=np.int8),
+        firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
+    )
 
 
-def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:
-    """Whose objects a scene is made of, and the range of their scales."""
-    source = kind
-    if rng.random() < OTHER_OBJECTS:
-        source = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
-    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
-    return source, (low * WIDER_SCALES[0], high * WIDER_SCALES[1])
+@lru_cache(maxsize=1)
+def detector(weights: Path) -> GraspDetector:
+    """The detector with these weights, loaded once in a process."""
+    return GraspDetector.load(weights)
+
+
+def _sampled(
+    observation: Observation, request: DetectOptions
+) -> tuple[Scene | None, Sample | None]:
+    """The scene and its candidates, as the detector makes them, without a network."""
+    scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
+    if scene is None:
+        return None, None
+    return scene, sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
+
+
+def _chosen(
+    sample: Sample,
+    logit: NDArray[np.floating] | None,
+    total: int,
+    rng: np.random.Generator,
+    hard: bool,
+) -> NDArray[np.int64]:
+    """Ascending rows of the candidates to try, `total` at most.
+
+    Some that a network would execute, as many whose outcome it leaves open, and the rest at
+    random, mostly free of collision. Fewer where the best one is sure to hold, unless the scene is
+    known to be hard.
+    """
+    left = np.ones(len(sample.candidates), dtype=bool)
+    guided = 0
+    if logit is not None:
+        score = 1.0 / (1.0 + np.exp(-logit))
+        free = np.flatnonzero(sample.collision_free)
+        ranked = free[np.argsort(-logit[free])][: round(BEST_SHARE * len(logit)) + 1]
+        if not hard and len(ranked) > 0 and score[ranked[0]] >= SURE:
+            total = round(EASY_SHARE * total)
+        each = round(GUIDED_SHARE * total / 2)
+        first, others = ranked[: each // 2], ranked[each // 2 :]
+        left[first] = False
+        left[rng.permutation(others)[: each - len(first)]] = False
+        unsure = np.flatnonzero(left & (score > UNSURE[0]) & (score < UNSURE[1]))
+        left[rng.permutation(unsure)[:each]] = False
+        guided = int((~left).sum())
+    count = total - guided
+    free = rng.permutation(np.flatnonzero(left & sample.collision_free))
+    hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
+    free = free[: max(round(FREE_SHARE * count), count - len(hit))]
+    left[free] = False
+    left[hit[: count - len(free)]] = False
+    return np.flatnonzero(~left)
+
+
+def _empty(observation: Observation) -> LabelledView:
+    nothing = np.empty((0, 3), dtype=np.float32)
+    rows = np.empty(0, dtype=np.int64)
+    return LabelledView(
+        nothing,
+        nothing,
+        observation.camera_position,
+        rows,
+        rows,
+        None,
+        rows.astype(np.int8),
+    )

@@ -1,6 +1,10 @@
-"""What each shipped model is: its widths and what it reads."""
+"""The networks that can be trained: their sizes, first weights, and the unit they train in."""
 
+from copy import deepcopy
 from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
 
 from edgegrasp_model.networks.config import (
     EDGEGRASP,
@@ -10,11 +14,16 @@ from edgegrasp_model.networks.config import (
     CheckpointMetadata,
     NetworkConfig,
 )
+from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
 VOXEL_SIZE = 0.0045  # metres; that of the training views
 GRIPPER = "panda"
-
+# Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
+# power of two, so that converting weights back to metres is exact.
+LENGTH_UNIT = 1 / 64
+GAIN = 3**0.5  # a dozen layers with PyTorch's initial weights would shrink signals to nothing
 RECIPES: dict[str, NetworkConfig] = {
     "edgegrasp": replace(EDGEGRASP, crop_radius=CROP_RADIUS),
     "edgegrasp-small": replace(EDGEGRASP_SMALL, crop_radius=CROP_RADIUS),
@@ -24,7 +33,7 @@ RECIPES: dict[str, NetworkConfig] = {
 
 
 def recipe(name: str) -> CheckpointMetadata:
-    """What a new network of that name says of itself.
+    """The metadata of a new network of that name.
 
     Raises:
         ValueError: There is no such recipe.
@@ -32,3 +41,45 @@ def recipe(name: str) -> CheckpointMetadata:
     if name not in RECIPES:
         raise ValueError(f"model: got {name!r}. Use one of: {', '.join(RECIPES)}.")
     return CheckpointMetadata(name, RECIPES[name], VOXEL_SIZE, GRIPPER)
+
+
+def prepare_to_train(network: nn.Module) -> None:
+    """Scale the random weights of a network of balls so that signals keep their size."""
+    if isinstance(network, EdgeGraspNet | VNEdgeGraspNet):
+        with torch.no_grad():
+            for module in network.modules():
+                if isinstance(module, nn.Linear):
+                    module.weight.mul_(GAIN)
+
+
+def in_metres(network: nn.Module) -> nn.Module:
+    """Convert a network trained on multiples of LENGTH_UNIT to one that takes metres; a copy."""
+    return _scaled(network, 1.0 / LENGTH_UNIT)
+
+
+def in_units(network: nn.Module) -> nn.Module:
+    """Convert a network that takes metres to one for multiples of LENGTH_UNIT; a copy."""
+    return _scaled(network, LENGTH_UNIT)
+
+
+def _scaled(network: nn.Module, factor: float) -> nn.Module:
+    copy = deepcopy(network)
+    with torch.no_grad():
+        for weight in _length_weights(copy):
+            weight.mul_(factor)
+    return copy
+
+
+def _length_weights(network: nn.Module) -> list[Tensor]:
+    """Views of the weights that multiply lengths; none in the hand network."""
+    if isinstance(network, EdgeGraspNet):
+        first, join = network.conv1.hidden.weight, network.join.weight
+        later = [conv.hidden.weight[:, -3:] for conv in (network.conv2, network.conv3)]
+        return [first[:, :3], first[:, 6:], *later, join[:, :3], join[:, 6]]
+    if isinstance(network, VNEdgeGraspNet):
+        first, frame = network.conv1.hidden.weight, network.frame_1
+        later = [conv.hidden.weight[:, -1] for conv in (network.conv2, network.conv3)]
+        seen = [frame.feature.weight[:, 1], frame.direction.weight[:, 1]]
+        hidden = next(network.classifier.parameters())
+        return [first[:, 0], first[:, 2], *later, *seen, hidden[:, 3:6]]
+    return []

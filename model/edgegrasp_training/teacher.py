@@ -1,4 +1,4 @@
-"""A trained network as teacher: its scores of many candidates that no simulated hand has tried."""
+"""A trained network as teacher: it scores candidates that were not tried in simulation."""
 
 import zlib
 from pathlib import Path
@@ -16,19 +16,17 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
-from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.scene.scene import near_workspace_side
-from edgegrasp_training.examples import SUPPORT, UP, WORKSPACE, Lessons
+from edgegrasp_training.examples import SUPPORT, SoftLabels, hand_batch
 from edgegrasp_training.views import LabelledView, load_view
 
 OWN_BALLS = 16  # balls of a view around approach points of its tried grasps
 FURTHER_BALLS = 8  # around other points
-GRASPS_PER_BALL = 64  # that are scored; about a third of a ball's candidates
+GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 
 class Teacher:
-    """A hand network that scores the candidates of views, and the files that keep its scores."""
+    """A hand network that scores the candidates of views, and keeps its scores in files."""
 
     def __init__(self, weights: Path, crop_radius: float, folder: Path) -> None:
         """Load the teacher.
@@ -36,7 +34,7 @@ class Teacher:
         Args:
             weights: A checkpoint of architecture `hand`.
             crop_radius: Radius of the balls that candidates are drawn from, metres.
-            folder: Keeps the scores, in a folder for this teacher and radius; runs may share it.
+            folder: Keeps the scores, in a subfolder for this teacher and radius; runs may share it.
 
         Raises:
             InvalidCheckpoint: The weights cannot be read.
@@ -50,20 +48,20 @@ class Teacher:
         self.crop_radius = crop_radius
         self.folder = folder / f"{self.metadata.digest[:12]}-{crop_radius * 1000:g}mm"
 
-    def lessons(self, path: Path) -> Lessons:
-        """Its scores of a view's candidates; from the file that keeps them if there is one.
+    def soft_labels(self, path: Path) -> SoftLabels:
+        """Its scores of a view's candidates, read from a file if they were computed before.
 
         Args:
-            path: The view's file. What it holds decides which candidates are scored.
+            path: The view's file; its content decides which candidates are scored.
         """
         digest = zlib.crc32(path.read_bytes())
         kept = self.folder / f"{path.stem}-{digest:08x}.npz"
         if not kept.is_file():
             self.folder.mkdir(parents=True, exist_ok=True)
-            self.teach(load_view(path), np.random.default_rng(digest)).save(kept)
-        return Lessons.load(kept)
+            self.score(load_view(path), np.random.default_rng(digest)).save(kept)
+        return SoftLabels.load(kept)
 
-    def teach(self, view: LabelledView, rng: np.random.Generator) -> Lessons:
+    def score(self, view: LabelledView, rng: np.random.Generator) -> SoftLabels:
         """Score candidates around some of a view's points.
 
         Args:
@@ -75,24 +73,16 @@ class Teacher:
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
         if len(balls) == 0:
-            return Lessons.none()
+            return SoftLabels.none()
         cloud = Cloud(view.points, view.normals)
         candidates = self._candidates(cloud, balls, rng)
         if len(candidates) == 0:
-            return Lessons.none()
-        hands = HandBatch.from_cloud(
-            cloud,
-            candidates,
-            self.gripper,
-            UP,
-            SUPPORT,
-            view.camera_position,
-            near_workspace_side(view.points, WORKSPACE, UP),
-            self.metadata.network.hand_points,
-        )
+            return SoftLabels.none()
+        max_points = self.metadata.network.hand_points
+        hands = hand_batch(cloud, candidates, self.gripper, view.camera_position, max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
-        return Lessons(
+        return SoftLabels(
             candidates.approach_index.astype(np.uint16),
             candidates.contact_index.astype(np.uint16),
             candidates.approach.astype(np.float16),
@@ -103,7 +93,7 @@ class Teacher:
     def _candidates(
         self, cloud: Cloud, balls: NDArray[np.int64], rng: np.random.Generator
     ) -> Candidates:
-        """Candidates in balls (A,), as the detector makes them; so many of each."""
+        """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
         level = top_down_grasps(cloud, *pairs, SUPPORT, self.gripper)

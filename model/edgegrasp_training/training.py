@@ -1,4 +1,4 @@
-"""The training loop: resumable to the step, stops by itself, keeps the best network."""
+"""The training loop: resumes at the exact step, stops by itself, keeps the best network."""
 
 import csv
 import math
@@ -21,11 +21,11 @@ from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, HandNet
-from edgegrasp_training.ball_network import in_metres, in_units, prepare_to_train
+from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
 from edgegrasp_training.examples import (
-    Lessons,
     Packed,
     Rotations,
+    SoftLabels,
     TriedGrasps,
     pack_balls,
     pack_hands,
@@ -33,8 +33,7 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
-from edgegrasp_training.metrics import Evaluation, evaluate_scores
-from edgegrasp_training.model_card import write_model_card
+from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train
 from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import load_view
 
@@ -42,6 +41,9 @@ VIEWS_IN_MEMORY = 8000
 Schedule = Literal["plateau", "cosine"]  # halve on a plateau, or fall to 0 at the last step
 DROPOUT_STREAM = 1  # random stream of a step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
+# Attributes of a trainer that its state file keeps.
+COUNTERS = ("step", "best_loss", "since_best", "halved", "seconds")
+STATEFUL = ("network", "average", "optimizer")
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,16 @@ class TrainingOptions:
     patience: int = 3  # evaluations without a better loss before the learning rate is halved
     halvings: int = 4  # stop at the next one
     evaluate_every: int = 250  # steps
-    averaging: float = 0.998  # share of the old weights in the running mean that is kept and judged
+    averaging: float = 0.998  # share of the old weights in the running mean that is kept
     unknown: float = 0.1  # share of training views without their table, and without their camera
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate
-    mixed_precision: bool = False  # products in bfloat16: for a GPU
+    mixed_precision: bool = False  # matrix products in bfloat16, for a GPU
     seed: int = 0
 
 
 class Trainer:
-    """Trains one network; everything it needs to go on is in its run folder."""
+    """Trains one network; its run folder holds everything it needs to resume."""
 
     def __init__(
         self,
@@ -77,7 +79,7 @@ class Trainer:
         device: torch.device | str = "cpu",
         teacher: Teacher | None = None,
     ) -> None:
-        """Set up, and go on from the folder's last state if there is one.
+        """Set up, and resume from the folder's last state if there is one.
 
         Args:
             metadata: Name, widths and gripper of the network to train.
@@ -86,10 +88,10 @@ class Trainer:
             folder: Gets `state.pt`, `log.csv` and `NAME.safetensors`, the best so far.
             options: The recipe.
             device: Where the network runs.
-            teacher: Scores further candidates, to learn from beside the labels.
+            teacher: Scores further candidates to learn from.
 
         Raises:
-            ValueError: There is a teacher for a network that sees hands, not balls.
+            ValueError: The network is one of hands, which no teacher can teach.
         """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
@@ -98,7 +100,7 @@ class Trainer:
         self.train_paths, self.validation_paths = train_paths, validation_paths
         self.gripper = load_gripper(metadata.gripper)
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
-        self._lessons = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._learn)
+        self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._score)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
@@ -137,7 +139,7 @@ class Trainer:
         self._save_state()
 
     def evaluate(self, balls_per_view: int | None = None) -> Evaluation:
-        """Score the validation views against what held; of each so many balls, or all of them."""
+        """Score the validation views, or at most `balls_per_view` balls of each."""
         logits, labels = [], []
         with torch.inference_mode():
             for number, path in enumerate(self.validation_paths):
@@ -217,7 +219,7 @@ class Trainer:
         return float(loss.detach())
 
     def _training_batch(self, rng: np.random.Generator) -> Packed:
-        """Some balls of some views; the step number alone decides which."""
+        """Some balls of some views; the seed and the step number alone decide which."""
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
@@ -226,14 +228,14 @@ class Trainer:
             grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
             if not support_known:
                 grasps = grasps.without_support()
-            balls, lessons = grasps.balls(), None
+            balls, soft_labels = grasps.balls(), None
             if self.teacher is not None:
-                lessons = self._lessons(self.train_paths[index])
-                balls = np.union1d(balls, lessons.approach_index).astype(np.int64)
+                soft_labels = self._soft_labels(self.train_paths[index])
+                balls = np.union1d(balls, soft_labels.approach_index).astype(np.int64)
             if len(balls) == 0:
                 continue
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
-            packed = self._pack(grasps, np.sort(chosen), rng, lessons)
+            packed = self._pack(grasps, np.sort(chosen), rng, soft_labels)
             if self.metadata.network.architecture == "edgegrasp":
                 packed = self._turned(packed, rng, bool(camera_known))
             parts.append(packed)
@@ -246,16 +248,16 @@ class Trainer:
         grasps: TriedGrasps,
         balls: NDArray[np.int64],
         rng: np.random.Generator | None = None,
-        lessons: Lessons | None = None,
+        soft_labels: SoftLabels | None = None,
     ) -> Packed:
-        """Some balls of a view; varied where there is a random stream."""
+        """Some balls of a view; `rng` picks the points of hands at random."""
         network = self.metadata.network
         if network.architecture == "hand":
             return pack_hands(grasps, balls, network, rng)
-        return pack_balls(grasps, balls, network, lessons)
+        return pack_balls(grasps, balls, network, soft_labels)
 
     def _turned(self, packed: Packed, rng: np.random.Generator, camera_known: bool) -> Packed:
-        """Balls turned at random: what Vector Neurons need not learn, this network must."""
+        """Rotate balls at random: this network, unlike Vector Neurons, is not equivariant."""
         # Without a camera the detector's frame is upright, but may be turned any way about up.
         known = camera_known or self.options.rotations == "any"
         rotations = self.options.rotations if known else "upright"
@@ -267,12 +269,12 @@ class Trainer:
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
 
-    def _learn(self, path: Path) -> Lessons:
+    def _score(self, path: Path) -> SoftLabels:
         assert self.teacher is not None
-        return self.teacher.lessons(path)
+        return self.teacher.soft_labels(path)
 
     def _standardise(self) -> None:
-        """Fit the description's mean and spread to the training views."""
+        """Fit the mean and spread of the hand descriptions to the training views."""
         if not isinstance(self.network, HandNet):
             return
         seen = [self._tried(path, True).seen for path in self.train_paths]
@@ -294,7 +296,7 @@ class Trainer:
         self._save_state()
 
     def _save_average(self, metadata: CheckpointMetadata) -> None:
-        """Write the running mean, for lengths in metres."""
+        """Write the running mean of the weights, for lengths in metres."""
         path = self.folder / f"{metadata.name}.safetensors"
         save_checkpoint(path, in_metres(self.average), metadata)
 
@@ -316,16 +318,8 @@ class Trainer:
             writer.writerow(row)
 
     def _save_state(self) -> None:
-        state = {
-            "step": self.step,
-            "best_loss": self.best_loss,
-            "since_best": self.since_best,
-            "halved": self.halved,
-            "seconds": self.seconds,
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-        }
+        state = {name: getattr(self, name) for name in COUNTERS}
+        state |= {name: getattr(self, name).state_dict() for name in STATEFUL}
         partial = self.folder / (STATE_FILE + ".partial")
         torch.save(state, partial)
         partial.replace(self.folder / STATE_FILE)
@@ -334,9 +328,7 @@ class Trainer:
         state: dict[str, Any] = torch.load(
             self.folder / STATE_FILE, weights_only=True, map_location=self.device
         )
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step, self.best_loss = state["step"], state["best_loss"]
-        self.since_best, self.halved = state["since_best"], state["halved"]
-        self.seconds = state["seconds"]
+        for name in STATEFUL:
+            getattr(self, name).load_state_dict(state[name])
+        for name in COUNTERS:
+            setattr(self, name, state[name])

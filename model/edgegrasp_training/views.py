@@ -1,6 +1,7 @@
-"""Labelled views: what a data generator writes and a trainer reads."""
+"""Labelled views, which a data generator writes and a trainer reads, and their data card."""
 
 import zlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
-
-UNTRIED = -1  # label of a candidate that no simulated hand has tried
+UNTRIED = -1  # label of a candidate that was not tried
+CARD_FILE = "card.md"
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class LabelledView:
     camera_position: Float32  # (3,)
     approach_index: NDArray[np.int64]  # (E,) rows of `points`
     contact_index: NDArray[np.int64]  # (E,) rows of `points`
-    T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: those of the paper's definition
+    T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
@@ -72,10 +73,6 @@ def load_view(path: Path) -> LabelledView:
         )
 
 
-def _texts(array: NDArray[np.str_] | None) -> tuple[str, ...]:
-    return () if array is None else tuple(str(text) for text in array)
-
-
 def find_views(folders: list[Path]) -> list[Path]:
     """All view files of some folders, sorted by name.
 
@@ -99,7 +96,7 @@ def split_by_scene(
 ) -> tuple[list[Path], list[Path]]:
     """Training and validation views; all views of one scene fall on the same side.
 
-    A scene keeps its side when more scenes are added, so that a run may go on with more data.
+    A scene keeps its side when scenes are added, so that a run may resume with more data.
 
     Args:
         paths: View files.
@@ -131,3 +128,63 @@ def part_of(paths: list[Path], share: float, seed: int) -> list[Path]:
     if not part:
         raise ValueError(f"training_share: {share:g} of {len(paths)} views leaves none. Use more.")
     return part
+
+
+def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
+    """Count views, scenes, labels and objects of each kind of scene in `card.md`.
+
+    Args:
+        folder: Where the card goes.
+        paths: View files.
+        command: The one that made them.
+    """
+    views = {path: load_view(path) for path in paths}
+    kinds = sorted({_kind(path) for path in paths})
+    columns = [_facts({p: v for p, v in views.items() if _kind(p) == kind}) for kind in kinds]
+    columns.append(_facts(views))
+    names = [*kinds, "all"]
+    rule = "| --- " * (len(names) + 1) + "|"
+    lines = ["# Labelled views", "", f"| | {' | '.join(names)} |", rule]
+    lines += [
+        f"| {fact} | {' | '.join(column[fact] for column in columns)} |" for fact in columns[0]
+    ]
+    objects = Counter(
+        known
+        for view in views.values()
+        for known in set(zip(view.objects, view.object_digests, strict=True))
+    )
+    lines += ["", "Made by:", "", "```", command, "```", ""]
+    lines += ["Objects, the SHA-256 of their files, and in how many views they are:", ""]
+    lines += [f"- {name} `{digest}`: {count}" for (name, digest), count in sorted(objects.items())]
+    path = folder / CARD_FILE
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def _texts(array: NDArray[np.str_] | None) -> tuple[str, ...]:
+    return () if array is None else tuple(str(text) for text in array)
+
+
+def _kind(path: Path) -> str:
+    return path.stem.split("_")[0]
+
+
+def _facts(views: dict[Path, LabelledView]) -> dict[str, str]:
+    """The rows of one column."""
+    tried = sum(len(view.tried()) for view in views.values())
+    held = sum(int((view.success == 1).sum()) for view in views.values())
+    shaken = [view for view in views.values() if view.firm is not None]
+    shaken_held = sum(int((view.success == 1).sum()) for view in shaken)
+    firm = sum(int((view.firm == 1).sum()) for view in shaken if view.firm is not None)
+    return {
+        "scenes": str(len({scene_of(path) for path in views})),
+        "views": str(len(views)),
+        "grasps tried": str(tried),
+        "held after the lift": _share(held, tried),
+        "of those, held after shaking too": _share(firm, shaken_held),
+        "objects": str(len({name for view in views.values() for name in view.objects})),
+    }
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f} %" if whole else "-"

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from benchmarks import readme
-from benchmarks.textbook.edge_grasp import edge_grasp_logits
-from benchmarks.textbook.vn_edge_grasp import vn_edge_grasp_logits
-from benchmarks.timing import interleaved, summary
+from benchmarks.textbook.networks import edge_grasp_logits, vn_edge_grasp_logits
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.networks.balls import BallBatch
@@ -48,37 +45,13 @@ def batch() -> BallBatch:
     )
 
 
-def test_edge_grasp_logits_are_those_of_the_network(batch: BallBatch) -> None:
-    plain = network("edgegrasp")
+@pytest.mark.parametrize(
+    ("architecture", "textbook"),
+    [("edgegrasp", edge_grasp_logits), ("vn-edgegrasp", vn_edge_grasp_logits)],
+)
+def test_logits_are_those_of_the_network(architecture: str, textbook, batch: BallBatch) -> None:
+    ours = network(architecture)
     with torch.no_grad():
-        ours, theirs = plain(batch), edge_grasp_logits(plain, batch)
-    assert ours.std() > 1e-6
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-9)
-
-
-def test_vn_logits_are_those_of_the_network(batch: BallBatch) -> None:
-    vn = network("vn-edgegrasp")
-    with torch.no_grad():
-        ours, theirs = vn(batch), vn_edge_grasp_logits(vn, batch)
-    assert ours.std() > 1e-6
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-9)
-
-
-def test_variants_take_turns() -> None:
-    order: list[str] = []
-    names = ("a", "b")
-    times = interleaved({name: lambda name=name: order.append(name) for name in names}, runs=2)
-    assert order == ["a", "b"] * 3
-    assert {name: len(seconds) for name, seconds in times.items()} == {"a": 2, "b": 2}
-
-
-def test_the_ratio_is_the_median_of_rounds() -> None:
-    measured = summary({"x": [1.0, 2.0, 1.0], "y": [3.0, 4.0, 9.0]}, "x", "y")
-    assert measured == {"seconds": {"x": 1.0, "y": 4.0}, "times_faster": 3.0, "rounds": 3}
-
-
-def test_a_readme_without_markers_is_refused(tmp_path) -> None:
-    page = tmp_path / "README.md"
-    page.write_text("nothing")
-    with pytest.raises(ValueError, match="bench:begin"):
-        readme.write_table(page, {})
+        expected, found = ours(batch), textbook(ours, batch)
+    assert expected.std() > 1e-6
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)

@@ -1,32 +1,45 @@
+"""The program as a whole: its help, and what it says where something is missing."""
+
+import json
 import subprocess
 import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 
-HEAVY = ("torch", "open3d", "grpc", "pybullet", "numpy", "fastapi", "scipy", "httpx")
+HEAVY = {"torch", "open3d", "grpc", "pybullet", "fastapi", "uvicorn", "matplotlib", "httpx"}
 
 
-def test_help_lists_the_commands_and_imports_nothing_heavy() -> None:
+def loaded_by(*arguments: str) -> tuple[str, set[str]]:
+    """What a command prints, and the modules that a fresh interpreter has loaded for it."""
     program = (
-        "import sys\nfrom edgegrasp_cli.main import main\nsys.argv = ['edgegrasp', '--help']\n"
-        "try: main()\nexcept SystemExit: pass\n"
-        "print('imported', *sys.modules)"
+        "import sys\nfrom edgegrasp_cli.main import main\n"
+        f"sys.argv = ['edgegrasp', *{arguments!r}]\n"
+        "try: main()\nexcept SystemExit as end: assert not end.code\n"
+        "print('LOADED', *sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    shown, _, imported = done.stdout.partition("imported ")
-    for name in main.COMMANDS:
-        assert name in shown
-    assert not set(HEAVY) & set(imported.split())
+    assert done.returncode == 0, done.stderr
+    shown, _, loaded = done.stdout.rpartition("LOADED")
+    return shown, set(loaded.split())
 
 
-@pytest.mark.parametrize("name", ["serve", "detect", "models"])
-def test_commands_show_their_own_help(name: str) -> None:
-    result = CliRunner().invoke(main.app, [name, "--help"])
-    assert result.exit_code == 0
-    assert "--weights" in result.output
+def test_help_lists_the_commands_and_loads_nothing_heavy() -> None:
+    shown, loaded = loaded_by("--help")
+    assert all(name in shown for name in main.COMMANDS)
+    assert not loaded & (HEAVY | {"numpy", "scipy", "pydantic"})
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_help_of_a_command_loads_nothing_heavy(name: str) -> None:
+    shown, loaded = loaded_by(name, "--help")
+    assert name in shown
+    assert not loaded & HEAVY
 
 
 def test_unknown_command() -> None:
@@ -35,27 +48,19 @@ def test_unknown_command() -> None:
     assert "Did you mean 'detect'?" in result.output
 
 
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    monkeypatch.setitem(sys.modules, "edgegrasp_client", None)
-    result = CliRunner().invoke(main.app, ["models", "--server", "127.0.0.1:1"])
-    assert result.exit_code == 1
-    assert "pip install 'edgegrasp[service]'" in result.output
-
-
-def test_a_missing_package_of_a_command_in_a_group_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch, tmp_path
+@pytest.mark.parametrize(
+    ("missing", "words", "extra"),
+    [
+        ("edgegrasp_client", ["models", "--server", "127.0.0.1:1"], "service"),
+        ("edgegrasp_sim.replay", ["replay", "attempt", "FOLDER"], "service,sim"),
+        ("edgegrasp_cli.serve", ["serve"], "service"),
+    ],
+)
+def test_a_missing_package_names_the_extra(
+    missing: str, words: list[str], extra: str, refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "edgegrasp_sim.film", None)
-    result = CliRunner().invoke(main.app, ["replay", "attempt", str(tmp_path)])
-    assert result.exit_code == 1
-    assert "pip install 'edgegrasp[sim]'" in result.output
-
-
-def test_a_command_that_is_not_there_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "edgegrasp_cli.serve", None)
-    result = CliRunner().invoke(main.app, ["serve"])
-    assert result.exit_code == 1
-    assert "pip install 'edgegrasp[service]'" in result.output
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert f"pip install 'edgegrasp[{extra}]'" in refused(*words)
 
 
 def test_the_command_line_is_an_extra() -> None:
@@ -63,3 +68,27 @@ def test_the_command_line_is_an_extra() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1
     assert "pip install 'edgegrasp[cli]'" in done.stderr
+
+
+@pytest.mark.parametrize("transport", ["http", "grpc"])
+def test_a_recorded_request_is_answered_again(
+    transport: str, run, refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def body(model: str, seconds: float) -> bytes:
+        if transport == "http":
+            return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()
+        response = grasp_pb2.DetectGraspsResponse(model=model, seconds={"total": seconds})
+        return response.SerializeToString()
+
+    def replay(path: Path, settings: object) -> SimpleNamespace:
+        answer = SimpleNamespace(
+            body=body(path.stem, 2.0), error=None, facts=SimpleNamespace(grasps=7)
+        )
+        job = SimpleNamespace(transport=transport, method="DetectGrasps")
+        return SimpleNamespace(job=job, recorded=body("plus", 1.0), answer=answer)
+
+    recording = ModuleType("edgegrasp_service.recording")
+    recording.replay = replay  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "edgegrasp_service.recording", recording)
+    assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
+    assert "differs" in refused("replay", "request", "small.job")

@@ -1,22 +1,40 @@
+"""What the open hand hits; PyBullet, which knows nothing of ours, has to agree."""
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.collision import FINGER_CLEARANCE, hits_cloud, required_openings
-from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.candidates.collision import (
+    FINGER_CLEARANCE,
+    clearances,
+    collides,
+    hits_cloud,
+    required_openings,
+)
 from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
-from edgegrasp_model.options import Collision
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.options import Collision, OrientedBox, SupportPlane
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.obstacles import SolidBoxes
+from edgegrasp_model.scene.scene import Scene
 
-PANDA = load_gripper()
+from .scenes import PANDA
+
 HAND = np.eye(4, dtype=np.float32)[None]
+POSES = 600
+SWEPT_POSES = 150
+DOUBT = 0.0005  # metres around touching in which neither is held to be right
+DOT = 0.0005  # radius of the spheres that stand for points, metres
+FLOOR = -0.08  # height of the support plane, metres
+POINTS = np.random.default_rng(1).uniform(-0.06, 0.06, (25, 3)).astype(np.float32)
+WALL = OrientedBox(
+    center=(0.1, 0.05, 0.0),
+    half_extents=(0.02, 0.06, 0.05),
+    quaternion=tuple(Rotation.from_euler("xyz", [0.3, -0.4, 0.7]).as_quat().tolist()),
+)
 
 
 def cloud_of(*points: tuple[float, float, float]) -> Cloud:
     return Cloud(np.array(points, np.float32), np.zeros((len(points), 3), np.float32))
-
-
-def seen(*points: tuple[float, float, float]):
-    return hand_views(cloud_of(*points), HAND, reach_of(PANDA))
 
 
 @pytest.mark.parametrize(
@@ -38,25 +56,126 @@ def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hit
     assert hits_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
 
 
-def test_the_width_is_what_lies_between_the_fingers_and_clearance() -> None:
-    width = required_openings(
-        seen((0.0, 0.012, 0.10), (0.0, -0.02, 0.09), (0.0, 0.03, 0.12)), PANDA
-    )
-    np.testing.assert_allclose(width, 2 * (0.02 + FINGER_CLEARANCE), atol=1e-6)
-    assert required_openings(seen((0.0, 0.039, 0.10)), PANDA)[0] == np.float32(PANDA.max_opening)
+def test_the_opening_is_what_lies_between_the_fingers_and_clearance() -> None:
+    for points, opening in (
+        (
+            [(0.0, 0.012, 0.10), (0.0, -0.02, 0.09), (0.0, 0.03, 0.12)],
+            2 * (0.02 + FINGER_CLEARANCE),
+        ),
+        ([(0.0, 0.039, 0.10)], PANDA.max_opening),
+    ):
+        view = hand_views(cloud_of(*points), HAND, reach_of(PANDA))
+        np.testing.assert_allclose(required_openings(view, PANDA), opening, atol=1e-6)
 
 
-def test_views_of_some_hands_are_those_of_all_taken() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.1, 0.15, (300, 3)).astype(np.float32)
-    cloud = Cloud(points, np.zeros_like(points))
-    hands = np.repeat(HAND, 9, axis=0)
-    hands[:, :3, 3] = rng.uniform(-0.05, 0.05, (9, 3))
-    rows = np.array([1, 4, 8])
-    taken, direct = (
-        hand_views(cloud, hands, reach_of(PANDA)).take(rows),
-        hand_views(cloud, hands[rows], reach_of(PANDA)),
+def scene() -> Scene:
+    everywhere = np.ones(len(POINTS), dtype=bool)
+    frame = CanonicalFrame(np.eye(4))
+    return Scene(
+        frame,
+        Cloud(POINTS, POINTS),
+        POINTS,
+        np.arange(len(POINTS)),
+        everywhere,
+        everywhere,
+        SupportPlane(normal=(0.0, 0.0, 1.0), offset=FLOOR),
+        SolidBoxes.from_shapes([WALL], frame),
     )
-    np.testing.assert_array_equal(taken.candidate, direct.candidate)
-    np.testing.assert_array_equal(taken.row, direct.row)
-    np.testing.assert_allclose(taken.position, direct.position, atol=1e-6)
+
+
+def hands_about_the_points(count: int, seed: int) -> np.ndarray:
+    """Hands (count, 4, 4) whose fingertips are about the points, half of them from above."""
+    rng = np.random.default_rng(seed)
+    hands = np.tile(np.eye(4, dtype=np.float32), (count, 1, 1))
+    leaning = Rotation.from_euler("x", np.pi + rng.uniform(-0.5, 0.5, (count, 1)))
+    hands[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    hands[::2, :3, :3] = leaning[::2].as_matrix()
+    ahead = rng.uniform(0.06, 0.22, count)[:, None]
+    hands[:, :3, 3] = rng.uniform(-0.07, 0.07, (count, 3)) - ahead * hands[:, :3, 2]
+    return hands
+
+
+class BulletScene:
+    """The open hand, points, wall and floor in a physics world of their own."""
+
+    def __init__(self) -> None:
+        bullet = pytest.importorskip("pybullet")
+        clients = pytest.importorskip("pybullet_utils.bullet_client")
+        self.world = clients.BulletClient(bullet.DIRECT)
+        self.hand = [
+            self.box((high - low) / 2, shift=(high + low) / 2)
+            for low, high in PANDA.boxes(PANDA.max_opening)
+        ]
+        dot = self.world.createCollisionShape(bullet.GEOM_SPHERE, radius=DOT)
+        self.dots = [self.world.createMultiBody(0, dot, -1, point.tolist()) for point in POINTS]
+        wall = self.box(WALL.half_extents)
+        self.world.resetBasePositionAndOrientation(wall, WALL.center, WALL.quaternion)
+        floor = self.box((1, 1, 0.2))
+        self.world.resetBasePositionAndOrientation(floor, (0, 0, FLOOR - 0.2), (0, 0, 0, 1))
+        self.others = [*self.dots, wall, floor]
+
+    def box(self, half: object, shift: object = (0, 0, 0)) -> int:
+        shape = self.world.createCollisionShape(
+            self.world.GEOM_BOX, halfExtents=list(half), collisionFramePosition=list(shift)
+        )
+        return self.world.createMultiBody(0, shape)
+
+    def distance(self, T_world_hand: np.ndarray, within: float) -> float:
+        """Signed distance of the hand to the nearest thing, at most `within`."""
+        quaternion = Rotation.from_matrix(T_world_hand[:3, :3]).as_quat()
+        found = [within]
+        for part in self.hand:
+            self.world.resetBasePositionAndOrientation(part, T_world_hand[:3, 3], quaternion)
+            for other in self.others:
+                grown = DOT if other in self.dots else 0.0
+                near = self.world.getClosestPoints(part, other, within)
+                found += [contact[8] + grown for contact in near]
+        return min(found)
+
+
+@pytest.fixture(scope="module")
+def bullet_scene() -> BulletScene:
+    return BulletScene()
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.004])
+def test_hands_at_rest_collide_where_bullet_says_so(
+    bullet_scene: BulletScene, margin: float
+) -> None:
+    hands = hands_about_the_points(POSES, seed=2)
+    found = collides(scene(), hands, PANDA, Collision(approach_length=0.0, margin=margin))
+    measured = clearances(scene(), hands, PANDA)
+    distance = np.array([bullet_scene.distance(hand, 0.02) for hand in hands])
+    # Boxes grown on every side reach further at their edges than a distance does.
+    clear = (distance < margin - DOUBT) | (distance > np.sqrt(3) * margin + DOUBT)
+    assert clear.sum() > 0.7 * POSES
+    assert 0.1 < found.mean() < 0.9
+    assert (found[clear] == (distance[clear] < margin)).mean() >= 0.99
+    apart = (distance > DOUBT) & (distance < 0.02 - DOUBT)
+    # Bullet rounds the corners of boxes, by up to a millimetre.
+    np.testing.assert_allclose(measured[apart], distance[apart], atol=0.0015)
+    assert ((measured <= 0) == (distance <= 0))[np.abs(distance) > DOUBT].mean() >= 0.99
+
+
+@pytest.mark.parametrize("direction", ["back", "up"])
+def test_hands_on_their_way_collide_where_bullet_says_so(
+    bullet_scene: BulletScene, direction: str
+) -> None:
+    hands = hands_about_the_points(SWEPT_POSES, seed=3)
+    request = Collision(approach_length=0.03, retreat_length=0.06, retreat_direction=direction)
+    found = collides(scene(), hands, PANDA, request)
+    distance = np.full(SWEPT_POSES, np.inf)
+    for row, hand in enumerate(hands):
+        out = -hand[:3, 2] if direction == "back" else np.array([0, 0, 1])
+        ways = [-hand[:3, 2] * step for step in np.linspace(0, 0.03, 11)]
+        ways += [out * step for step in np.linspace(0, 0.06, 21)]
+        for way in ways:
+            moved = hand.copy()
+            moved[:3, 3] += way
+            distance[row] = min(distance[row], bullet_scene.distance(moved, 0.01))
+            if distance[row] < -DOUBT:
+                break
+    clear = np.abs(distance) > 0.0015  # half a step
+    assert clear.sum() > 0.5 * SWEPT_POSES
+    assert 0.05 < found.mean() < 0.95
+    assert (found[clear] == (distance[clear] < 0)).mean() >= 0.99

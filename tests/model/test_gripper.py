@@ -1,31 +1,34 @@
+"""Grippers from files and requests, and what each of them makes of edges and points."""
+
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from edgegrasp_model.candidates.collision import hits_cloud, required_openings
-from edgegrasp_model.candidates.edge_grasps import (
-    EDGE_MARGIN,
-    edge_grasps,
-    support_clearance,
-    top_down_grasps,
+from edgegrasp_model.candidates.collision import hits_cloud
+from edgegrasp_model.candidates.edge_grasps import edge_grasps, support_clearance, top_down_grasps
+from edgegrasp_model.errors import InvalidGripper, InvalidRequest
+from edgegrasp_model.gripper import (
+    GRIPPER_FOLDER,
+    Gripper,
+    choose_gripper,
+    gripper_from_fields,
+    gripper_names,
+    load_gripper,
 )
-from edgegrasp_model.errors import InvalidGripper
-from edgegrasp_model.gripper import GRIPPER_FOLDER, gripper_from_fields, gripper_names, load_gripper
 from edgegrasp_model.hand_description import describe_hands
-from edgegrasp_model.hand_view import hand_views, reach_of
-from edgegrasp_model.options import Collision, GripperGeometry, SupportPlane
+from edgegrasp_model.options import Collision, DetectOptions, GripperGeometry, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
+from .scenes import PANDA, VIEW, box_on_table, detector
+
 GRIPPERS = [load_gripper(name) for name in gripper_names()]
-SWINGING = [gripper for gripper in GRIPPERS if gripper.swing is not None]
+LINKAGES = [gripper for gripper in GRIPPERS if gripper.linkage is not None]
 by_name = pytest.mark.parametrize("gripper", GRIPPERS, ids=lambda gripper: gripper.name)
 HAND = np.eye(4, dtype=np.float32)[None]
-swinging = pytest.mark.parametrize("gripper", SWINGING, ids=lambda gripper: gripper.name)
+with_linkage = pytest.mark.parametrize("gripper", LINKAGES, ids=lambda gripper: gripper.name)
 
 
 def panda_fields() -> dict[str, Any]:
@@ -36,15 +39,6 @@ def edge_cloud(along: float, depth: float) -> Cloud:
     """p_a over p_c: the hand comes down, its fingers close along y."""
     points = np.array([[0.1, 0.2, 0.3], [0.1, 0.2 + along, 0.3 - depth]], np.float32)
     return Cloud(points, np.array([[0, 0, 1], [0, 1, 0]], np.float32))
-
-
-def test_the_panda_has_its_published_dimensions() -> None:
-    panda = load_gripper("panda")
-    assert panda.max_opening == 0.08
-    assert panda.palm_z == 0.0658
-    assert panda.pad_half_width == 0.0105
-    np.testing.assert_allclose(panda.finger_depth, 0.0392)
-    np.testing.assert_allclose(panda.T_hand_tcp[:3, 3], [0, 0, 0.1034])
 
 
 @pytest.mark.parametrize(
@@ -65,17 +59,13 @@ def test_each_gripper_that_ships_has_its_published_dimensions(
     assert gripper.tip_z + gripper.tip_advance(0.0) == pytest.approx(closed_tip, abs=1e-4)
     hand = np.array(gripper.hand_boxes)
     np.testing.assert_allclose((hand[:, 1] - hand[:, 0])[:, :2].max(axis=0), body, atol=1e-6)
-
-
-@by_name
-def test_the_tcp_lies_ahead_of_the_palm_among_the_fingers(gripper: Any) -> None:
     np.testing.assert_allclose(gripper.T_hand_tcp[:3, :3], np.eye(3))
     np.testing.assert_allclose(gripper.T_hand_tcp[:3, 3], [0, 0, gripper.tcp_z])
     assert gripper.palm_z < gripper.tcp_z <= gripper.max_tip_z + 1e-6
 
 
 @by_name
-def test_fingers_mirror_each_other_and_stand_the_opening_apart(gripper: Any) -> None:
+def test_fingers_mirror_each_other_and_stand_the_opening_apart(gripper: Gripper) -> None:
     hands, fingers = len(gripper.hand_boxes), len(gripper.finger_boxes)
     for opening in (0.0, 0.05, gripper.max_opening):
         boxes = gripper.boxes(opening)
@@ -88,48 +78,27 @@ def test_fingers_mirror_each_other_and_stand_the_opening_apart(gripper: Any) -> 
     np.testing.assert_array_equal(many, [gripper.boxes(0.01), gripper.boxes(0.05)])
 
 
-@swinging
-def test_swinging_fingers_stay_on_their_link_and_come_forward(gripper: Any) -> None:
+@with_linkage
+def test_swinging_fingers_stay_on_their_link_and_come_forward(gripper: Gripper) -> None:
     opening = np.linspace(0.0, gripper.max_opening, 50)
     advance = gripper.tip_advance(opening)
-    outward = gripper.swing.reach - (gripper.max_opening - opening) / 2
-    ahead = np.sqrt(gripper.swing.radius**2 - gripper.swing.reach**2) + advance
-    np.testing.assert_allclose(np.hypot(outward, ahead), gripper.swing.radius)
+    outward = gripper.linkage.reach - (gripper.max_opening - opening) / 2
+    ahead = np.sqrt(gripper.linkage.radius**2 - gripper.linkage.reach**2) + advance
+    np.testing.assert_allclose(np.hypot(outward, ahead), gripper.linkage.radius)
     assert gripper.tip_advance(gripper.max_opening) == pytest.approx(0.0)
     assert gripper.max_tip_z == pytest.approx(gripper.tip_z + advance.max(), abs=1e-5)
     tips = gripper.boxes(opening)[:, :, 1, 2].max(axis=1)
     np.testing.assert_allclose(tips, gripper.tip_z + advance)
 
 
-@swinging
-def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Any) -> None:
+@with_linkage
+def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gripper) -> None:
     down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)[None]
     down[0, 2, 3] = 0.5
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
     clearance = support_clearance(down, floor, gripper)[0]
     lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in np.linspace(0, 0.08, 40))
     assert clearance == pytest.approx(lowest, abs=1e-5)
-
-
-@by_name
-@settings(max_examples=30, deadline=None)
-@given(along=st.floats(0.004, 0.06), depth=st.floats(0.002, 0.05))
-def test_an_edge_grasp_puts_its_contact_inside_the_fingertips(
-    gripper: Any, along: float, depth: float
-) -> None:
-    cloud = edge_cloud(along, depth)
-    grasps = edge_grasps(cloud, np.array([0]), np.array([1]), gripper)
-    fits = np.hypot(along, depth) < gripper.max_opening / 2 - EDGE_MARGIN
-    assert len(grasps) == int(fits and depth < gripper.finger_depth)
-    for pose in grasps.T_cloud_hand:
-        p_a, p_c = (cloud.points - pose[:3, 3]) @ pose[:3, :3]
-        np.testing.assert_allclose(p_c[[0, 1]], [0, along], atol=1e-6)
-        np.testing.assert_allclose(p_a[[0, 1]], [0, 0], atol=1e-6)
-        np.testing.assert_allclose(p_c[2], gripper.contact_z_at(2 * along), atol=1e-6)
-        tips = gripper.boxes(2 * along)[:, 1, 2].max()
-        np.testing.assert_allclose(tips - p_c[2], gripper.tip_z - gripper.contact_z, atol=1e-6)
-        assert abs(p_c[1]) < gripper.max_opening / 2
-        assert p_a[2] > gripper.palm_z
 
 
 def test_a_wider_gripper_takes_edges_that_a_narrow_one_cannot() -> None:
@@ -139,7 +108,7 @@ def test_a_wider_gripper_takes_edges_that_a_narrow_one_cannot() -> None:
 
 
 @by_name
-def test_a_level_grasp_puts_its_contact_inside_the_fingertips(gripper: Any) -> None:
+def test_a_level_grasp_puts_its_contact_inside_the_fingertips(gripper: Gripper) -> None:
     floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.28)
     cloud = edge_cloud(0.02, 0.005)
     grasps = top_down_grasps(cloud, np.array([0]), np.array([1]), floor, gripper)
@@ -150,7 +119,7 @@ def test_a_level_grasp_puts_its_contact_inside_the_fingertips(gripper: Any) -> N
 
 
 @by_name
-def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
+def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> None:
     boxes = gripper.boxes(gripper.max_opening)
     centres = boxes.mean(axis=1).astype(np.float32)
     between = np.array([[0.0, 0.0, gripper.contact_z]], np.float32)
@@ -169,24 +138,11 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Any) -> None:
     assert np.expm1(described[2]).round() >= hands
 
 
-@by_name
-def test_the_width_needed_reaches_past_what_stands_between_the_fingers(gripper: Any) -> None:
-    point = np.array([[0.0, 0.01, gripper.contact_z]], np.float32)
-    view = hand_views(Cloud(point, point), HAND, reach_of(gripper))
-    assert 0.02 < required_openings(view, gripper)[0] <= gripper.max_opening
-
-
 def test_a_bracket_beside_the_fingers_is_no_palm() -> None:
     fields = panda_fields()
     fields["hand"]["boxes"].append([[0.04, -0.02, 0.0], [0.09, 0.02, 0.1]])
     assert gripper_from_fields(fields).palm_z == 0.0658
     assert len(gripper_from_fields(fields).boxes(0.05)) == 4
-
-
-def test_the_fields_of_a_request_make_the_gripper_of_the_file() -> None:
-    fields = panda_fields()
-    assert gripper_from_fields(fields) == load_gripper("panda")
-    assert gripper_from_fields(GripperGeometry.model_validate(fields)) == load_gripper("panda")
 
 
 @pytest.mark.parametrize(
@@ -222,25 +178,95 @@ def test_contradictory_fields_are_refused_by_name(
         gripper_from_fields(fields)
 
 
+def test_a_file_and_a_request_make_the_same_gripper_and_a_broken_file_is_refused(
+    tmp_path: Path,
+) -> None:
+    assert gripper_from_fields(GripperGeometry.model_validate(panda_fields())) == PANDA
+    text, path = (GRIPPER_FOLDER / "panda.toml").read_text(), tmp_path / "mine.toml"
+    path.write_text(text)
+    assert load_gripper(path) == PANDA
+    for old, new, message in (
+        ("max_opening = 0.08", "", "mine.toml: gripper.max_opening"),
+        ("[hand]", "[hand", "mine.toml"),
+    ):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(InvalidGripper, match=message):
+            load_gripper(path)
+    with pytest.raises(InvalidGripper, match="'panda', 'robotiq-2f-140'"):
+        load_gripper("claw")
+
+
+def choose(own: dict[str, object] | None = None, **fields: object) -> object:
+    return choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
+
+
+def test_none_is_the_default_a_name_a_file_and_an_object_itself() -> None:
+    assert choose() is PANDA
+    mine = load_gripper("wsg-50")
+    assert choose(gripper="wsg-50") == mine
+    assert choose({"panda": mine}, gripper="panda") is mine
+    fields = {
+        "max_opening": 0.05,
+        "tip_z": 0.1,
+        "contact_z": 0.09,
+        "tcp_z": 0.09,
+        "hand": {"boxes": [[[-0.03, -0.05, 0.0], [0.03, 0.05, 0.06]]]},
+        "finger": {"boxes": [[[-0.01, 0.0, 0.06], [0.01, 0.02, 0.1]]]},
+    }
+    custom = choose(gripper=fields)
+    assert (custom.name, custom.max_opening, custom.palm_z) == ("custom", 0.05, 0.06)
+
+
 @pytest.mark.parametrize(
-    ("edit", "message"),
+    ("fields", "field", "fix"),
     [
-        (("max_opening = 0.08", ""), "mine.toml: gripper.max_opening"),
-        (("[hand]", "[hand"), "mine.toml"),
+        ({"gripper": "hook"}, "options.gripper", "robotiq-2f-85"),
+        ({"gripper": "../grippers/panda.toml"}, "options.gripper", "Use one of"),
+        ({"collision": {"opening": 0.081}}, "options.collision.opening", "at most 0.08"),
     ],
 )
-def test_a_broken_file_is_refused(tmp_path: Path, edit: tuple[str, str], message: str) -> None:
-    text = (GRIPPER_FOLDER / "panda.toml").read_text()
-    path = tmp_path / "mine.toml"
-    path.write_text(text)
-    assert load_gripper(path) == load_gripper("panda")
-    path.write_text(text.replace(*edit))
-    with pytest.raises(InvalidGripper, match=message):
-        load_gripper(path)
+def test_what_there_is_not_is_refused(fields: dict[str, object], field: str, fix: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        choose(**fields)
+    assert caught.value.field == field
+    assert fix in caught.value.fix
 
 
-def test_an_unknown_name_lists_those_there_are() -> None:
-    with pytest.raises(
-        InvalidGripper, match="'panda', 'robotiq-2f-140', 'robotiq-2f-85', 'wsg-50'"
-    ):
-        load_gripper("claw")
+@by_name
+@pytest.mark.parametrize("share", [0.3, 0.6, 1.0])
+def test_a_gripper_that_opens_less_is_the_same_one_half_closed(
+    gripper: Gripper, share: float
+) -> None:
+    opening = share * gripper.max_opening
+    part = choose(gripper=gripper.name, collision={"opening": opening})
+    for narrower in (opening, 0.5 * opening, 0.0):
+        np.testing.assert_allclose(part.boxes(narrower), gripper.boxes(narrower), atol=1e-9)
+        np.testing.assert_allclose(part.contact_z_at(narrower), gripper.contact_z_at(narrower))
+    np.testing.assert_allclose(part.tip_z, part.boxes(opening)[:, 1, 2].max())
+
+
+@by_name
+def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
+    options = DetectOptions(
+        viewpoint=VIEW, gripper=gripper.name, num_approach_points=12, suppression=None
+    )
+    found = detector().detect(box_on_table(), options)
+    assert found.grasps
+    for grasp in found.grasps:
+        T_hand_tcp = np.linalg.inv(grasp.T_cloud_hand) @ grasp.T_cloud_tcp
+        np.testing.assert_allclose(T_hand_tcp, gripper.T_hand_tcp, atol=1e-5)
+        contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
+        np.testing.assert_allclose(contact[2], gripper.contact_z_at(2 * abs(contact[1])), atol=1e-5)
+        assert grasp.width <= np.float32(gripper.max_opening)
+    told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
+    assert told == (gripper.name != "panda")
+
+
+def test_a_wider_gripper_reaches_contacts_beyond_the_ball_of_the_weights() -> None:
+    for name, least, most in (("panda", 0.0, 0.038), ("robotiq-2f-140", 0.045, 0.07)):
+        options = DetectOptions(
+            viewpoint=VIEW, gripper=name, collision="ignore", suppression=None, top_k=2000
+        )
+        grasps = detector().detect(box_on_table(), options).grasps
+        longest = max(np.linalg.norm(g.approach_point - g.contact_point) for g in grasps)
+        assert least < longest < most

@@ -1,10 +1,19 @@
+"""A sent cloud made into a scene, and the solid boxes in it."""
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.options import Box, DetectOptions, OrientedBox
+from edgegrasp_model.scene.cloud import CanonicalFrame, CloudInput, check_cloud
+from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene, build_scene
+
+from .scenes import SEED
 
 VOXEL = 0.004
 
@@ -28,18 +37,16 @@ def normals_in_cloud(scene: Scene) -> np.ndarray:
     return scene.frame.directions_in_cloud(scene.cloud.normals)
 
 
-def test_given_normals_are_averaged_in_each_voxel_instead_of_estimated() -> None:
-    given = np.random.default_rng(1).normal([0.3, 0.2, -1.0], 0.01, (3000, 3)) * 5.0
-    scene, _, _ = build(CloudInput(sheet(0.3), normals=given), viewpoint=(0, 0, 9))
+def test_given_normals_are_averaged_in_each_voxel_and_estimated_where_they_cancel() -> None:
+    sent = np.random.default_rng(1).normal([0.3, 0.2, -1.0], 0.01, (3000, 3)) * 5.0
+    scene, _, _ = build(CloudInput(sheet(0.3), normals=sent), viewpoint=(0, 0, 9))
     expected = np.array([0.3, 0.2, -1.0]) / np.linalg.norm([0.3, 0.2, -1.0])
     np.testing.assert_allclose(normals_in_cloud(scene) @ expected, 1.0, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(scene.cloud.normals, axis=1), 1.0, atol=1e-5)
 
-
-def test_normals_that_cancel_in_a_voxel_are_estimated() -> None:
-    given = np.where(np.arange(3000)[:, None] % 2, [[1.0, 0, 0]], [[-1.0, 0, 0]])
+    sent = np.where(np.arange(3000)[:, None] % 2, [[1.0, 0, 0]], [[-1.0, 0, 0]])
     twice = np.repeat(sheet(0.3, 1500), 2, axis=0)
-    scene, _, _ = build(CloudInput(twice, normals=given), viewpoint=(0, 0, 9))
+    scene, _, _ = build(CloudInput(twice, normals=sent), viewpoint=(0, 0, 9))
     np.testing.assert_allclose(normals_in_cloud(scene)[:, 2], 1.0, atol=1e-4)
 
 
@@ -106,3 +113,74 @@ def test_regions_say_where_approach_and_contact_points_may_be() -> None:
     assert scene.contact_allowed.all()
     scene, _, _ = build(sheet(0.3), contact_region=left)
     np.testing.assert_array_equal(scene.contact_allowed, scene.points_in_cloud[:, 0] <= 0)
+
+
+def random_boxes(rng: np.random.Generator, count: int) -> SolidBoxes:
+    turn = Rotation.random(count, rng=rng).as_matrix()
+    extent = rng.uniform(0.01, 0.2, (count, 3))
+    return SolidBoxes(rng.uniform(-0.25, 0.25, (count, 3)), extent[..., None] * turn)
+
+
+def least_distance(generators: np.ndarray, offset: np.ndarray) -> float:
+    """Distance of `offset` to all sums of generators, each times -1 to 1."""
+    return float(np.sqrt(2 * lsq_linear(generators.T, offset, (-1, 1), tol=1e-14).cost))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, SEED))
+def test_distances_of_boxes_are_those_of_a_convex_optimiser(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ours, theirs = random_boxes(rng, 8), random_boxes(rng, 8)
+    way = rng.normal(scale=0.2, size=(8, 3))
+    found, swept = signed_distance(ours, theirs), separation(ours, theirs, way)
+    for row in range(8):
+        offset = theirs.center[row] - ours.center[row]
+        both = [*ours.half[row], *-theirs.half[row]]
+        np.testing.assert_allclose(
+            max(found[row], 0.0), least_distance(np.array(both), offset), atol=1e-6
+        )
+        moved = least_distance(np.array([*both, way[row] / 2]), offset - way[row] / 2)
+        assert (swept[row] > 0) == (moved > 1e-7)
+        assert swept[row] <= moved + 1e-9
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, SEED))
+def test_boxes_moved_apart_by_their_depth_just_touch(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ours, theirs = random_boxes(rng, 20), random_boxes(rng, 20)
+    depth = signed_distance(ours, theirs)
+    shifts = rng.normal(size=(20, 3))
+    shifts /= np.linalg.norm(shifts, axis=1, keepdims=True)
+    inside = depth < -1e-3
+    # No shift shorter than the depth separates them.
+    moved = SolidBoxes(ours.center + shifts * (np.abs(depth) * 0.99)[:, None], ours.half)
+    assert (separation(moved, theirs)[inside] < 0).all()
+
+
+def test_a_request_gives_boxes_in_the_canonical_frame() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3)).astype(np.float32)
+    frame = CanonicalFrame.of_scene(points, (0.2, 0.3, 1.0), (1.0, 2.0, 3.0))
+    turn = Rotation.from_euler("xyz", [0.1, 0.2, 0.3])
+    tilted = OrientedBox(
+        center=(0.1, 0.2, 0.3),
+        half_extents=(0.01, 0.02, 0.03),
+        quaternion=tuple(turn.as_quat().tolist()),
+    )
+    boxes = SolidBoxes.from_shapes([tilted, Box(min=(0, 0, 0), max=(0.2, 0.4, 0.6))], frame)
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3)
+    expected = [
+        turn.apply(signs * (0.01, 0.02, 0.03)) + np.array([0.1, 0.2, 0.3]),
+        (signs + 1) / 2 * (0.2, 0.4, 0.6),
+    ]
+    for corners, want in zip(boxes.corners(), expected, strict=True):
+        found = frame.points_in_cloud(corners)
+        apart = np.linalg.norm(found[:, None] - want, axis=2)
+        np.testing.assert_allclose(apart.min(axis=0), 0.0, atol=1e-6)
+        np.testing.assert_allclose(apart.min(axis=1), 0.0, atol=1e-6)
+
+
+def test_no_boxes_hit_nothing() -> None:
+    none = SolidBoxes(np.empty((0, 3)), np.empty((0, 3, 3)))
+    assert separation(none, none).shape == signed_distance(none, none).shape == (0,)
+    assert separation(none, none, np.empty((0, 3))).shape == (0,)

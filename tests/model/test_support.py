@@ -1,43 +1,52 @@
+"""Support planes that are found, and depths that a known one corrects."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.options import RansacPlane, SupportPlane
-from edgegrasp_model.scene.support import find_support_plane
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import RansacPlane, SupportPlane, parse_options
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_model.scene.scene import build_scene
+from edgegrasp_model.scene.support import correct_depth_scale, depth_scale, find_support_plane
+
+from .scenes import SEED
+
+CAMERA = np.array([0.0, -0.5, 0.4])
+PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}
 
 
-def table(rng: np.random.Generator, share: float = 0.5, count: int = 3000) -> np.ndarray:
-    """A noisy table at z = 0.1 with a crowded box on it and things in the air."""
-    flat = rng.uniform(-0.3, 0.3, (int(count * share), 3)) * (1, 1, 0)
-    box = rng.uniform(-0.05, 0.05, (count - len(flat), 3)) + np.array([0, 0, 0.05])
-    box[: len(box) // 2, 2] = 0.1  # its top: level too, and more crowded than the table
-    points = np.concatenate([flat, box]) + rng.normal(0, 0.001, (count, 3))
-    return (points + np.array([0, 0, 0.1])).astype(np.float32)
+def scene(rng: np.random.Generator, table: int = 2000, things: int = 1000) -> np.ndarray:
+    """A table at z = 0.05, and on it a box with a level lid 0.06 above."""
+    flat = rng.uniform(-0.15, 0.15, (table, 3)) * (1, 1, 0)
+    box = rng.uniform(-0.05, 0.05, (things, 3)) + np.array([0, 0, 0.05])
+    box[: things // 2, 2] = 0.06
+    points = np.concatenate([flat, box]) + np.array([0, 0, 0.05])
+    return points + rng.normal(0, 0.001, points.shape)
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.3, 0.9))
+@given(seed=st.integers(0, SEED), share=st.floats(0.3, 0.9))
 def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
-    points = (turn.apply(table(rng, share)) + shift).astype(np.float32)
+    table = int(3000 * share)
+    points = scene(rng, table, 3000 - table)
+    points = (turn.apply(points) + shift).astype(np.float32)
     up = turn.apply([0.1, 0.0, 1.0])  # need not be exact
     plane = find_support_plane(points, RansacPlane(), up, np.random.default_rng(seed))
     assert plane is not None
     normal = turn.apply([0, 0, 1])
     assert np.dot(plane.normal, normal) > np.cos(0.01)
-    assert abs(plane.heights(shift[None] + 0.1 * normal)[0]) < 0.001
+    assert abs(plane.heights(shift[None] + 0.05 * normal)[0]) < 0.001
 
 
 def test_the_same_seed_finds_the_same_plane() -> None:
-    points = table(np.random.default_rng(0))
-    planes = [
-        find_support_plane(points, RansacPlane(), (0, 0, 1), np.random.default_rng(5))
-        for _ in range(2)
-    ]
-    assert planes[0] == planes[1]
+    points, rngs = scene(np.random.default_rng(0)), [np.random.default_rng(5) for _ in range(2)]
+    one, again = (find_support_plane(points, RansacPlane(), (0, 0, 1), rng) for rng in rngs)
+    assert one == again
 
 
 @pytest.mark.parametrize(
@@ -71,3 +80,98 @@ def test_a_handful_of_points_or_one_point_many_times_is_no_plane(count: int) -> 
 def test_heights_are_over_the_plane() -> None:
     plane = SupportPlane(normal=(0.0, 0.6, 0.8), offset=0.5)
     np.testing.assert_allclose(plane.heights(np.array([[9.0, 0.0, 0.0], [0, 3, 4]])), [-0.5, 4.5])
+
+
+def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
+    """The points as a camera sees them whose depths are wrong by a factor."""
+    return (camera + factor * (points - camera)).astype(np.float32)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, SEED),
+    factor=st.floats(0.9, 1.1),
+    things=st.sampled_from([0, 1000, 4000, 12_000]),
+)
+def test_the_factor_is_found_in_any_frame(seed: int, factor: float, things: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = seen(scene(rng, things=things), factor)
+    turn, shift = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
+    x, y, z = turn.apply(PLANE["normal"]).tolist()
+    offset = 0.05 + float(np.dot((x, y, z), shift))
+    plane = SupportPlane(normal=(x, y, z), offset=offset, max_depth_error=0.12)
+    moved = (turn.apply(points) + shift).astype(np.float32)
+    scale = depth_scale(moved, turn.apply(CAMERA) + shift, plane)
+    # A millimetre at the table is a share of 0.003 of the camera's height.
+    assert scale == pytest.approx(1.0 / factor, abs=0.003)
+
+
+SCENE, BARE = scene(np.random.default_rng(0)), scene(np.random.default_rng(0), things=0)
+
+
+@pytest.mark.parametrize(
+    ("points", "camera"),
+    [
+        pytest.param(scene(np.random.default_rng(0), table=0), CAMERA, id="no table"),
+        pytest.param(np.empty((0, 3)), CAMERA, id="no points"),
+        pytest.param(seen(BARE, 1.3), CAMERA, id="out of reach"),
+        pytest.param(SCENE, np.array([0.0, -0.5, 0.02]), id="camera below it"),
+        pytest.param(SCENE, np.array([0.0, 0.0, 1e9]), id="camera in millimetres"),
+    ],
+)
+def test_without_its_plane_there_is_no_factor(points: np.ndarray, camera: np.ndarray) -> None:
+    plane = SupportPlane(**PLANE).model_copy(update={"max_depth_error": 0.05})
+    assert depth_scale(points, camera, plane) is None
+
+
+def test_every_view_has_a_factor_of_its_own() -> None:
+    rng = np.random.default_rng(3)
+    cameras = np.array([CAMERA, [0.4, 0.2, 0.5], [-0.4, 0.2, 0.5]])
+    clean = [scene(rng) for _ in cameras]
+    factors = 0.96, 1.0, 1.05
+    sent = [seen(points, f, c) for points, f, c in zip(clean, factors, cameras, strict=True)]
+    ids = np.repeat(np.arange(3), [len(points) for points in sent])
+    cloud, warnings = check_cloud(CloudInput(np.concatenate(sent), view_ids=ids)), []
+    corrected = correct_depth_scale(cloud, SupportPlane(**PLANE), cameras, warnings)
+    np.testing.assert_allclose(corrected.points, np.concatenate(clean), atol=0.003)
+    assert len(warnings) == 2
+    for warning, *told in zip(warnings, ("view 0", "view 2"), ("1.04", "0.95"), strict=True):
+        assert all(text in warning for text in told)
+
+
+def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]:
+    """What is left above the plane, in the cloud's frame, and the warnings."""
+    warnings: list[str] = []
+    workspace = {"min": (-0.15, -0.15, 0.055), "max": (0.15, 0.15, 0.3)}
+    options = parse_options(
+        {"support": PLANE | support, "viewpoint": CAMERA.tolist(), "workspace": workspace}
+    )
+    found = build_scene(check_cloud(points.astype(np.float32)), options, 0.004, {}, warnings)
+    assert found is not None
+    return found.points_in_cloud, warnings
+
+
+def test_a_scene_is_the_same_after_wrong_depths_where_that_is_asked_for() -> None:
+    points = scene(np.random.default_rng(4))
+    (right, quiet), (corrected, told) = built(points), built(seen(points, 1.06))
+    assert (len(quiet), len(told)) == (0, 1)
+    assert abs(len(right) - len(corrected)) < 0.05 * len(right)
+    np.testing.assert_allclose(right.max(axis=0), corrected.max(axis=0), atol=0.004)
+    np.testing.assert_allclose(right.min(axis=0), corrected.min(axis=0), atol=0.004)
+    wrong, quiet = built(seen(points, 1.06), max_depth_error=0.0)
+    assert quiet == []
+    assert abs(wrong[:, 2].max() - right[:, 2].max()) > 0.008
+
+
+def test_a_table_that_was_cut_away_is_missed() -> None:
+    points = scene(np.random.default_rng(5), table=0)[500:]
+    _, warnings = built(points[points[:, 2] > 0.08])
+    assert len(warnings) == 1
+    assert "options.support.max_depth_error (0.12)" in warnings[0]
+
+
+def test_depths_need_a_camera() -> None:
+    cloud = check_cloud(scene(np.random.default_rng(7)).astype(np.float32))
+    with pytest.raises(InvalidRequest) as caught:
+        build_scene(cloud, parse_options({"support": PLANE}), 0.004, {}, [])
+    assert caught.value.field == "options.viewpoint"

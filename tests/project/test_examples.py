@@ -6,21 +6,12 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edgegrasp_client.local_server import Addresses, local_server
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Addresses]:
-    with local_server("--backend", "dummy") as addresses:
-        yield addresses
 
 
 @pytest.fixture
@@ -68,29 +59,31 @@ def test_demo_says_why_its_server_does_not_start(tmp_path: Path) -> None:
     assert "backend: got 'none'" in done.stderr
 
 
-def test_python_example_prints_five_grasps(server: Addresses, cloud_file: Path) -> None:
+def test_python_example_prints_five_grasps(dummy_server, cloud_file: Path) -> None:
     example = EXAMPLES / "01_detect_from_python.py"
-    over_grpc = run(sys.executable, example, cloud_file, server.grpc_address)
-    over_rest = run(sys.executable, example, cloud_file, server.http_url)
+    over_grpc = run(sys.executable, example, cloud_file, dummy_server.grpc_address)
+    over_rest = run(sys.executable, example, cloud_file, dummy_server.http_url)
     assert over_grpc.stdout.count("score 0.") == 5, over_grpc.stderr
     assert over_grpc.stdout.partition("counts")[0] == over_rest.stdout.partition("counts")[0]
 
 
-def test_python_example_names_what_is_wrong(server: Addresses, tmp_path: Path) -> None:
+def test_python_example_names_what_is_wrong(dummy_server, tmp_path: Path) -> None:
     empty = tmp_path / "empty.npy"
     np.save(empty, np.empty((0, 3), np.float32))
-    done = run(sys.executable, EXAMPLES / "01_detect_from_python.py", empty, server.grpc_address)
+    done = run(
+        sys.executable, EXAMPLES / "01_detect_from_python.py", empty, dummy_server.grpc_address
+    )
     assert done.returncode == 1
     assert done.stderr.startswith("error: cloud: got ")
 
 
 def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(
-    server: Addresses, cloud_file: Path
+    dummy_server, cloud_file: Path
 ) -> None:
     few = cloud_file.with_name("few.npy")
     np.save(few, np.zeros((3, 3), np.float32))
     names = [str(cloud_file), str(few), str(cloud_file)]
-    for address in (server.grpc_address, server.http_url):
+    for address in (dummy_server.grpc_address, dummy_server.http_url):
         done = run(sys.executable, EXAMPLES / "04_stream_of_clouds.py", *names, "--server", address)
         first, second, third = done.stdout.splitlines()
         assert first == third
@@ -99,7 +92,7 @@ def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
-def test_curl_example_prints_five_grasps(server: Addresses, cloud_file: Path) -> None:
-    done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, server.http_url)
+def test_curl_example_prints_five_grasps(dummy_server, cloud_file: Path) -> None:
+    done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, dummy_server.http_url)
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["grasps"]) == 5

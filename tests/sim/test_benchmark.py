@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import importlib
 import json
 import multiprocessing
@@ -7,21 +5,23 @@ import sys
 import time
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
-from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores, manifest, run_benchmark
+from edgegrasp_sim.benchmark import (
+    BenchmarkConfig,
+    RoundRunner,
+    available_cores,
+    manifest,
+    run_benchmark,
+)
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.ray_cluster import RayRunner, _result
 from edgegrasp_sim.results import ResultFolder, attempts_digest
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import PlannerUnavailableError
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from edgegrasp_sim.trial import PlannerUnavailableError
 
 PAPER = load_protocol("edgegrasp")
 TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
@@ -34,7 +34,7 @@ DIES_ONCE = """
 import os, signal
 from pathlib import Path
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trials import PlannerUnavailableError
+from edgegrasp_sim.trial import PlannerUnavailableError
 
 MARK = Path(__file__).with_suffix(".died")
 
@@ -54,7 +54,7 @@ def alone() -> tuple[BenchmarkConfig, str]:
     return config, attempts_digest(rounds)
 
 
-def test_a_crashed_worker_s_rounds_are_run_again_and_workers_change_nothing(
+def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     alone: tuple[BenchmarkConfig, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, digest = alone
@@ -107,7 +107,7 @@ def test_the_manifest_holds_what_decides_the_figures() -> None:
     assert facts["host"]["platform"]
 
 
-def test_wrong_settings_are_told(tmp_path: Path) -> None:
+def test_wrong_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="rounds is 0"):
         BenchmarkConfig(SceneKind.PILE, rounds=0)
     with pytest.raises(ValueError, match=r"seeds is \(-1,\)"):
@@ -157,28 +157,35 @@ def test_a_ray_cluster_changes_nothing(alone: tuple[BenchmarkConfig, str]) -> No
     assert attempts_digest(rounds) == digest
 
 
-def test_errors_on_a_cluster_are_those_of_a_process_here() -> None:
+@pytest.mark.parametrize(
+    ("error", "expected", "message"),
+    [("RayTaskError", PlannerUnavailableError, "gone"), ("ActorDiedError", RuntimeError, "again")],
+)
+def test_errors_on_a_cluster_are_those_of_a_process_here(
+    alone: tuple[BenchmarkConfig, str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: str,
+    expected: type[Exception],
+    message: str,
+) -> None:
     ray = pytest.importorskip("ray", reason="the extra `ray` is not installed")
-    told = PlannerUnavailableError("away for good")
-
-    def failing(error: Exception) -> SimpleNamespace:
-        def get(_: object) -> None:
-            raise error
-
-        return SimpleNamespace(get=get, exceptions=ray.exceptions)
-
-    with pytest.raises(PlannerUnavailableError, match="away for good"):
-        _result(failing(ray.exceptions.RayTaskError("run", "traceback", told)), None)
-    with pytest.raises(RuntimeError, match="died again and again"):
-        _result(failing(ray.exceptions.ActorDiedError()), None)
+    kind = getattr(ray.exceptions, error)
+    cause = PlannerUnavailableError("gone for good")
+    fake = MagicMock(exceptions=ray.exceptions)
+    fake.cluster_resources.return_value = {"CPU": 1.0}
+    fake.wait.side_effect = lambda running: (running[:1], running[1:])
+    fake.get.side_effect = kind("run", "traceback", cause) if error == "RayTaskError" else kind()
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    with pytest.raises(expected, match=message):
+        run_benchmark(alone[0], make_planner, ray="local")
 
 
-def test_a_missing_ray_or_cluster_is_told(
+def test_a_missing_ray_or_cluster_is_named(
     alone: tuple[BenchmarkConfig, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config, _ = alone
     with pytest.raises(ValueError, match="differ between the machines"):
-        RayRunner(config, make_planner, "another digest")
+        RoundRunner(config, make_planner, digest="another digest")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(RuntimeError, match=r"ray is not .*edgegrasp\[ray\]"):
         run_benchmark(config, make_planner, ray="local")

@@ -1,13 +1,26 @@
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from edgegrasp_sim.camera import EVALUATION_VIEWS, TRAINING_VIEWS, Camera, ViewRange, look_at
-from edgegrasp_sim.world import World
+from edgegrasp_sim.camera import (
+    EVALUATION_VIEWS,
+    TRAINING_VIEWS,
+    WORKSPACE,
+    ViewRange,
+    look_at,
+    points_of,
+    resample_surfaces,
+)
+from edgegrasp_sim.engine import Intrinsics, World
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import load_protocol
+from edgegrasp_sim.simulation import ClutterSimulation
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])
+CAMERA = Intrinsics()
+VOXEL = 0.002
 
 
 def distance_to_box(points: np.ndarray) -> np.ndarray:
@@ -15,14 +28,12 @@ def distance_to_box(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0)
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0])
-def test_a_box_appears_where_it_is(azimuth: float) -> None:
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, 4.0])
+def test_a_box_appears_where_it_is(world: World, azimuth: float) -> None:
     eye = np.array([0.15 + 0.5 * np.cos(azimuth), 0.15 + 0.5 * np.sin(azimuth), 0.6])
-    with World() as world:
-        world.add_box(2 * HALF, CENTRE, lateral_friction=0.5)
-        camera = Camera(world)
-        T_world_camera = look_at(eye, np.array([0.15, 0.15, 0.1]))
-        points = camera.points(camera.render_depth(T_world_camera), T_world_camera)
+    world.add_box(2 * HALF, CENTRE, friction=0.5)
+    T_world_camera = look_at(eye, np.array([0.15, 0.15, 0.1]))
+    points = points_of(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
     assert len(points) > 1000
     assert np.abs(distance_to_box(points)).max() < 1e-4
     # The top is seen from edge to edge, so that no pixel is shifted sideways either.
@@ -31,28 +42,22 @@ def test_a_box_appears_where_it_is(azimuth: float) -> None:
     assert top[:, :2].max(axis=0) == pytest.approx(CENTRE[:2] + HALF[:2], abs=1.5e-3)
 
 
-def test_depth_is_measured_along_the_line_of_sight() -> None:
-    with World() as world:
-        world.add_box((4.0, 4.0, 0.02), (0.0, 0.0, -0.01), lateral_friction=0.5)
-        camera = Camera(world)
-        depth = camera.render_depth(look_at(np.array([0.5, 0.0, 0.5]), np.zeros(3)))
+def test_depth_is_measured_along_the_line_of_sight(world: World) -> None:
+    T_world_camera = look_at(np.array([0.5, 0.0, 0.5]), np.zeros(3))
+    empty = world.render_depth(T_world_camera, CAMERA)
+    assert points_of(empty, T_world_camera, CAMERA).shape == (0, 3)
+    world.add_box((4.0, 4.0, 0.02), (0.0, 0.0, -0.01), friction=0.5)
+    depth = world.render_depth(T_world_camera, CAMERA)
     assert depth[240, 320] == pytest.approx(np.sqrt(0.5), abs=2e-3)
     # Further up in the image the plane is further away.
     assert depth[120, 320] > depth[240, 320] > depth[360, 320]
-
-
-def test_an_empty_world_shows_nothing() -> None:
-    with World() as world:
-        camera = Camera(world)
-        T_world_camera = look_at(np.array([0.5, 0.0, 0.5]), np.zeros(3))
-        assert camera.points(camera.render_depth(T_world_camera), T_world_camera).shape == (0, 3)
 
 
 @pytest.mark.parametrize("views", [EVALUATION_VIEWS, TRAINING_VIEWS])
 def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
-        T_world_camera = views.sample(rng)
+        (T_world_camera,) = views.sample(rng)
         sight = np.asarray(views.target) - T_world_camera[:3, 3]
         radius = np.linalg.norm(sight)
         assert views.radius[0] <= radius <= views.radius[1]
@@ -61,8 +66,54 @@ def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> N
         assert T_world_camera[:3, 2] == pytest.approx(sight / radius)
         assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
         assert T_world_camera[2, 1] < 0  # the image's y points down in the world
-
-
-def test_a_vertical_line_of_sight_is_refused() -> None:
     with pytest.raises(ValueError, match="slanted line of sight"):
         look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+
+
+def test_resampled_surfaces_are_as_dense_at_a_slant_as_face_to_face(world: World) -> None:
+    world.add_box(2 * HALF, CENTRE, friction=0.5)
+    T_world_camera = look_at(np.array([0.15, -0.55, 0.30]), CENTRE)  # the top is seen at a slant
+    depth = world.render_depth(T_world_camera, CAMERA)
+    box = np.stack((CENTRE - HALF, CENTRE + HALF))
+    resampled = resample_surfaces(depth, T_world_camera, CAMERA, box, VOXEL)
+
+    def per_square_millimetre(points: np.ndarray) -> tuple[float, float]:
+        inner = np.abs(points - CENTRE) < HALF - 0.01  # away from the edges
+        front = inner[:, 0] & inner[:, 2] & (points[:, 1] < CENTRE[1] - HALF[1] + 0.005)
+        top = inner[:, 0] & inner[:, 1] & (points[:, 2] > CENTRE[2] + HALF[2] - 0.005)
+        return front.sum() / (40 * 80), top.sum() / (40 * 60)
+
+    front, top = per_square_millimetre(points_of(depth, T_world_camera, CAMERA))
+    assert front > 2.5 * top > 0
+    for density in per_square_millimetre(resampled):
+        assert density == pytest.approx(1 / (1000 * VOXEL) ** 2, rel=0.2)
+    assert np.quantile(np.abs(distance_to_box(resampled)), 0.95) < 0.5 * VOXEL
+    assert abs(np.median(distance_to_box(resampled))) < 0.2 * VOXEL
+
+
+def test_an_observation_may_be_resampled(simulation: ClutterSimulation) -> None:
+    simulation.reset(SceneKind.PACKED, np.random.default_rng(0), 3)
+    (plain, again, resampled) = (
+        simulation.observe(np.random.default_rng(1), np.random.default_rng(2), surface_voxel=voxel)
+        for voxel in (0.0, VOXEL, VOXEL)
+    )
+    np.testing.assert_array_equal(again.cloud, resampled.cloud)
+    assert len(resampled.cloud) != len(plain.cloud)
+    assert ((resampled.cloud >= WORKSPACE[0]) & (resampled.cloud <= WORKSPACE[1])).all()
+    assert len(resampled.view_ids) == len(resampled.cloud)
+
+
+def test_depth_noise_has_the_strength_asked_for() -> None:
+    noise = load_protocol("giga").noise
+    flat = np.ones((480, 640))
+    rng = np.random.default_rng(0)
+    images = [noise.apply(flat, rng) for _ in range(60)]
+    factors = np.array([image.mean() for image in images])
+    assert np.std(factors) == pytest.approx(1000**-0.5, rel=0.3)
+    rough = np.array([image.std() > 1e-9 for image in images])
+    assert 0.3 < rough.mean() < 0.7
+    smooth = replace(noise, gamma_shape=0.0, correlated_share=1.0).apply(flat, rng) - 1
+    assert 0.002 < smooth.std() < 0.005
+    neighbours = np.corrcoef(smooth[:, :-1].ravel(), smooth[:, 1:].ravel())[0, 1]
+    distant = np.corrcoef(smooth[:, :-16].ravel(), smooth[:, 16:].ravel())[0, 1]
+    assert neighbours > 0.8 > 0.1 > abs(distant)

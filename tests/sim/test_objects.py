@@ -1,47 +1,173 @@
-from __future__ import annotations
+"""Object sets: built-in ones, folders of URDF files, plain meshes and families."""
 
-from typing import TYPE_CHECKING
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edgegrasp_sim.objects import ObjectSet, SceneKind
-from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.world import World
+from edgegrasp_sim.benchmark import BenchmarkConfig, run_benchmark
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.objects import (
+    FAMILIES,
+    LONGEST_SIDE,
+    OBJECT_MASS,
+    SHORTEST_SIDE,
+    ObjectModel,
+    ObjectSet,
+    SceneKind,
+    cache_folder,
+    prepare_mesh,
+    write_family,
+)
+from edgegrasp_sim.scene import add_table, load_object
+from edgegrasp_sim.top_down import plan_top_down
 
-if TYPE_CHECKING:
-    from pathlib import Path
+MARGIN = 0.006  # metres that the engine's boxes are wider than what is in them
+
+
+def extents(world: World, model: ObjectModel, scale: float = 1.0) -> np.ndarray:
+    item = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), scale)
+    found = np.ptp(item.body.bounds, axis=0)
+    item.body.remove()
+    return found
 
 
 @pytest.mark.parametrize("scene", SceneKind)
-def test_builtin_objects_fit_between_the_fingers(scene: SceneKind) -> None:
+def test_builtin_objects_fit_between_the_fingers(world: World, scene: SceneKind) -> None:
     models = ObjectSet.builtin(scene).models
     assert len({model.urdf for model in models}) == len({model.name for model in models}) >= 8
-    with World() as world:
-        for model in models:
-            item = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), 0.8)
-            extent = np.sort(np.ptp(item.body.bounds, axis=0))
-            # A mug is gripped by its wall or handle; everything else between the fingers.
-            assert model.name == "mug" or extent[0] < 0.075, model.name
-            assert extent[2] < 0.25, model.name
+    for model in models:
+        extent = np.sort(extents(world, model, 0.8))
+        # A mug is gripped by its wall or handle; everything else between the fingers.
+        assert model.name == "mug" or extent[0] < 0.075, model.name
+        assert extent[2] < 0.25, model.name
 
 
-def test_folder_is_read_in_order_of_names(tmp_path: Path) -> None:
+def test_families_are_what_they_are_called(world: World, tmp_path: Path) -> None:
+    for name, shapes in FAMILIES.items():
+        objects = ObjectSet.from_folder(write_family(name, tmp_path / name), SceneKind.PACKED)
+        for model, shape in zip(objects.models, shapes, strict=True):
+            np.testing.assert_allclose(
+                extents(world, model), np.add(shape.size, MARGIN / 2), atol=0.0035
+            )
+    assert max(sorted(shape.size)[1] for shape in FAMILIES["thin"]) <= 0.014
+    assert max(shape.size[2] for shape in FAMILIES["flat"]) <= 0.014
+    assert min(min(shape.size) for shape in FAMILIES["large"]) >= 0.06
+
+
+def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"<scene>/<split>/<name>\.urdf"):
+        ObjectSet.from_folder(tmp_path, SceneKind.PILE)
     folder = tmp_path / "packed" / "train"
     folder.mkdir(parents=True)
     for name in ("b", "a", "c"):
         (folder / f"{name}.urdf").touch()
-    (folder / "a_visual.obj").touch()
+    (folder / "a_visual.obj").touch()  # beside URDF files, meshes are parts of those
     objects = ObjectSet.from_folder(tmp_path, SceneKind.PACKED, "train")
     assert [model.name for model in objects.models] == ["a", "b", "c"]
     assert objects.name == "packed/train"
+    with pytest.raises(ValueError, match="'nothing' is empty"):
+        ObjectSet("nothing", ())
 
 
-def test_missing_folder_says_what_is_expected(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"<scene>/<split>/<name>\.urdf"):
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ring in millimetres, a brick in metres."""
+    trimesh = pytest.importorskip("trimesh", reason="the extra `meshes` is not installed")
+    pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
+    folder = tmp_path_factory.mktemp("meshes")
+    ring = trimesh.creation.torus(30.0, 10.0, major_sections=10, minor_sections=6)
+    ring.export(folder / "ring.obj")
+    trimesh.creation.box((0.1, 0.2, 0.4)).export(folder / "Brick.STL")
+    (folder / "notes.txt").write_text("no mesh")
+    return folder
+
+
+@pytest.fixture
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One cache for all tests, so that each mesh is decomposed once."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    return cache_folder()
+
+
+def test_meshes_of_any_unit_are_scaled_to_the_hand(world: World, meshes: Path, cache: Path) -> None:
+    models = ObjectSet.from_folder(meshes, SceneKind.PILE).models
+    assert [model.name for model in models] == ["Brick", "ring"]
+    brick, ring = (np.sort(extents(world, model)) - MARGIN for model in models)
+    np.testing.assert_allclose(brick, LONGEST_SIDE * np.array([0.25, 0.5, 1.0]), atol=1e-3)
+    # A ring of six-sided tubes is a little lower than it is thick.
+    assert ring[0] == pytest.approx(LONGEST_SIDE / 4, rel=0.15)
+    assert max(brick[0], ring[0]) <= SHORTEST_SIDE
+
+
+def test_a_ring_has_a_hole_and_every_object_s_mass(world: World, meshes: Path, cache: Path) -> None:
+    urdf = prepare_mesh(meshes / "ring.obj")
+    add_table(world)
+    ring = load_object(world, ObjectModel("ring", urdf), (0.15, 0.15, 0.07), (0, 0, 0, 1), 1.0)
+    above = np.array([[x, 0.15, 0.3] for x in (0.15, 0.15 + 0.055)])
+    below = above - np.array([0.0, 0.0, 0.245])
+    assert world.first_hits(above, below) == [-1, ring.body.uid]
+    # The centre of mass is in the middle of the hole, where the body's frame is.
+    np.testing.assert_allclose(ring.body.position, (0.15, 0.15, 0.07), atol=2e-3)
+    assert f'mass value="{OBJECT_MASS}"' in urdf.read_text()
+
+
+def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_path: Path) -> None:
+    urdf = prepare_mesh(meshes / "ring.obj")
+    assert urdf.is_relative_to(cache)
+    before = urdf.stat().st_mtime_ns
+    copy = tmp_path / "other name.obj"
+    copy.write_bytes((meshes / "ring.obj").read_bytes())
+    assert prepare_mesh(copy) == urdf
+    assert urdf.stat().st_mtime_ns == before
+    copy.write_bytes((meshes / "ring.obj").read_bytes() + b"\n# changed\n")
+    again = prepare_mesh(copy)
+    assert again != urdf
+    # The same mesh makes the same object, to the byte.
+    for file in sorted(urdf.parent.iterdir()):
+        assert (again.parent / file.name).read_bytes() == file.read_bytes()
+    assert not list(cache.glob(".unfinished*"))
+
+
+def test_rounds_run_on_a_folder_of_meshes(meshes: Path, cache: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "packed" / "test"
+    folder.mkdir(parents=True)
+    (folder / "ring.obj").write_bytes((meshes / "ring.obj").read_bytes())
+    config = BenchmarkConfig(SceneKind.PACKED, 1, objects=tmp_path)
+    (done,) = run_benchmark(config, lambda: plan_top_down)
+    assert set(done.objects) == {"ring"}
+    assert done.attempts
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("v 0 0 0\n", "holds no triangles"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no solid object"),
+        ("v 0 0 zero\nf 1 2 3\n", "cannot be read"),
+    ],
+)
+def test_a_file_without_a_solid_is_refused(
+    cache: Path, tmp_path: Path, content: str, message: str
+) -> None:
+    pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
+    (tmp_path / "thing.obj").write_text(content)
+    with pytest.raises(ValueError, match=rf"thing\.obj.*({message})"):
         ObjectSet.from_folder(tmp_path, SceneKind.PILE)
 
 
-def test_empty_set_is_refused() -> None:
-    with pytest.raises(ValueError, match="'nothing' is empty"):
-        ObjectSet("nothing", ())
+def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
+    for name in ("cup.obj", "cup.stl"):
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match="several meshes named cup"):
+        ObjectSet.from_folder(tmp_path, SceneKind.PILE)
+
+
+@pytest.mark.parametrize("package", ["coacd", "trimesh"])
+def test_a_missing_package_is_named(
+    meshes: Path, cache: Path, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(RuntimeError, match=rf"{package} is not .*edgegrasp\[meshes\]"):
+        ObjectSet.from_folder(meshes, SceneKind.PILE)

@@ -1,42 +1,32 @@
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protocol_names
 
-if TYPE_CHECKING:
-    from pathlib import Path
 
-
-def test_the_named_protocols_differ_where_they_should() -> None:
-    names = ["edgegrasp", "edgegrasp-fused", "edgegrasp-memory", "giga", "robot", "vgn"]
-    assert protocol_names() == names
-    paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
-    fused = load_protocol("edgegrasp-fused")
-    assert fused.camera.surface_voxel == pytest.approx(0.30 / 180)
+def test_variants_differ_from_the_paper_s_protocol_in_one_thing() -> None:
+    paper, fused = load_protocol("edgegrasp"), load_protocol("edgegrasp-fused")
     camera = replace(fused.camera, surface_voxel=0.0)
+    assert fused.camera.surface_voxel == pytest.approx(0.30 / 180)
     assert replace(fused, name="edgegrasp", camera=camera) == paper
     memory = load_protocol("edgegrasp-memory")
     planning = replace(memory.planning, selection="best")
     assert memory.planning.selection == "elsewhere"
     assert replace(memory, name="edgegrasp", source=paper.source, planning=planning) == paper
+
+
+def test_protocols_have_the_constants_of_their_sources() -> None:
+    paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
     assert (paper.rounds, paper.seeds) == (100, (0, 1, 2, 3, 4))
-    assert paper.noise.point_std == 0.001
-    assert paper.planning.voxel_size == 0.004
     assert (paper.planning.num_approach_points, paper.planning.num_candidates) == (64, 4000)
-    assert paper.round.max_consecutive_failures == 2
-    assert giga.camera.polar_degrees == (60.0, 60.0)
-    assert giga.camera.azimuth_degrees == (-90.0, -90.0)
-    assert giga.noise.depth_noise() is not None
+    assert giga.noise.gamma_shape > 0 == paper.noise.gamma_shape
     assert (giga.planning.table, giga.version) == ("seen", 3)
     assert vgn.camera.views == 6
     assert [robot.num_objects(index) for index in range(3)] == [8, 10, 8]
-    assert (robot.planning.num_approach_points, robot.planning.num_candidates) == (40, 2000)
     assert (robot.planning.selection, robot.planning.min_score) == ("highest", 0.9)
     assert robot.planning.table == "ransac"
 
@@ -45,9 +35,7 @@ def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)
         assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == protocol
-
-
-def test_a_manifest_from_before_a_constant_was_known_is_read() -> None:
+    # A manifest from before a constant was known is read.
     table = load_protocol("edgegrasp").to_json()
     assert "surface_voxel" not in table["camera"]
     assert protocol_from(table).camera.surface_voxel == 0.0
@@ -55,7 +43,7 @@ def test_a_manifest_from_before_a_constant_was_known_is_read() -> None:
 
 
 def test_the_side_view_is_where_giga_has_it() -> None:
-    view = load_protocol("giga").camera.view_range().sample(np.random.default_rng(0))
+    (view,) = load_protocol("giga").camera.view_range().sample(np.random.default_rng(0))
     expected = [0.15, 0.15 - 0.6 * np.sin(np.pi / 3), 0.10 + 0.6 * np.cos(np.pi / 3)]
     np.testing.assert_allclose(view[:3, 3], expected, atol=1e-9)
 
@@ -74,7 +62,7 @@ def test_the_side_view_is_where_giga_has_it() -> None:
         ("version = 2", "version = ", "protocol .*toml"),
     ],
 )
-def test_a_wrong_file_is_told(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     file = tmp_path / "own.toml"
     file.write_text((FOLDER / "edgegrasp.toml").read_text().replace(old, new))
     with pytest.raises(ValueError, match=message):
@@ -86,20 +74,3 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
         FileNotFoundError, match="edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn"
     ):
         load_protocol("paper")
-
-
-def test_depth_noise_has_the_strength_asked_for() -> None:
-    noise = load_protocol("giga").noise.depth_noise()
-    assert noise is not None
-    flat = np.ones((480, 640))
-    rng = np.random.default_rng(0)
-    images = [noise.apply(flat, rng) for _ in range(60)]
-    factors = np.array([image.mean() for image in images])
-    assert np.std(factors) == pytest.approx(1000**-0.5, rel=0.3)
-    rough = np.array([image.std() > 1e-9 for image in images])
-    assert 0.3 < rough.mean() < 0.7
-    smooth = replace(noise, gamma_shape=0.0, correlated_share=1.0).apply(flat, rng) - 1
-    assert 0.002 < smooth.std() < 0.005
-    neighbours = np.corrcoef(smooth[:, :-1].ravel(), smooth[:, 1:].ravel())[0, 1]
-    distant = np.corrcoef(smooth[:, :-16].ravel(), smooth[:, 16:].ravel())[0, 1]
-    assert neighbours > 0.8 > 0.1 > abs(distant)

@@ -1,21 +1,22 @@
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edgegrasp_sim.gate import below_gate
-from edgegrasp_sim.grasping import FailureCause, GraspOutcome
-from edgegrasp_sim.intervals import paired_difference, wilson
-from edgegrasp_sim.results import ResultFolder, attempts_digest, round_from_json, summarise
-from edgegrasp_sim.trials import Attempt, Round, RoundEnd
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from edgegrasp_sim.hand import FailureCause, GraspOutcome
+from edgegrasp_sim.results import (
+    ResultFolder,
+    attempts_digest,
+    below_gate,
+    paired_difference,
+    round_from_json,
+    summarise,
+    wilson,
+)
+from edgegrasp_sim.trial import Attempt, Round, RoundEnd
 
 HELD = Attempt(
     GraspOutcome.SUCCESS, None, "mug", "mug", False, 0.5, 0.04, 0.03, False, 0, 1000, 0.25,

@@ -1,27 +1,23 @@
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-import pybullet_data
 import pytest
+from scipy.spatial.transform import Rotation
 
-from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.families import write_family
-from edgegrasp_sim.grasping import GraspOutcome, retreat_pose
-from edgegrasp_sim.gripper import FINGERTIP
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.observation import WORKSPACE
+from edgegrasp_sim.camera import WORKSPACE, look_at
+from edgegrasp_sim.engine import ASSETS, World
+from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
+from edgegrasp_sim.poses import quaternion_xyzw, require_pose, translation
 from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
-from edgegrasp_sim.world import World
+from edgegrasp_sim.validate import measure_agreement
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-CUBE = Path(pybullet_data.getDataPath()) / "cube_small.urdf"  # 0.05 m
+CUBE = ASSETS / "cube_small.urdf"  # 0.05 m
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+FRONT = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))  # T_world_camera
+# The reference agrees with itself in 92 to 100 % of packed and 85 to 95 % of pile labels.
+LEAST_AGREEMENT = {SceneKind.PACKED: 0.90, SceneKind.PILE: 0.82}
 
 
 def cube_at(x: float, y: float, z: float = 0.075) -> ObjectPlacement:
@@ -35,10 +31,27 @@ def top_down(x: float, y: float, tip: float) -> np.ndarray:
     return T
 
 
-@pytest.fixture
-def simulation() -> Iterator[ClutterSimulation]:
-    with ClutterSimulation() as simulation:
-        yield simulation
+def grasps_near(simulation: ClutterSimulation, number: int) -> list[np.ndarray]:
+    """So many grasps near each object, from above."""
+    rng = np.random.default_rng(0)
+    return [
+        top_down(x + rng.normal(0, 0.01), y + rng.normal(0, 0.01), max(z - 0.01, 0.055))
+        for x, y, z in (item.position for item in simulation.placements)
+        for _ in range(number)
+    ]
+
+
+def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(
+    simulation: ClutterSimulation,
+) -> None:
+    simulation.reset_from_poses([cube_at(0.15, 0.15)])
+    before = simulation.placements
+    result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))  # in the air
+    assert result.outcome is GraspOutcome.AFTER
+    assert result.opening < 0.008
+    assert result.held is None
+    assert not simulation.try_grasp(top_down(0.15, 0.25, 0.06)).success  # beside the cube
+    assert simulation.placements == before
 
 
 def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
@@ -51,40 +64,20 @@ def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
     assert result.held.model.name == "cube_small"
 
 
-def test_what_is_pressed_into_the_table_comes_out_on_top() -> None:
-    with World() as world:
-        add_table(world)
-        cube = load_object(world, ObjectModel("cube", CUBE), (0.15, 0.15, 0.035), UPRIGHT, 1.0)
-        for _ in range(400):
-            world.step()
-        assert cube.body.position[2] == pytest.approx(TABLE_HEIGHT + 0.025, abs=0.002)
+def test_an_object_pressed_into_the_table_comes_out_on_top(world: World) -> None:
+    add_table(world)
+    cube = load_object(world, ObjectModel("cube", CUBE), (0.15, 0.15, 0.035), UPRIGHT, 1.0)
+    world.step(400)
+    assert cube.body.position[2] == pytest.approx(TABLE_HEIGHT + 0.025, abs=0.002)
 
 
 def test_thin_things_that_are_dropped_stay_on_the_table(tmp_path: Path) -> None:
     sticks = ObjectSet.from_folder(write_family("thin", tmp_path / "thin"), SceneKind.PILE)
-    left = 0
     with ClutterSimulation({SceneKind.PILE: sticks}) as simulation:
-        for seed in range(4):
-            simulation.reset(SceneKind.PILE, np.random.default_rng(seed), 5)
-            left += simulation.num_objects
-    assert left >= 12  # of 20; some roll away
-
-
-def test_grasp_in_the_air_holds_nothing(simulation: ClutterSimulation) -> None:
-    simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))
-    assert result.outcome is GraspOutcome.AFTER
-    assert result.opening < 0.008
-    assert result.held is None
-
-
-def test_grasp_beside_the_middle_pushes_or_misses_but_never_moves_the_scene(
-    simulation: ClutterSimulation,
-) -> None:
-    simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    before = simulation.placements
-    assert not simulation.try_grasp(top_down(0.15, 0.25, 0.06)).success
-    assert simulation.placements == before
+        left = [
+            simulation.reset(SceneKind.PILE, np.random.default_rng(seed), 5) for seed in range(2)
+        ]
+    assert sum(left) >= 6  # of 10; some roll away
 
 
 def test_contact_at_the_start_pose() -> None:
@@ -115,7 +108,7 @@ def test_executed_grasp_removes_the_object(simulation: ClutterSimulation) -> Non
     assert not simulation.execute_grasp(grasp).success
 
 
-def test_what_is_pushed_out_of_the_workspace_is_taken_away(simulation: ClutterSimulation) -> None:
+def test_an_object_outside_the_workspace_is_removed(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15), cube_at(0.35, 0.15)])
     simulation.execute_grasp(top_down(0.05, 0.05, 0.2))
     assert [round(item.position[0], 2) for item in simulation.placements] == [0.15]
@@ -123,13 +116,7 @@ def test_what_is_pushed_out_of_the_workspace_is_taken_away(simulation: ClutterSi
 
 def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimulation) -> None:
     simulation.reset("pile", np.random.default_rng(3))
-    rng = np.random.default_rng(0)
-    positions = [item.position for item in simulation.placements]
-    grasps = [
-        top_down(x + rng.normal(0, 0.01), y + rng.normal(0, 0.01), max(z - 0.01, 0.055))
-        for x, y, z in positions
-        for _ in range(2)
-    ]
+    grasps = grasps_near(simulation, 2)
     forward = [simulation.try_grasp(grasp).opening for grasp in grasps]
     backward = [simulation.try_grasp(grasp).opening for grasp in reversed(grasps)]
     assert forward == backward[::-1]
@@ -141,18 +128,13 @@ def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(
     simulation: ClutterSimulation,
 ) -> None:
     simulation.reset("pile", np.random.default_rng(5))
-    rng = np.random.default_rng(1)
     steps = 0
 
     def count() -> None:
         nonlocal steps
         steps += 1
 
-    grasps = [
-        top_down(x + rng.normal(0, 0.01), y + rng.normal(0, 0.01), max(z - 0.01, 0.055))
-        for x, y, z in (item.position for item in simulation.placements)
-        for _ in range(4)
-    ]
+    grasps = grasps_near(simulation, 3)
     simulation.world.on_step = count
     whole = [simulation.try_grasp(grasp, to_the_end=True).success for grasp in grasps]
     whole_steps, steps = steps, 0
@@ -160,7 +142,7 @@ def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(
     assert any(whole)
     assert not all(whole)
     assert np.mean(np.equal(whole, early)) >= 0.95
-    assert steps < 0.7 * whole_steps
+    assert steps < 0.75 * whole_steps
 
 
 @pytest.mark.parametrize("scene", SceneKind)
@@ -195,8 +177,7 @@ def test_saved_state_comes_back(simulation: ClutterSimulation) -> None:
 
 def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
-    seen = simulation.observe_from([T_world_camera], np.random.default_rng(0), noise_std=0.0)
+    seen = simulation.observe_from([FRONT], np.random.default_rng(0), noise_std=0.0)
     assert seen.cloud.dtype == np.float32
     assert (seen.cloud >= WORKSPACE[0].astype(np.float32)).all()
     assert seen.cloud.max(axis=0) == pytest.approx((0.175, 0.175, 0.1), abs=2e-3)
@@ -208,11 +189,8 @@ def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimu
 
 def test_an_observation_holds_the_table_where_it_may(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
     known, ransac, seen = (
-        simulation.observe_from(
-            [T_world_camera], np.random.default_rng(0), noise_std=0.0, table=table
-        )
+        simulation.observe_from([FRONT], np.random.default_rng(0), noise_std=0.0, table=table)
         for table in ("known", "ransac", "seen")
     )
     level = [np.abs(each.cloud[:, 2] - TABLE_HEIGHT) < 1e-3 for each in (known, ransac, seen)]
@@ -224,11 +202,10 @@ def test_an_observation_holds_the_table_where_it_may(simulation: ClutterSimulati
 
 def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    T_world_camera = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))
 
     def top(noise_std: float, seed: int) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        cloud = simulation.observe_from([T_world_camera], rng, noise_std=noise_std).cloud
+        cloud = simulation.observe_from([FRONT], rng, noise_std=noise_std).cloud
         inner = (np.abs(cloud[:, :2] - 0.15) < 0.02).all(axis=1) & (cloud[:, 2] > 0.09)
         return cloud[inner, 2]
 
@@ -251,10 +228,8 @@ def test_retreat_is_straight_up_after_a_side_grasp() -> None:
     assert retreat_pose(slanted)[:3, 3] == pytest.approx(-0.1 * slanted[:3, 2])
 
 
-def test_wrong_use_is_told(simulation: ClutterSimulation) -> None:
+def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
     rng = np.random.default_rng(0)
-    with pytest.raises(RuntimeError, match="call reset"):
-        simulation.try_grasp(np.eye(4))
     with pytest.raises(ValueError, match="scene is 'heap'; choose one of packed, pile"):
         simulation.reset("heap", rng)
     with pytest.raises(ValueError, match="num_objects is 0"):
@@ -264,5 +239,46 @@ def test_wrong_use_is_told(simulation: ClutterSimulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     with pytest.raises(ValueError, match="T_world_hand is no rigid transform"):
         simulation.try_grasp(np.zeros((4, 4)))
-    with ClutterSimulation({}) as without, pytest.raises(ValueError, match="no object set"):
-        without.reset("pile", rng)
+    with ClutterSimulation({}) as empty:
+        with pytest.raises(RuntimeError, match="call reset"):
+            empty.try_grasp(np.eye(4))
+        with pytest.raises(ValueError, match="no object set"):
+            empty.reset("pile", rng)
+
+
+@pytest.mark.parametrize(
+    ("kind", "to_the_end"), [(SceneKind.PACKED, True), (SceneKind.PILE, False)]
+)
+def test_outcomes_agree_with_the_reference_simulator(
+    shared_dir: Path, kind: SceneKind, to_the_end: bool
+) -> None:
+    agreement = measure_agreement(shared_dir, kind, grasps_per_scene=20, to_the_end=to_the_end)
+    assert agreement.tried == (20,) * 4
+    assert agreement.share >= LEAST_AGREEMENT[kind]
+
+
+def test_quaternions_are_those_of_the_rotation() -> None:
+    turns = Rotation.random(100, rng=np.random.default_rng(0))
+    halves = Rotation.from_rotvec(np.pi * np.eye(3))
+    for rotation in Rotation.concatenate([turns, halves]):
+        T = np.eye(4)
+        T[:3, :3] = rotation.as_matrix()
+        quaternion = quaternion_xyzw(T)
+        assert np.linalg.norm(quaternion) == pytest.approx(1.0)
+        assert abs(np.dot(quaternion, rotation.as_quat())) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("T", "message"),
+    [
+        (np.eye(3), r"pose has shape \(3, 3\)"),
+        (np.full((4, 4), np.nan), "pose holds values that are not finite"),
+        (2.0 * np.eye(4), "pose is no rigid transform"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "pose is no rigid transform"),
+    ],
+)
+def test_only_rigid_transforms_are_poses(T: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        require_pose(T, "pose")
+    pose = translation(0.1, 0.2, 0.3)
+    assert np.array_equal(require_pose(pose.tolist(), "pose"), pose)

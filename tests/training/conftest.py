@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,10 +7,24 @@ import pytest
 
 from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_training.views import LabelledView, find_views
+from edgegrasp_training.teacher import Teacher
+from edgegrasp_training.training import Trainer, TrainingOptions
+from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
 MakeView = Callable[[int], LabelledView]
+MakeTrainer = Callable[..., Trainer]
+FAST = TrainingOptions(
+    steps=40, views_per_step=2, balls_per_view=3, learning_rate=3e-3, evaluate_every=10
+)
+NETWORKS = {
+    "balls": NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04),
+    "vn": NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 9, 9), (9, 9), (16, 8, 4), crop_radius=0.04),
+    "hands": NetworkConfig(
+        "hand", hand_widths=(8, 16), hand_points=16, classifier_widths=(16, 8), crop_radius=0.04
+    ),
+}
 
 
 def _made_up_view(seed: int) -> LabelledView:
@@ -50,3 +65,30 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     for number in range(8):
         _made_up_view(number).save(folder / f"packed_{number}_0.npz")
     return find_views([folder])
+
+
+@pytest.fixture(scope="session")
+def networks() -> dict[str, NetworkConfig]:
+    """Small networks of every architecture."""
+    return NETWORKS
+
+
+@pytest.fixture(scope="session")
+def make_trainer(views: list[Path]) -> MakeTrainer:
+    """Makes the trainer of a small network on made-up views."""
+
+    def make(
+        folder: Path,
+        network: str = "hands",
+        *,
+        name: str = "tiny",
+        train: list[Path] | None = None,
+        teacher: Teacher | None = None,
+        **options: object,
+    ) -> Trainer:
+        metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
+        own, validation = split_by_scene(views, 0.25, seed=0)
+        chosen = replace(FAST, **options)
+        return Trainer(metadata, train or own, validation, folder, chosen, teacher=teacher)
+
+    return make

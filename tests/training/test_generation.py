@@ -3,7 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_sim.objects import SceneKind
 from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+from edgegrasp_training.shapes import made_object
 from edgegrasp_training.views import find_views, load_view
 
 SMALL = GenerationOptions(scenes=2, views_per_scene=1, grasps_per_view=12, seed=5)
@@ -47,3 +49,20 @@ def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
         again = load_view(tmp_path / path.name)
         np.testing.assert_array_equal(again.success, load_view(path).success)
         np.testing.assert_array_equal(again.points, load_view(path).points)
+
+
+def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) -> None:
+    train = tmp_path / "objects" / "pile" / "train"
+    plain = ("made-bowl", "made-ring-flat", "made-tube")
+    models = {name: made_object(name, train) for name in plain}
+    (tmp_path / "objects" / "packed").symlink_to(tmp_path / "objects" / "pile")
+    options = GenerationOptions(2, 1, 4, seed=2, kind=SceneKind.PILE)
+    list(generate(tmp_path / "views", tmp_path / "objects", options))
+    paths = find_views([tmp_path / "views"])
+    assert [path.name for path in paths] == [f"pile_2-00000{k}_0.npz" for k in range(2)]
+    views = [load_view(path) for path in paths]
+    assert any(view.objects for view in views)
+    for view in views:
+        for name, digest in zip(view.objects, view.object_digests, strict=True):
+            model = models.get(name) or made_object(name, tmp_path / "again")
+            assert digest == model.digest

@@ -1,16 +1,22 @@
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_training.views import (
+    CARD_FILE,
     LabelledView,
     find_views,
     load_view,
     part_of,
     scene_of,
     split_by_scene,
+    write_data_card,
 )
+
+SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
 
 def some_view(T_world_hand: np.ndarray | None = None) -> LabelledView:
@@ -77,3 +83,44 @@ def test_a_larger_part_holds_the_smaller_one_and_whole_scenes() -> None:
 def test_no_views_is_an_error_with_the_way_out(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="generate-data"):
         find_views([tmp_path])
+
+
+def test_every_view_says_which_objects_it_shows() -> None:
+    for path in find_views([SAMPLE]):
+        view = load_view(path)
+        assert len(view.objects) == len(view.object_digests) > 0
+        assert view.firm is not None
+        assert (view.firm <= view.success).all()
+
+
+@pytest.mark.parametrize("kind", SceneKind)
+def test_no_test_object_is_in_a_training_view(shared_dir: Path, kind: SceneKind) -> None:
+    kept_apart = ObjectSet.from_folder(shared_dir / "objects", kind, "test").models
+    names, digests = {model.name for model in kept_apart}, {model.digest for model in kept_apart}
+    # A generator's own folder, where there is one, is held to the same.
+    generated = [path for path in (SAMPLE.parents[1] / "data").glob("*") if any(path.glob("*.npz"))]
+    for path in find_views([SAMPLE, *generated]):
+        view = load_view(path)
+        assert not names & set(view.objects), path
+        assert not digests & set(view.object_digests), path
+
+
+def test_the_card_counts_what_is_there(tmp_path: Path) -> None:
+    paths = find_views([SAMPLE])
+    card = write_data_card(tmp_path, paths, "edgegrasp generate-data").read_text()
+    committed = (SAMPLE / CARD_FILE).read_text()
+    assert card.split("Made by:")[0] == committed.split("Made by:")[0]
+    tried = sum(len(load_view(path).tried()) for path in paths)
+    assert f"| {tried} |" in card
+
+
+@pytest.mark.parametrize("kind", SceneKind)
+def test_no_test_object_is_in_the_data_of_the_shipped_weights(
+    shared_dir: Path, kind: SceneKind
+) -> None:
+    card = (SAMPLE.parents[1] / "docs" / "training_data.md").read_text()
+    listed = re.findall(r"^- (\S+) `([0-9a-f]{64})`: \d+$", card, re.MULTILINE)
+    assert len(listed) > 300
+    kept_apart = ObjectSet.from_folder(shared_dir / "objects", kind, "test").models
+    assert not {name for name, _ in listed} & {model.name for model in kept_apart}
+    assert not {digest for _, digest in listed} & {model.digest for model in kept_apart}

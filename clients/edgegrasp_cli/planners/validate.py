@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_cli.planners.paper_candidates import PaperCandidates, estimate_normals
+from edgegrasp_cli.planners.baselines import PaperCandidates, estimate_normals
 from edgegrasp_sim.camera import TRAINING_VIEWS
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from edgegrasp_sim.observation import Observation
+    from edgegrasp_sim.camera import Observation
 
 # How the labelled views were made: see the data's own description.
 MORE_OBJECTS = 4.0  # than one, on average; Poisson
@@ -109,7 +109,7 @@ def own_successes(
 
 
 def densities(clouds: Iterable[tuple[NDArray[Any], NDArray[Any]]]) -> list[float]:
-    """Points per square millimetre of a surface, by how aslant it is seen (`COSINES`).
+    """Points per square millimetre of a surface, by the angle it is seen at (`COSINES`).
 
     Args:
         clouds: (N, 3) points and (3,) camera of each, metres.

@@ -1,5 +1,6 @@
 """The batch that the ball networks score: the neighbourhoods of the approach points."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -43,7 +44,7 @@ def nearest_in_ball(
 
 @dataclass(frozen=True)
 class BallBatch:
-    """Everything a ball network needs to score the edge grasps of one cloud.
+    """Everything a ball network needs to score the edge grasps of one cloud, or of several.
 
     P ball points in `num_balls` balls, E edge grasps. Metres; every ball in the axes of its cloud.
     """
@@ -91,6 +92,24 @@ class BallBatch:
             contact=torch.from_numpy(np.asarray(contact, dtype=np.int64)),
             approach=_float_tensor(approach),
             depth=_float_tensor(depth),
+        )
+
+    @staticmethod
+    def concatenate(batches: Sequence["BallBatch"]) -> "BallBatch":
+        """Join batches into one, as training does; scores come out in the same order."""
+        first_point = np.cumsum([0, *(len(batch.points) for batch in batches)]).tolist()
+        first_ball = np.cumsum([0, *(batch.num_balls for batch in batches)]).tolist()
+        points = list(zip(batches, first_point, strict=False))  # with the row each begins at
+        balls = list(zip(batches, first_ball, strict=False))
+        return BallBatch(
+            points=torch.cat([batch.points for batch in batches]),
+            normals=torch.cat([batch.normals for batch in batches]),
+            neighbors=torch.cat([batch.neighbors + first for batch, first in points]),
+            ball_of_point=torch.cat([batch.ball_of_point + first for batch, first in balls]),
+            num_balls=first_ball[-1],
+            contact=torch.cat([batch.contact + first for batch, first in points]),
+            approach=torch.cat([batch.approach for batch in batches]),
+            depth=torch.cat([batch.depth for batch in batches]),
         )
 
     @classmethod

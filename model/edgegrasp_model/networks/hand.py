@@ -5,6 +5,7 @@ network shares one ball among all its edge grasps and has to learn what a rotati
 sees each edge grasp in the frame of its own hand: invariant by construction.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -81,6 +82,15 @@ class HandBatch:
             cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
         )
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
+
+    @staticmethod
+    def concatenate(batches: Sequence["HandBatch"]) -> "HandBatch":
+        """Join batches into one, as training does; scores come out in the same order."""
+        return HandBatch(
+            torch.cat([batch.description for batch in batches]),
+            torch.cat([batch.points for batch in batches]),
+            torch.cat([batch.point_count for batch in batches]),
+        )
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:

@@ -1,0 +1,136 @@
+"""What the benchmarks share: runs that take turns, the machine, a server to measure."""
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+RESULTS = Path(__file__).parent / "results"
+MIB = 2**20
+RUNS = 5
+STOP_SECONDS = 30.0
+SERVE = "from edgegrasp_cli.main import main; main()"
+
+
+def interleaved(
+    variants: Mapping[str, Callable[[], object]],
+    runs: int = RUNS,
+    clock: Callable[[], float] = time.process_time,
+) -> dict[str, list[float]]:
+    """Seconds of each variant in each of `runs` rounds, after one that does not count.
+
+    Args:
+        variants: What to run, by name.
+        runs: Rounds that count.
+        clock: Of the processor, which other work on the machine changes little; or of the wall.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    for number in range(runs + 1):
+        for name, variant in variants.items():
+            start = clock()
+            variant()
+            if number:
+                seconds[name].append(clock() - start)
+    return seconds
+
+
+def compare(seconds: Mapping[str, list[float]], ours: str, theirs: str) -> dict[str, Any]:
+    """Medians of each variant, and of the ratio of two of them round by round."""
+    ratios = [b / a for a, b in zip(seconds[ours], seconds[theirs], strict=True)]
+    return {
+        "seconds": {name: statistics.median(times) for name, times in seconds.items()},
+        "times_faster": statistics.median(ratios),
+        "rounds": len(ratios),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Where it was measured."""
+    import torch
+
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    left, right = torch.rand(4096, 1024), torch.rand(1024, 1024)
+    product = statistics.median(interleaved({"product": lambda: left @ right})["product"])
+    return {
+        "processor": models[0] if models else platform.processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "capability": torch.backends.cpu.get_cpu_capability(),
+        "threads": torch.get_num_threads(),
+        "gflops": 2e-9 * 4096 * 1024 * 1024 / product,  # float32, each thread
+        "load_average": os.getloadavg()[0],  # other work on the machine makes everything slower
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def write_results(folder: Path, name: str, results: Mapping[str, Any]) -> None:
+    """Write `name`.json into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(json.dumps(results, indent=1) + "\n")
+
+
+@dataclass(frozen=True)
+class Served:
+    """A running server; its figures are those of all its processes together."""
+
+    http_url: str
+    grpc_address: str
+    process: psutil.Popen
+
+    def memory(self) -> float:
+        """Resident memory, MiB; shared pages count once."""
+        return sum(one.memory_full_info().pss for one in self._processes()) / MIB
+
+    def files(self) -> int:
+        """Open file descriptors, sockets among them."""
+        return sum(one.num_fds() for one in self._processes())
+
+    def threads(self) -> int:
+        """Threads."""
+        return sum(one.num_threads() for one in self._processes())
+
+    def stop(self) -> int:
+        """Send SIGTERM; returns the exit code."""
+        self.process.terminate()
+        return int(self.process.wait(STOP_SECONDS))
+
+    def _processes(self) -> list[psutil.Process]:
+        return [self.process, *self.process.children(recursive=True)]
+
+
+@contextmanager
+def served(*flags: str) -> Iterator[Served]:
+    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
+    ports = ("--http-port", "0", "--grpc-port", "0")
+    quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
+    process = psutil.Popen(
+        [sys.executable, "-c", SERVE, "serve", *ports, *quiet, *flags],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        # "EdgeGrasp serves HTTP <url> gRPC <address>", printed when it is ready.
+        words = process.stdout.readline().split()
+        if len(words) != 6:
+            raise RuntimeError("the server did not start; it says why above")
+        yield Served(words[3], words[5], process)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(STOP_SECONDS)
+            except psutil.TimeoutExpired:
+                process.kill()
+        process.stdout.close()

@@ -1,0 +1,178 @@
+"""Flags that commands share: read from pydantic models, and those of commands that ask a server."""
+
+import functools
+import inspect
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
+
+import typer
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from edgegrasp_client import GraspClient
+
+Flags: TypeAlias = list[inspect.Parameter]
+PLAIN = (bool, int, float, str, Path)  # types that a flag has as they are
+TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
+
+Server = Annotated[
+    str | None, typer.Option(help="host:port (gRPC) or http://host:port; else in this process.")
+]
+Timeout = Annotated[float, typer.Option(help="Seconds to wait for a server.")]
+
+
+def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add groups of flags to a command.
+
+    The command has a keyword argument for each group: a dict of the flags that were given.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**given: Any) -> None:
+            for group, flags in groups.items():
+                values = {flag.name: given.pop(flag.name) for flag in flags}
+                given[group] = {n: value for n, value in values.items() if value not in (None, [])}
+            command(**given)
+
+        own = [
+            parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for parameter in inspect.signature(command).parameters.values()
+            if parameter.name not in groups
+        ]
+        added = [flag for flags in groups.values() for flag in flags]
+        run.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+        run.__annotations__ = {"return": None}  # typer reads the signature alone
+        return run
+
+    return decorate
+
+
+def model_flags(
+    model: "type[BaseModel]",
+    leave_out: Sequence[str] = (),
+    panel: str = "Options",
+    defaults: bool = True,
+) -> Flags:
+    """A flag for each field of a pydantic model, with the field's description and default.
+
+    Args:
+        model: The fields; those that are no number, text, truth value or path are given as JSON.
+        leave_out: Fields without a flag.
+        panel: Heading of the flags in the help.
+        defaults: Whether the help shows the fields' defaults.
+    """
+    flags = []
+    for name, field in model.model_fields.items():
+        if name in leave_out:
+            continue
+        flag_type, choices = _flag_type(field.annotation)
+        option = typer.Option(
+            help=f"{field.description}{_default_text(field.default) if defaults else ''}",
+            show_default=False,
+            metavar=choices,
+            rich_help_panel=panel,
+        )
+        annotation: Any = Annotated[flag_type | None, option]
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        flags.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
+    return flags
+
+
+def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
+    """A flag for each option of a detection; `defaults`: whether the help shows the detector's."""
+    from edgegrasp_model.options import DetectOptions
+
+    return model_flags(DetectOptions, leave_out, "Options of the detection", defaults)
+
+
+def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that flags of `option_flags` stand for; text is read as in query parameters.
+
+    Raises:
+        InvalidRequest: A value is of the wrong type or out of range.
+    """
+    from edgegrasp_model.options import parse_options
+    from edgegrasp_service.worker.http_bodies import options_from_query
+
+    options = options_from_query(
+        (name, value if isinstance(value, str) else json.dumps(value))
+        for name, value in given.items()
+    )
+    parse_options(options)  # a wrong value is refused before anything is started
+    return options
+
+
+def connect(
+    address: str,
+    timeout: float,
+    retry: bool = True,
+    *,
+    token_file: Annotated[
+        Path | None, typer.Option(help=f"File with the server's token; else {TOKEN_VARIABLE}.")
+    ] = None,
+    tls: Annotated[
+        bool, typer.Option("--tls", help="TLS over gRPC, trusting this machine's authorities.")
+    ] = False,
+    tls_ca: Annotated[
+        Path | None, typer.Option(help="TLS, trusting the authorities in a PEM file.")
+    ] = None,
+    tls_certificate: Annotated[Path | None, typer.Option(help="Client certificate, PEM.")] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(help="Key of the client certificate, PEM.")
+    ] = None,
+) -> "GraspClient":
+    """A client of a server; the keyword arguments are the flags in `CONNECTION`.
+
+    Raises:
+        GraspClientError: The token or a file cannot be used.
+    """
+    from edgegrasp_client import GraspClient, Tls
+
+    files = (tls_ca, tls_certificate, tls_key)
+    return GraspClient(
+        address,
+        timeout=timeout,
+        retry=retry,
+        token=_token(token_file),
+        tls=Tls(*files) if tls or any(files) else None,
+    )
+
+
+CONNECTION: Flags = [
+    parameter
+    for parameter in inspect.signature(connect).parameters.values()
+    if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+]
+
+
+def _token(file: Path | None) -> str | None:
+    if file is None:
+        return os.environ.get(TOKEN_VARIABLE) or None
+    try:
+        return file.read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        sys.exit(f"edgegrasp: token file {file}: {error}")
+
+
+def _flag_type(annotation: Any) -> tuple[Any, str | None]:
+    """The type that typer reads a field as, and what its help shows for the value, if not that."""
+    if get_origin(annotation) is Literal:
+        return str, "|".join(get_args(annotation))
+    parts = [part for part in get_args(annotation) if part is not type(None)]
+    if get_origin(annotation) is tuple and parts[-1] is ... and parts[0] in PLAIN:
+        return list[parts[0]], None  # type: ignore[valid-type]
+    only = parts[0] if len(parts) == 1 else annotation
+    return (only, None) if only in PLAIN else (str, "JSON")
+
+
+def _default_text(default: Any) -> str:
+    """A default behind its description; none for nothing, nor for an object."""
+    if default in ("", (), None) or hasattr(default, "model_dump"):
+        return ""
+    return f" ({default if isinstance(default, (str, Path)) else json.dumps(default)})"

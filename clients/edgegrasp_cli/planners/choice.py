@@ -1,0 +1,236 @@
+"""From what the command line names to a planner, and to how a manifest describes it.
+
+A planner of one's own needs nothing from here: see docs/benchmark.md.
+"""
+
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from edgegrasp_cli.flags import connect
+from edgegrasp_sim.protocol import PlanningRules
+from edgegrasp_sim.trial import Planner
+
+GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
+SHIPPED = ("server", "in-process", "edge-sample", "oracle", "oracle-own")
+CONNECT_SECONDS = 30.0
+SUFFIX = ".safetensors"
+SAMPLING = ("num_approach_points", "num_candidates")  # options that planners without a network have
+
+
+@dataclass(frozen=True)
+class PlannerChoice:
+    """A planner as the command line names it.
+
+    Attributes:
+        name: `server`, `in-process`, `edge-sample`, `oracle`, `oracle-own`, an installed one, or
+            `module:callable`.
+        model: weights by name, or a `.safetensors` file; empty: the default.
+        weights: files or folders besides those that ship.
+        server: `host:port` or `http://host:port`; None: one is started.
+        connection: keyword arguments of `connect`.
+        options: of each request, in place of the protocol's and of collision `penalise`.
+        voxel_size: metres, in place of the weights' own; `in-process` only.
+        flipped_normals: share of the normals turned around at random; `in-process` only.
+    """
+
+    name: str
+    model: str = ""
+    weights: tuple[Path, ...] = ()
+    server: str | None = None
+    connection: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    voxel_size: float | None = None
+    flipped_normals: float = 0.0
+
+    def sampling(self) -> dict[str, int]:
+        """The protocol's sampling that is changed."""
+        return {name: self.options[name] for name in SAMPLING if name in self.options}
+
+    def request_options(self) -> dict[str, Any]:
+        """Of each request for grasps."""
+        return {"collision": "penalise"} | self.options
+
+    def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
+        """The weights to load, and the name to ask for.
+
+        Raises:
+            ValueError: the model is a file, and there is none.
+        """
+        if not self.model.endswith(SUFFIX):
+            return self.weights, self.model
+        file = Path(self.model)
+        if not file.is_file():
+            raise ValueError(f"model is {self.model}; there is no such file")
+        return (*self.weights, file), file.stem
+
+
+@dataclass(frozen=True)
+class ChosenPlanner:
+    """How to make a planner, and what it is.
+
+    Attributes:
+        make: makes the planner in the process that uses it; can be sent to another.
+        facts: for the manifest.
+    """
+
+    make: Callable[[], Planner]
+    facts: dict[str, Any]
+
+    @property
+    def title(self) -> str:
+        """The weights' name where there are any, else the planner's."""
+        return str(self.facts.get("model") or self.facts["name"])
+
+
+@contextmanager
+def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlanner]:
+    """Find a planner for a protocol; a server of its own runs as long as the context.
+
+    Raises:
+        ValueError: no such planner, or weights that cannot be used.
+        GraspClientError: the server does not answer.
+    """
+    only_in_process = choice.voxel_size is not None or choice.flipped_normals > 0
+    if only_in_process and choice.name != "in-process":
+        raise ValueError(
+            f"planner is {choice.name!r}; voxel_size and flipped_normals need in-process"
+        )
+    if choice.name == "server":
+        with _server(choice, rules) as planner:
+            yield planner
+    elif choice.name == "in-process":
+        yield _in_process(choice, rules)
+    elif choice.name in ("edge-sample", "oracle"):
+        yield _on_paper_candidates(choice, rules)
+    elif choice.name == "oracle-own":
+        yield _on_own_candidates(choice, rules)
+    else:
+        make = partial(named_planner, choice.name)
+        make()  # a wrong name fails here, not in every worker
+        yield ChosenPlanner(make, {"name": choice.name})
+
+
+def named_planner(name: str) -> Planner:
+    """The planner of a name: `module:attribute`, or an entry point of `edgegrasp.planners`.
+
+    A function is the planner itself; a class is called without arguments to make one.
+
+    Raises:
+        ValueError: there is no such planner.
+    """
+    installed = entry_points(group=GROUP)
+    module, colon, attribute = name.partition(":")
+    if name not in installed.names and not (module and colon and attribute):
+        known = [*SHIPPED, *sorted(installed.names)]
+        raise ValueError(
+            f"planner is {name!r}; choose one of {', '.join(known)}, or module:callable"
+        )
+    try:
+        if name in installed.names:
+            found = installed[name].load()
+        else:
+            found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
+    planner: Any = found() if isinstance(found, type) else found
+    if not callable(planner):
+        raise ValueError(f"planner {name!r} is no callable; name a function or a class")
+    made: Planner = planner
+    return made
+
+
+@contextmanager
+def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlanner]:
+    from edgegrasp_cli.planners.detection import ServerPlanner, model_used
+    from edgegrasp_client.local_server import Addresses, local_server
+
+    if choice.server and choice.model.endswith(SUFFIX):
+        raise ValueError(f"model is {choice.model}; name one of the server's own weights")
+    weights, model = choice.weights_and_model()
+    options = choice.request_options()
+    flags = [text for path in weights for text in ("--weights", str(path))]
+    own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
+    with own as addresses:
+        address = addresses.grpc_address
+        with connect(address, CONNECT_SECONDS, **choice.connection) as client:
+            used = model_used(client, model)
+        asked = {"model": model, **options}
+        yield ChosenPlanner(
+            partial(ServerPlanner, address, rules, asked, used.digest, choice.connection),
+            {
+                "name": "server",
+                "model": used.name,
+                "digest": used.digest,
+                "voxel_size": used.voxel_size,
+                "options": options,
+            },
+        )
+
+
+def _in_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
+    from edgegrasp_cli.planners.detection import InProcessPlanner
+
+    weights, model = choice.weights_and_model()
+    used = _metadata(weights, model)
+    options = choice.request_options()
+    changes: dict[str, Any] = {}
+    if choice.voxel_size is not None:
+        changes["voxel_size"] = choice.voxel_size
+    if choice.flipped_normals > 0:
+        changes["flipped_normals"] = choice.flipped_normals
+    facts = {"model": used.name, "digest": used.digest, "options": options, **changes}
+    return ChosenPlanner(
+        partial(InProcessPlanner, weights, model, rules, options, **changes),
+        {"name": choice.name, **facts},
+    )
+
+
+def _on_paper_candidates(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
+    from edgegrasp_cli.planners.baselines import (
+        MAX_TRIES,
+        EdgeSamplePlanner,
+        OraclePlanner,
+        PaperCandidates,
+    )
+
+    numbers = {name: getattr(rules, name) for name in SAMPLING} | choice.sampling()
+    sampler = PaperCandidates(**numbers, voxel_size=rules.voxel_size)
+    facts = {"name": choice.name, "candidates": "paper", **choice.sampling()}
+    if choice.name == "edge-sample":
+        return ChosenPlanner(partial(EdgeSamplePlanner, sampler), facts)
+    return ChosenPlanner(partial(OraclePlanner, sampler), facts | {"max_tries": MAX_TRIES})
+
+
+def _on_own_candidates(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
+    from edgegrasp_cli.planners.baselines import MAX_TRIES, OraclePlanner, OwnCandidates
+
+    weights, model = choice.weights_and_model()
+    used = _metadata(weights, model)
+    options = {"collision": "avoid", **choice.sampling()}
+    return ChosenPlanner(
+        partial(OraclePlanner, OwnCandidates(rules, options, weights, model)),
+        {
+            "name": choice.name,
+            "candidates": "own",
+            "voxel_size": used.voxel_size,
+            "max_tries": MAX_TRIES,
+            "options": options,
+        },
+    )
+
+
+def _metadata(weights: tuple[Path, ...], model: str) -> Any:
+    """The metadata of the weights that a name stands for."""
+    from edgegrasp_model.detector import ModelCatalogue
+    from edgegrasp_model.errors import EdgeGraspError
+
+    try:
+        return ModelCatalogue.load(weights).get(model).metadata
+    except EdgeGraspError as error:
+        raise ValueError(str(error)) from error

@@ -1,0 +1,355 @@
+"""A floating Panda hand, and a grasp with it: approach, close, retreat, and the outcome."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from edgegrasp_sim.engine import ASSETS, TIME_STEP, World, WorldAnchor, couple_joints
+from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
+from edgegrasp_sim.scene import SceneObject
+
+MESHES = ASSETS / "franka_panda" / "meshes" / "collision"
+MAX_OPENING = 0.08  # metres between the fingers
+FINGERTIP = 0.1122  # metres ahead of the link
+# The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
+T_HAND_HANDCOM = translation(0.0, 0.0, 0.04)
+T_HANDCOM_HAND = translation(0.0, 0.0, -0.04)
+
+HAND_MASS = 0.5  # kg
+HAND_FRICTION = 1.0
+FINGER_MASS = 0.1  # kg
+FINGER_FRICTION = 0.75
+FINGER_SPINNING_FRICTION = 0.05
+FINGER_STIFFNESS = 30000.0  # N/m at a contact
+FINGER_DAMPING = 1000.0  # N s/m at a contact
+FINGER_FORCE = 20.0  # N
+FINGER_BASE = 0.0584  # metres ahead of the link
+GEAR_FORCE = 30.0  # N
+GEAR_ERP = 0.1
+TOOL_FORCE = 300.0  # N
+CLOSE_SECONDS = 0.5
+COLLISION_DEPTH = 0.001  # metres; a finger sliding along an object overlaps it by less
+
+# Far above the table and out of the cameras' sight.
+_PARKED = translation(0.15, 0.15, 5.0)
+
+PREGRASP_DISTANCE = 0.05  # metres back along the approach
+RETREAT_DISTANCE = 0.10  # metres
+SIDE_GRASP_ANGLE = np.pi / 3  # radians from straight down; beyond it the hand lifts straight up
+# The reference asks for 0.10 m/s in pieces of 2 mm and rounds each down to whole steps of 1/80 s.
+STEP_LENGTH = 0.002  # metres in each time step
+MIN_OPENING = 0.1 * MAX_OPENING  # below it, the hand holds nothing
+
+# When a grasp that need not be run to its end has a clear outcome.
+STILL = 5e-5  # metres that fingers at rest still close in a time step
+STILL_STEPS = 5
+EMPTY_STEPS = 2  # time steps without contact
+HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves with them
+SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
+LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
+SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
+SHAKE_STEP = 0.0125  # metres in each time step: 1.0 m/s
+# Metres along the hand's z at which to look for the object between the fingers, best first.
+_TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
+
+
+class GraspOutcome(StrEnum):
+    """The outcome of a grasp."""
+
+    SUCCESS = "success"
+    PREGRASP = "pregrasp"
+    AFTER = "after"
+
+
+class FailureCause(StrEnum):
+    """Why a grasp failed: the first of these that applies."""
+
+    START_COLLISION = "collision at pre-grasp"
+    APPROACH_COLLISION = "collision on approach"
+    MISSED = "missed"
+    WRONG_OBJECT = "wrong object"
+    SLIPPED = "slipped"
+
+
+@dataclass(frozen=True, slots=True)
+class GraspResult:
+    """The outcome of a grasp, and its details.
+
+    Attributes:
+        outcome: `SUCCESS`; `PREGRASP`: contact at the start pose (only where that is a failure);
+            `AFTER`: nothing held at the end.
+        opening: metres between the fingers at the end.
+        start_contact: whether the open hand overlapped something at its start pose.
+        held: the object held, None if nothing is.
+        target: the object between the fingers before the hand came, None if there was none.
+        cause: why it failed, None if it did not.
+        held_after_shaking: whether it was still held then; None if the hand was not shaken.
+    """
+
+    outcome: GraspOutcome
+    opening: float
+    start_contact: bool
+    held: SceneObject | None
+    target: SceneObject | None = None
+    cause: FailureCause | None = None
+    held_after_shaking: bool | None = None
+
+    @property
+    def success(self) -> bool:
+        """Whether the hand came away holding something."""
+        return self.outcome is GraspOutcome.SUCCESS
+
+
+def run_grasp(
+    gripper: "Gripper",
+    T_world_hand: Matrix,
+    objects: Mapping[int, SceneObject],
+    *,
+    start_contact_fails: bool,
+    to_the_end: bool,
+    shake: bool = False,
+) -> GraspResult:
+    """Run a grasp from its start pose to the end of the retreat; the hand stays there.
+
+    Args:
+        gripper: the hand to use.
+        T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
+        objects: what may be held, by the id of its body.
+        start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
+        to_the_end: simulate every step, so that whatever the hand pushes aside ends up right;
+            otherwise stop once the outcome is clear.
+        shake: shake a held object at the end of the retreat; this does not change `outcome`.
+    """
+    gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
+    gripper.world.detect_collisions()
+    start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
+    target = _object_between_fingers(gripper, T_world_hand, objects)
+    if start_contact and start_contact_fails:
+        return GraspResult(
+            GraspOutcome.PREGRASP,
+            gripper.opening,
+            start_contact,
+            None,
+            target,
+            FailureCause.START_COLLISION,
+        )
+
+    collided = False
+    for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
+        collided = collided or gripper.penetrates()
+    _close(gripper, objects, to_the_end=to_the_end)
+    missed = gripper.opening <= MIN_OPENING
+    caught = _touched(gripper, objects)
+    if not missed or to_the_end:
+        held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
+        if held is not None and gripper.opening > MIN_OPENING:
+            opening = gripper.opening
+            still = _holds_when_shaken(gripper, T_world_hand, held, objects) if shake else None
+            return GraspResult(
+                GraspOutcome.SUCCESS,
+                opening,
+                start_contact,
+                held,
+                target,
+                held_after_shaking=still,
+            )
+    applies = {
+        FailureCause.START_COLLISION: start_contact,
+        FailureCause.APPROACH_COLLISION: collided,
+        FailureCause.MISSED: missed or not caught,
+        FailureCause.WRONG_OBJECT: target is not None and target not in caught,
+        FailureCause.SLIPPED: True,
+    }
+    cause = next(cause for cause, holds in applies.items() if holds)
+    return GraspResult(GraspOutcome.AFTER, gripper.opening, start_contact, None, target, cause)
+
+
+def retreat_pose(T_world_hand: Matrix) -> Matrix:
+    """Where the hand goes after closing: back along the approach, or up after a side grasp."""
+    approach = T_world_hand[:3, 2]
+    if -approach[2] < np.cos(SIDE_GRASP_ANGLE):
+        return translation(0.0, 0.0, RETREAT_DISTANCE) @ T_world_hand
+    return T_world_hand @ translation(0.0, 0.0, -RETREAT_DISTANCE)
+
+
+class Gripper:
+    """The simulated hand; its link frame is `panda_hand` (z out of the palm, y closes).
+
+    The shapes are the convex hulls of the Panda's meshes: palm at z = 0.0658, fingertips at
+    z = 0.1122, hand within x ± 0.0316 and y ± 0.104, in metres.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.body = world.add_hand(
+            MESHES / "hand.obj",
+            MESHES / "finger.obj",
+            palm_mass=HAND_MASS,
+            palm_centre=T_HAND_HANDCOM[:3, 3].tolist(),
+            finger_mass=FINGER_MASS,
+            finger_base=FINGER_BASE,
+            position=_PARKED[:3, 3].tolist(),
+        )
+        self.body.set_dynamics(mass=HAND_MASS, friction=HAND_FRICTION)
+        self.fingers = (self.body.joint(0), self.body.joint(1))
+        for finger in self.fingers:
+            self.body.set_finger(
+                finger.index,
+                friction=FINGER_FRICTION,
+                spinning_friction=FINGER_SPINNING_FRICTION,
+                stiffness=FINGER_STIFFNESS,
+                damping=FINGER_DAMPING,
+                max_position=0.5 * MAX_OPENING,
+            )
+        self._anchor = WorldAnchor(self.body, _PARKED[:3, 3].tolist(), TOOL_FORCE)
+        couple_joints(self.body, 0, 1, erp=GEAR_ERP, max_force=GEAR_FORCE)
+        self.park()
+
+    @property
+    def opening(self) -> float:
+        """Metres between the fingers."""
+        return self.fingers[0].position + self.fingers[1].position
+
+    def park(self) -> None:
+        """Put the open hand where it touches nothing and no camera sees it."""
+        self.place(_PARKED)
+
+    def place(self, T_world_hand: Matrix) -> None:
+        """Put the open hand there at once, at rest."""
+        T_world_com = T_world_hand @ T_HAND_HANDCOM
+        self.body.set_transform(T_world_com)
+        self._anchor.move(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
+        for finger in self.fingers:
+            finger.reset(0.5 * MAX_OPENING)
+            finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
+
+    def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
+        """Drag the hand in a straight line, `step_length` metres in each time step.
+
+        Yields:
+            After every time step; a caller that stops iterating leaves the hand where it is.
+        """
+        T_world_com = T_world_hand @ T_HAND_HANDCOM
+        quaternion = quaternion_xyzw(T_world_com)
+        position = self.body.position
+        way = T_world_com[:3, 3] - position
+        distance = float((way @ way) ** 0.5)
+        steps = max(1, int(distance / step_length))
+        for _ in range(steps):
+            position = position + way / steps
+            self._anchor.move(position, quaternion)
+            self.world.step()
+            yield
+
+    def move_to(self, T_world_hand: Matrix, *, step_length: float) -> None:
+        """Drag the hand all the way there, see `steps_to`."""
+        for _ in self.steps_to(T_world_hand, step_length=step_length):
+            pass
+
+    def penetrates(self) -> bool:
+        """Whether the hand overlaps something by more than `COLLISION_DEPTH`."""
+        return any(contact.distance < -COLLISION_DEPTH for contact in self.body.contacts())
+
+    def closing_steps(self) -> Iterator[None]:
+        """Close the fingers with full force for half a second; yields after every time step."""
+        for finger in self.fingers:
+            finger.drive_to(0.0, FINGER_FORCE)
+        for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
+            self.world.step()
+            yield
+
+
+def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
+    """Close the fingers; unless `to_the_end`, only until they are shut or hold firmly."""
+    opening, still_steps = gripper.opening, 0
+    for _ in gripper.closing_steps():
+        before, opening = opening, gripper.opening
+        still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
+        shut = opening <= MIN_OPENING
+        if not to_the_end and (shut or (still_steps >= STILL_STEPS and _touched(gripper, objects))):
+            return
+
+
+def _retreat(
+    gripper: Gripper,
+    T_world_hand: Matrix,
+    objects: Mapping[int, SceneObject],
+    *,
+    to_the_end: bool,
+) -> SceneObject | None:
+    """Retreat; unless `to_the_end`, only until it is clear what the hand holds.
+
+    Returns:
+        The object in contact with the hand, None if there is none.
+    """
+    watch = _Watch(gripper, objects)
+    for _ in gripper.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH):
+        if not to_the_end and watch.is_clear():
+            break
+    return next(iter(_touched(gripper, objects)), None)
+
+
+class _Watch:
+    """Observes a retreating hand after every time step, to tell early what it will hold.
+
+    On 1,760 grasps in packed and pile scenes, stopping then changes 1 outcome in 100.
+    """
+
+    def __init__(self, gripper: Gripper, objects: Mapping[int, SceneObject]) -> None:
+        self._gripper, self._objects = gripper, objects
+        self._empty_steps = self._held_steps = 0
+        self._offset: Matrix | None = None
+
+    def is_clear(self) -> bool:
+        """Whether the fingers hold nothing any more, or one object that rests on nothing else."""
+        touched = _touched(self._gripper, self._objects)
+        self._empty_steps = 0 if touched else self._empty_steps + 1
+        if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
+            return True
+        held = len(touched) == 1 and self._hangs(touched[0]) and self._keeps_still(touched[0])
+        self._held_steps = self._held_steps + 1 if held else 0
+        return self._held_steps >= HELD_STEPS
+
+    def _hangs(self, held: SceneObject) -> bool:
+        hand = self._gripper.body.uid
+        return all(contact.other_uid == hand for contact in held.body.contacts())
+
+    def _keeps_still(self, held: SceneObject) -> bool:
+        before, self._offset = self._offset, held.body.position - self._gripper.body.position
+        return before is None or bool(np.linalg.norm(self._offset - before) < SLIP)
+
+
+def _holds_when_shaken(
+    gripper: Gripper,
+    T_world_hand: Matrix,
+    held: SceneObject,
+    objects: Mapping[int, SceneObject],
+) -> bool:
+    """Shake the lifted hand from side to side; returns whether it still holds the object."""
+    T_world_lifted = retreat_pose(T_world_hand)
+    gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
+    for along in np.eye(3)[:2]:
+        for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
+            gripper.move_to(T_world_lifted @ translation(*(way * along)), step_length=SHAKE_STEP)
+    return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
+
+
+def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:
+    """The objects in contact with the hand, in the order of the contacts."""
+    uids = [contact.other_uid for contact in gripper.body.contacts()]
+    return [objects[uid] for uid in dict.fromkeys(uids) if uid in objects]
+
+
+def _object_between_fingers(
+    gripper: Gripper, T_world_hand: Matrix, objects: Mapping[int, SceneObject]
+) -> SceneObject | None:
+    """The object between the fingers of a hand at the grasp: the first that rays across hit."""
+    half = 0.5 * MAX_OPENING
+    ends = np.array([[0.0, side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
+    across = np.array([[0.0, -side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
+    hits = gripper.world.first_hits(
+        (ends @ T_world_hand.T)[:, :3], (across @ T_world_hand.T)[:, :3]
+    )
+    return next((objects[uid] for uid in hits if uid in objects), None)

@@ -1,0 +1,328 @@
+"""One round of clutter removal: look, plan, grasp, until the table is empty or planning fails.
+
+A planner is any callable; what runs behind it is up to the caller.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import IntEnum, StrEnum
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
+from edgegrasp_sim.simulation import ClutterSimulation
+
+MIN_POINTS = 100
+FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # seconds between tries of a planner that is unavailable
+PATIENCE = 300.0  # seconds
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedGrasp:
+    """A planner's answer.
+
+    Attributes:
+        T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+        score: how good the planner believes the grasp is; higher is better.
+        width: opening that the grasp needs, metres.
+    """
+
+    T_world_hand: ArrayLike
+    score: float
+    width: float
+
+
+# From an observation, and a seed for randomness in planning, to the grasp to execute; None if
+# there is none.
+Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
+
+
+class PlannerUnavailableError(Exception):
+    """Raised by planners when asking again may help, as when a server restarts."""
+
+
+@runtime_checkable
+class TriesGrasps(Protocol):
+    """A planner that tries grasps in a copy of the scene before it decides."""
+
+    def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
+        """Take a function that tries `T_world_hand`, (4, 4), in a copy of the present scene."""
+
+
+@runtime_checkable
+class Closes(Protocol):
+    """A planner that holds resources."""
+
+    def close(self) -> None:
+        """Release them; called once, after the last round."""
+
+
+class RoundEnd(StrEnum):
+    """Why a round ended."""
+
+    CLEARED = "cleared"
+    FAILURES = "consecutive failures"
+    NO_GRASP = "no grasp found"
+    NOTHING_SEEN = "too few points seen"
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One executed grasp.
+
+    Attributes:
+        outcome: its outcome.
+        cause: why it failed, None if it did not.
+        object: name of the object removed, None after a failure.
+        target: name of the object that was between the fingers, None if there was none.
+        wrong_object: whether what was removed was not the target.
+        score: the planner's score.
+        width: the opening the planner asked for, metres.
+        opening: metres between the fingers at the end.
+        start_contact: whether the open hand overlapped something at its start pose.
+        view: number of the view in its round that the grasp was planned in.
+        points: size of the cloud that was seen.
+        planning_seconds: wall-clock time of the planner.
+        T_world_hand: (4, 4) row-major pose of the hand.
+    """
+
+    outcome: GraspOutcome
+    cause: FailureCause | None
+    object: str | None
+    target: str | None
+    wrong_object: bool
+    score: float
+    width: float
+    opening: float
+    start_contact: bool
+    view: int
+    points: int
+    planning_seconds: float
+    T_world_hand: list[list[float]]
+
+    @property
+    def success(self) -> bool:
+        """Whether an object was removed."""
+        return self.outcome is GraspOutcome.SUCCESS
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One round of clutter removal.
+
+    Attributes:
+        seed: with `index` it gives the scene, the views and the noise.
+        index: number of the round.
+        objects: names of the objects that were there after the reset.
+        attempts: the grasps executed, in order.
+        no_grasp: how often the planner found no grasp; not counted as attempts, as in the
+            reference.
+        end: why the round ended.
+        retries: how often the planner had to be asked again because it was unavailable.
+        waited_seconds: spent on that.
+    """
+
+    seed: int
+    index: int
+    objects: tuple[str, ...]
+    attempts: tuple[Attempt, ...]
+    no_grasp: int
+    end: RoundEnd
+    retries: int = 0
+    waited_seconds: float = 0.0
+
+    @property
+    def successes(self) -> int:
+        """How many objects were removed by grasping."""
+        return sum(attempt.success for attempt in self.attempts)
+
+
+def run_round(
+    simulation: ClutterSimulation,
+    planner: Planner,
+    scene: SceneKind,
+    protocol: BenchmarkProtocol,
+    *,
+    seed: int,
+    index: int,
+    patience: float = PATIENCE,
+    on_grasp: Callable[[PlannedGrasp], None] | None = None,
+) -> Round:
+    """Run one round with a planner; `on_grasp` is called with every grasp before it is executed.
+
+    See `RoundDriver` for the other arguments, and errors.
+    """
+    if isinstance(planner, TriesGrasps):
+        planner.use_trial(simulation.try_in_copy)
+    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
+    while driver.end is None:
+        observation = driver.look()
+        if driver.end is not None:
+            break
+        grasp = driver.plan(planner, observation)
+        if grasp is not None:
+            if on_grasp is not None:
+                on_grasp(grasp)
+            driver.execute(grasp)
+    return driver.result()
+
+
+class RoundDriver:
+    """A round, step by step: `look`, `plan`, `execute`, as long as `end` is None.
+
+    Scene and views depend on `seed` and `index` alone.
+
+    Args:
+        simulation: is reset first.
+        scene: `packed` or `pile`.
+        protocol: objects, camera, noise and what ends the round.
+        seed: not negative.
+        index: number of the round, not negative.
+        patience: seconds to keep asking a planner that is unavailable.
+
+    Raises:
+        ValueError: unknown scene, or a negative seed or index.
+    """
+
+    def __init__(
+        self,
+        simulation: ClutterSimulation,
+        scene: SceneKind,
+        protocol: BenchmarkProtocol,
+        *,
+        seed: int,
+        index: int,
+        patience: float = PATIENCE,
+    ) -> None:
+        if seed < 0 or index < 0:
+            raise ValueError(f"seed is {seed} and index {index}; pass numbers of 0 or more")
+        self.simulation, self.protocol, self.patience = simulation, protocol, patience
+        self._camera = random_stream(seed, index, Stream.CAMERA)
+        self._noise = random_stream(seed, index, Stream.NOISE)
+        self._policy = random_stream(seed, index, Stream.POLICY)
+        simulation.start_contact_fails = protocol.round.start_contact_fails
+        simulation.reset(
+            scene,
+            random_stream(seed, index, Stream.SCENE),
+            protocol.num_objects(index),
+            protocol.scene.scale(scene),
+        )
+        self.view = -1
+        self.end: RoundEnd | None = None
+        self._seen: Observation | None = None
+        self._failures = 0
+        self._planning_seconds = 0.0
+        names = tuple(simulation.object_names)
+        self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED)
+        self._update_end()
+
+    def look(self) -> Observation:
+        """Take the next view; the round ends if it shows almost nothing."""
+        rules = self.protocol
+        seen = self.simulation.observe(
+            self._camera,
+            self._noise,
+            views=rules.camera.view_range(),
+            num_views=rules.camera.views,
+            noise_std=rules.noise.point_std,
+            depth_noise=rules.noise,
+            table=rules.planning.table,
+            surface_voxel=rules.camera.surface_voxel,
+        )
+        failed = [each.T_world_hand for each in self._round.attempts if not each.success]
+        self._seen = replace(seen, failed=np.array(failed).reshape(-1, 4, 4))
+        self.view += 1
+        above = self._seen.cloud[:, 2] > self._seen.table_height + 0.005
+        if np.count_nonzero(above) < MIN_POINTS:
+            self.end = RoundEnd.NOTHING_SEEN
+        return self._seen
+
+    def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
+        """Ask the planner, repeatedly while it is unavailable; None if it finds no grasp.
+
+        Raises:
+            PlannerUnavailableError: it was unavailable for longer than `patience`.
+        """
+        seed = int(self._policy.integers(2**31))
+        waited, pause = 0.0, FIRST_WAIT
+        while True:
+            started = time.perf_counter()
+            try:
+                grasp = planner(observation, seed)
+                break
+            except PlannerUnavailableError:
+                if waited >= self.patience:
+                    raise
+            time.sleep(pause)
+            seconds, pause = time.perf_counter() - started, min(2 * pause, LONGEST_WAIT)
+            waited += seconds
+            self._round = replace(
+                self._round,
+                retries=self._round.retries + 1,
+                waited_seconds=self._round.waited_seconds + seconds,
+            )
+        self._planning_seconds = time.perf_counter() - started
+        if grasp is None:
+            self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)
+            self._update_end()
+        return grasp
+
+    def execute(self, grasp: PlannedGrasp) -> Attempt:
+        """Execute a grasp planned in the last view.
+
+        Raises:
+            ValueError: its pose is no rigid transform.
+        """
+        result = self.simulation.execute_grasp(grasp.T_world_hand)
+        attempt = Attempt(
+            outcome=result.outcome,
+            cause=result.cause,
+            object=result.held.model.name if result.held is not None else None,
+            target=result.target.model.name if result.target is not None else None,
+            wrong_object=result.success and result.target not in (None, result.held),
+            score=float(grasp.score),
+            width=float(grasp.width),
+            opening=result.opening,
+            start_contact=result.start_contact,
+            view=self.view,
+            points=len(self._seen.cloud) if self._seen is not None else 0,
+            planning_seconds=self._planning_seconds,
+            T_world_hand=np.asarray(grasp.T_world_hand, dtype=np.float64).tolist(),
+        )
+        self._failures = 0 if attempt.success else self._failures + 1
+        self._round = replace(self._round, attempts=(*self._round.attempts, attempt))
+        self._update_end()
+        return attempt
+
+    def result(self) -> Round:
+        """The round so far; complete once `end` is not None."""
+        return replace(self._round, end=self.end) if self.end is not None else self._round
+
+    def _update_end(self) -> None:
+        rules = self.protocol.round
+        if self.simulation.num_objects == 0:
+            self.end = RoundEnd.CLEARED
+        elif self._failures >= rules.max_consecutive_failures:
+            self.end = RoundEnd.FAILURES
+        elif self._round.no_grasp >= rules.max_no_grasp:
+            self.end = RoundEnd.NO_GRASP
+
+
+class Stream(IntEnum):
+    """The random streams of a round; none depends on what another was used for."""
+
+    SCENE = 0
+    CAMERA = 1
+    NOISE = 2
+    POLICY = 3
+
+
+def random_stream(seed: int, round_index: int, stream: Stream) -> np.random.Generator:
+    """The generator of one stream of one round."""
+    return np.random.default_rng([seed, round_index, stream])

@@ -1,0 +1,326 @@
+"""Training objects of many shapes: those of a set stretched, and computed ones among them.
+
+A computed object is a hollow one (`HOLLOW`) or drawn at random (`drawn_shape`). The engine takes
+the convex hull of its surface, as of scanned objects: many have hollows that a camera sees into
+but nothing can enter.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, write_object
+
+STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
+MADE_SHARE = 0.6  # of a scene's objects that are computed
+SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
+NUM_VARIED = 16  # objects that a scene is drawn from
+HOLLOW_SHARE = 0.25  # of the computed objects; the others are drawn at random
+
+NUM_FREE, NUM_PLAIN = 320, 160
+NUM_DRAWN = NUM_FREE + NUM_PLAIN  # different shapes, before a scene stretches them
+CIRCLE, FINE_CIRCLE = 20, 32  # corners of a ring that stands for a circle
+LONGEST = 0.045, 0.12  # metres, range of the greatest extent
+THINNEST = 0.009  # metres, least extent
+PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
+
+SEGMENTS = 24  # of a surface of revolution, around its axis
+AXIS = 1e-4  # metres; profiles keep off the axis, where triangles would have no area
+Rings = NDArray[np.float64]  # (R, S, 3) corners of each ring along a part, any unit
+Profile = NDArray[np.float64]  # (P, 2) radius and height, metres; closed, counter-clockwise
+
+
+def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
+    """Draw objects of a set and computed ones, each stretched at random.
+
+    Args:
+        objects: To draw from.
+        folder: Gets the descriptions and the computed objects; other meshes stay where they are.
+        rng: Draws objects and factors.
+
+    Returns:
+        Up to `NUM_VARIED` objects, each under the name it had.
+    """
+    drawn: dict[str, ObjectModel] = {}
+    for _ in range(NUM_VARIED):
+        made = rng.random() < MADE_SHARE
+        model = any_made_object(folder / "made", rng) if made else objects.sample(rng)
+        factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
+        if rng.random() < SYMMETRIC_SHARE:
+            factors[1] = factors[0]
+        drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
+    return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))
+
+
+def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:
+    """Describe an object anew, with its meshes stretched along x, y and z.
+
+    Args:
+        model: An object whose shapes are meshes.
+        factors: Along the axes of its link frame.
+        folder: Gets the description.
+
+    Raises:
+        ValueError: The object has a shape that is not a mesh, or one with a frame of its own.
+    """
+    tree = ElementTree.parse(model.urdf)
+    for shape in (*tree.iter("visual"), *tree.iter("collision")):
+        mesh = shape.find("geometry/mesh")
+        if mesh is None or shape.find("origin") is not None:
+            raise ValueError(f"{model.urdf}: has shapes that cannot be stretched; use plain meshes")
+        own = np.array([float(each) for each in mesh.get("scale", "1 1 1").split()])
+        mesh.set("scale", " ".join(f"{each:.5f}" for each in own * factors))
+        mesh.set("filename", str((model.urdf.parent / mesh.get("filename", "")).resolve()))
+    for origin in tree.iterfind("link/inertial/origin"):
+        place = np.array([float(each) for each in origin.get("xyz", "0 0 0").split()])
+        origin.set("xyz", " ".join(f"{each:.6f}" for each in place * factors))
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{model.name}.urdf"
+    tree.write(path)
+    return replace(model, urdf=path, origin=model)
+
+
+def any_made_object(folder: Path, rng: np.random.Generator) -> ObjectModel:
+    """Draw a computed object and write it into a folder."""
+    names = HOLLOW_NAMES if rng.random() < HOLLOW_SHARE else DRAWN_NAMES
+    return made_object(names[int(rng.integers(len(names)))], folder)
+
+
+def made_object(name: str, folder: Path) -> ObjectModel:
+    """Write a computed object into a folder.
+
+    Args:
+        name: One of HOLLOW_NAMES or DRAWN_NAMES.
+        folder: Created if missing.
+    """
+    surface = revolved(HOLLOW[name]) if name in HOLLOW else drawn_shape(DRAWN_NAMES.index(name))
+    return ObjectModel(name, write_object(name, surface, folder))
+
+
+def drawn_shape(index: int) -> str:
+    """A shape as an OBJ file in metres, always the same for an index.
+
+    Raises:
+        IndexError: There are NUM_DRAWN.
+    """
+    if not 0 <= index < NUM_DRAWN:
+        raise IndexError(f"drawn shape {index} of {NUM_DRAWN}")
+    rng = np.random.default_rng([NUM_FREE, index])
+    if index >= NUM_FREE:
+        return as_obj([_surface(_plain(rng))])
+    parts = _KINDS[index % len(_KINDS)](rng)
+    extents = np.ptp(np.concatenate([part.reshape(-1, 3) for part in parts]), axis=0)
+    scale = rng.uniform(*LONGEST) / extents.max()
+    return as_obj(_surface(part * np.maximum(scale, THINNEST / extents)) for part in parts)
+
+
+def revolved(profile: Profile) -> str:
+    """The surface of revolution of a closed profile about z, as an OBJ file."""
+    angle = 2.0 * np.pi / SEGMENTS * np.arange(SEGMENTS)
+    turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring = profile[:, None, :1] * turn  # (P, S, 2)
+    height = np.broadcast_to(profile[:, None, 1:], (len(profile), SEGMENTS, 1))
+    points = np.concatenate([ring, height], axis=2).reshape(-1, 3)
+    faces = []
+    for row in range(len(profile)):
+        this, following = row * SEGMENTS, (row + 1) % len(profile) * SEGMENTS
+        for k in range(SEGMENTS):
+            beside = (k + 1) % SEGMENTS
+            a, b, c, d = this + k, this + beside, following + beside, following + k
+            faces += [(a, b, c), (a, c, d)]
+    return as_obj([(points, np.array(faces))])
+
+
+def _surface(rings: Rings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Join neighbouring rings and close the ends by fans: points (P, 3), triangles (F, 3)."""
+    count, corners, _ = rings.shape
+    ends = np.array([rings[0].mean(axis=0), rings[-1].mean(axis=0)])
+    points = np.concatenate([rings.reshape(-1, 3), ends])
+    this = np.arange(corners)
+    beside = (this + 1) % corners
+    faces = []
+    for low in range(0, (count - 1) * corners, corners):
+        high = low + corners
+        faces += [np.stack([low + this, low + beside, high + beside], axis=1)]
+        faces += [np.stack([low + this, high + beside, high + this], axis=1)]
+    bottom, top = np.full(corners, count * corners), np.full(corners, count * corners + 1)
+    last = (count - 1) * corners
+    faces += [np.stack([bottom, beside, this], axis=1)]
+    faces += [np.stack([top, last + this, last + beside], axis=1)]
+    triangles = np.concatenate(faces)
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    outwards = (np.cross(a, b) * c).sum() > 0.0
+    return points, triangles if outwards else triangles[:, ::-1]
+
+
+def _plain(rng: np.random.Generator) -> Rings:
+    """A box, a prism or a can in metres, as on a shelf."""
+    corners = int(rng.choice([4, 4, 6, FINE_CIRCLE, FINE_CIRCLE, FINE_CIRCLE]))
+    width, depth = rng.uniform(*PLAIN_WIDTH, size=2)
+    half_height = rng.uniform(*PLAIN_HEIGHT) / 2.0
+    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    ring = ring * (width / 2.0, (depth if corners == 4 else width) / 2.0, 1.0)
+    top = rng.uniform(0.7, 1.0) if rng.random() < 0.3 else 1.0
+    return _straight(ring, [1.0, top], [-half_height, half_height])
+
+
+def _bodies(rng: np.random.Generator) -> list[Rings]:
+    """Two to four bodies, each attached to an earlier one: L, T, steps, hammers, handles."""
+    half = rng.uniform(0.25, 1.0, size=3)
+    parts, boxes = [_body(rng) * half], [(np.zeros(3), half)]
+    for _ in range(int(rng.integers(1, 4))):
+        centre, size = boxes[int(rng.integers(len(boxes)))]
+        half = rng.uniform(0.12, 0.8, size=3)
+        axis, side = int(rng.integers(3)), float(rng.choice([-1.0, 1.0]))
+        place = centre + rng.uniform(-0.6, 0.6, size=3) * size
+        place[axis] = centre[axis] + side * (size[axis] + 0.85 * half[axis])
+        turned = np.roll(_body(rng), int(rng.integers(3)), axis=2)
+        parts.append(turned * half + place)
+        boxes.append((place, half))
+    return parts
+
+
+def _body(rng: np.random.Generator) -> Rings:
+    """A box, a prism, a cylinder, a frustum or an ellipsoid within two units."""
+    corners = int(rng.choice([4, 4, 6, CIRCLE, CIRCLE]))
+    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    if corners == CIRCLE and rng.random() < 0.3:
+        angle = np.linspace(-0.49 * np.pi, 0.49 * np.pi, 9)
+        return _straight(ring, list(np.cos(angle)), list(np.sin(angle)))
+    taper = rng.uniform(0.4, 1.0) if rng.random() < 0.3 else 1.0
+    return _straight(ring, [1.0, taper], [-1.0, 1.0])
+
+
+def _bottle(rng: np.random.Generator) -> list[Rings]:
+    """A body with a random profile: bottles, vases, spindles, dumb-bells."""
+    rows = int(rng.integers(4, 9))
+    widths = np.clip(0.5 + np.cumsum(rng.normal(0.0, 0.22, rows)), 0.15, 1.1)
+    heights = np.sort(rng.uniform(-1.0, 1.0, rows)) * rng.uniform(0.6, 2.0)
+    heights += 0.05 * np.arange(rows)  # no two at one height
+    ring = _ring(int(rng.choice([4, 8, CIRCLE, CIRCLE]))) * (1.0, rng.uniform(0.5, 1.0), 1.0)
+    return [_straight(ring, list(widths), list(heights))]
+
+
+def _plate(rng: np.random.Generator) -> list[Rings]:
+    """A flat part with a star-shaped or irregular outline."""
+    corners = int(rng.choice([5, 8, 10, 16, 24]))
+    if rng.random() < 0.5:
+        radii = np.where(np.arange(corners) % 2, 1.0, rng.uniform(0.35, 0.9))
+    else:
+        radii = rng.uniform(0.4, 1.0, corners)
+    ring = _ring(corners, radii) * (1.0, rng.uniform(0.4, 1.0), 1.0)
+    height = rng.uniform(0.08, 0.45)
+    return [_straight(ring, [1.0, rng.uniform(0.85, 1.0)], [0.0, height])]
+
+
+def _bow(rng: np.random.Generator) -> list[Rings]:
+    """A bent rod: bananas, horseshoes, handles."""
+    turn = np.linspace(0.0, rng.uniform(np.pi / 3, 1.8 * np.pi), 16)
+    taper = 1.0 - rng.uniform(0.0, 0.7) * np.abs(turn / turn[-1] - 0.5)
+    ring = _ring(int(rng.choice([4, 8, 12]))) * (1.0, rng.uniform(0.5, 1.6), 1.0)
+    return [_bent(ring, turn, rng.uniform(0.12, 0.45) * taper)]
+
+
+def _hoop(rng: np.random.Generator) -> list[Rings]:
+    """A bent rod that closes: rings, tapes, nuts, sleeves."""
+    corners = int(rng.choice([4, 8, 12]))
+    ring = _ring(corners) * (np.sqrt(2.0) if corners == 4 else 1.0)
+    thick = rng.uniform(0.08, 0.48)
+    height = np.exp(rng.uniform(np.log(0.4), np.log(4.0)))
+    turn = np.linspace(0.0, 2.0 * np.pi, int(rng.choice([7, 9, 25, 25, 25])))
+    return [_bent(ring * (1.0, height, 1.0), turn, np.full(len(turn), thick))]
+
+
+def _pot(rng: np.random.Generator) -> list[Rings]:
+    """Walls and a floor: cups, bowls, boxes without a lid."""
+    corners = int(rng.choice([4, 6, CIRCLE, CIRCLE]))
+    bottom, wall, floor = rng.uniform(0.5, 1.1), rng.uniform(0.06, 0.3), rng.uniform(0.08, 0.5)
+    ring = _ring(corners) * (1.0, rng.uniform(0.5, 1.0), 1.0)
+    height = rng.uniform(0.5, 2.5)
+    inside = 1.0 - wall, max(bottom - wall, 0.1)
+    heights = [0.0, height, height, floor * height]
+    return [_straight(ring, [bottom, 1.0, *inside], heights)]
+
+
+_KINDS = (_bodies, _hoop, _bottle, _plate, _bodies, _pot, _bow, _hoop)
+
+
+def _ring(corners: int, radii: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
+    """(S, 3) a polygon about the z axis."""
+    angle = 2.0 * np.pi * (np.arange(corners) + 0.5) / corners
+    return np.stack([radii * np.cos(angle), radii * np.sin(angle), np.zeros(corners)], axis=1)
+
+
+def _straight(ring: NDArray[np.float64], widths: list[float], heights: list[float]) -> Rings:
+    """A ring moved along z to each height and scaled to the width there."""
+    return np.stack(
+        [
+            ring * (width, width, 1.0) + (0.0, 0.0, height)
+            for width, height in zip(widths, heights, strict=True)
+        ]
+    )
+
+
+def _bent(
+    ring: NDArray[np.float64], turn: NDArray[np.float64], thick: NDArray[np.float64]
+) -> Rings:
+    """A ring swept about the z axis at a distance of one unit, scaled by `thick` along the way."""
+    radius = 1.0 + thick[:, None] * ring[:, 0]
+    across = np.cos(turn)[:, None] * radius, np.sin(turn)[:, None] * radius
+    return np.stack([*across, thick[:, None] * ring[:, 1]], axis=2)
+
+
+def _torus(radius: float, tube: float) -> Profile:
+    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    return np.stack([radius + tube * np.cos(angle), tube * np.sin(angle)], axis=1)
+
+
+def _tube(outer: float, inner: float, height: float) -> Profile:
+    return np.array([[inner, 0.0], [outer, 0.0], [outer, height], [inner, height]])
+
+
+def _bowl(radius: float, depth: float, wall: float) -> Profile:
+    angle = np.linspace(0.0, np.pi / 2, 8)
+    outside = np.stack([radius * np.sin(angle), depth * (1.0 - np.cos(angle))], axis=1)
+    inside = np.array([radius - wall, depth - wall]) * np.stack([np.sin(angle), -np.cos(angle)], 1)
+    inside[:, 1] += depth
+    profile: Profile = np.concatenate([outside, inside[::-1]])
+    profile[:, 0] = np.maximum(profile[:, 0], AXIS)
+    return profile
+
+
+def _cup(bottom: float, top: float, height: float, wall: float) -> Profile:
+    return np.array(
+        [
+            [AXIS, 0.0],
+            [bottom, 0.0],
+            [top, height],
+            [top - wall, height],
+            [bottom - wall, wall],
+            [AXIS, wall],
+        ]
+    )
+
+
+# Metres; a scene's own scale, and a stretch along each axis, come on top.
+HOLLOW: dict[str, Profile] = {
+    "made-torus-slim": _torus(0.030, 0.006),
+    "made-torus": _torus(0.026, 0.010),
+    "made-torus-thick": _torus(0.024, 0.014),
+    "made-torus-large": _torus(0.034, 0.011),
+    "made-ring-flat": _tube(0.035, 0.020, 0.010),
+    "made-ring": _tube(0.033, 0.022, 0.020),
+    "made-ring-narrow": _tube(0.024, 0.010, 0.016),
+    "made-tube": _tube(0.020, 0.015, 0.060),
+    "made-tube-wide": _tube(0.030, 0.025, 0.045),
+    "made-bowl": _bowl(0.038, 0.030, 0.004),
+    "made-bowl-flat": _bowl(0.042, 0.018, 0.004),
+    "made-bowl-deep": _bowl(0.030, 0.038, 0.005),
+    "made-cup": _cup(0.020, 0.028, 0.060, 0.003),
+    "made-cup-low": _cup(0.028, 0.034, 0.035, 0.004),
+}
+HOLLOW_NAMES = tuple(HOLLOW)
+DRAWN_NAMES = tuple(f"made-drawn-{index:03d}" for index in range(NUM_DRAWN))

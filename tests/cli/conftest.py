@@ -1,0 +1,66 @@
+"""Commands, and one result of each kind that several tests look at."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from edgegrasp_cli.main import app
+
+Command = Callable[..., str]
+
+
+@pytest.fixture(scope="session")
+def run() -> Command:
+    """Run a command that succeeds; gives what it prints."""
+
+    def run(*words: object) -> str:
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def refused() -> Command:
+    """Run a command that ends with a message; gives the message."""
+
+    def refused(*words: object) -> str:
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert result.exit_code == 1, result.output
+        return result.output
+
+    return refused
+
+
+@pytest.fixture(scope="session")
+def benchmark(run: Command) -> Callable[..., dict[str, Any]]:
+    """A small benchmark of packed scenes; gives its summary."""
+
+    def benchmark(folder: Path, planner: str, *flags: object, rounds: int = 2) -> dict[str, Any]:
+        where = ("--scene", "packed", "--seed", 0, "--workers", 1, "--output", folder)
+        asked = ("--planner", planner, "--rounds", rounds, "--no-report")
+        run("benchmark", *where, *asked, *flags)
+        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+        return summary
+
+    return benchmark
+
+
+@pytest.fixture(scope="session")
+def oracle(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("oracle")
+    benchmark(folder, "oracle", "--num-approach-points", 16, "--num-candidates", 200)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def edge_sample(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without a model, over the same scenes as the oracle, with a report."""
+    folder = tmp_path_factory.mktemp("edge_sample")
+    benchmark(folder, "edge-sample", "--report")
+    return folder

@@ -1,0 +1,51 @@
+"""Straightforward NumPy versions of the compiled loops, which the kernels are tested against."""
+
+import itertools
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+def in_hand(points: np.ndarray, T_cloud_hand: np.ndarray) -> np.ndarray:
+    """Points (N, 3) in the frames of hands (E, 4, 4).  # (E, N, 3)."""
+    shifted = points.astype(np.float64) - T_cloud_hand[:, None, :3, 3]
+    return shifted @ T_cloud_hand[:, :3, :3].astype(np.float64)
+
+
+def points_in_hand_boxes(
+    points: np.ndarray, T_cloud_hand: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Hand (P,), row (P,) and position (P, 3) of the points between two corners of hand frames."""
+    position = in_hand(points, T_cloud_hand)
+    hand, row = np.nonzero(((position > low) & (position < high)).all(axis=2))
+    return hand, row, position[hand, row]
+
+
+def any_point_in_boxes(
+    points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
+) -> np.ndarray:
+    """Which hands (E,) have a point in one of their boxes (B, 2, 3)."""
+    position = in_hand(points, T_cloud_hand)[:, :, None]  # (E, N, 1, 3)
+    inside = ((position > boxes[:, 0]) & (position < boxes[:, 1])).all(axis=3)
+    return inside.any(axis=(1, 2))
+
+
+def signed_distance_to_boxes(
+    points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
+) -> np.ndarray:
+    """Least signed distance (E,) of points to the boxes (B, 2, 3) of each hand."""
+    position = in_hand(points, T_cloud_hand)[:, :, None]  # (E, N, 1, 3)
+    beyond = np.maximum(boxes[:, 0] - position, position - boxes[:, 1])
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=3)
+    return np.where(outside > 0, outside, beyond.max(axis=3)).min(axis=(1, 2))
+
+
+def nearest_in_groups(points: np.ndarray, bounds: np.ndarray, k: int) -> np.ndarray:
+    """The k nearest (P, k) of the same group; the own row where there are fewer."""
+    nearest = np.repeat(np.arange(len(points))[:, None], k, axis=1)
+    for start, stop in itertools.pairwise(bounds.tolist()):
+        if stop > start:
+            _, rows = cKDTree(points[start:stop]).query(points[start:stop], k=range(1, k + 1))
+            known = rows < stop - start
+            nearest[start:stop] = np.where(known, rows + start, nearest[start:stop])
+    return nearest

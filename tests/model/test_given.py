@@ -1,0 +1,172 @@
+"""Edges and hand poses that a caller gives."""
+
+import numpy as np
+import pytest
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.given import FLIP
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import NoGrasp
+from edgegrasp_model.scene.cloud import CloudInput
+
+from .scenes import PANDA, box_on_table, detector
+
+ASKED = {
+    "viewpoint": (0.3, 0.2, 0.5),
+    "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.0},
+    "num_approach_points": 12,
+    "suppression": None,
+    "top_k": 300,
+    "collision": "penalise",
+}
+
+
+def ask(**fields: object) -> DetectOptions:
+    return DetectOptions.model_validate(ASKED | fields)
+
+
+def row_of(cloud: np.ndarray, point: np.ndarray) -> int:
+    return int(np.linalg.norm(cloud - point, axis=1).argmin())
+
+
+def test_edges_of_detected_grasps_get_the_scores_they_were_detected_with() -> None:
+    cloud = box_on_table()
+    found = detector().detect(cloud, ask())
+    edges = np.array(
+        [[row_of(cloud, g.approach_point), row_of(cloud, g.contact_point)] for g in found.grasps]
+    )
+    scored = detector().score(cloud, ask(), edges=edges)
+    assert len(scored.evaluations) == len(found.grasps)
+    same = 0
+    for mine, theirs in zip(scored.evaluations, found.grasps, strict=True):
+        if mine.grasp is None or not np.allclose(
+            mine.grasp.T_cloud_hand, theirs.T_cloud_hand, atol=1e-5
+        ):
+            continue  # a level grasp, or a row that went into a neighbouring voxel
+        same += 1
+        np.testing.assert_allclose(mine.grasp.score, theirs.score, atol=1e-5)
+        np.testing.assert_allclose(mine.grasp.clearance, theirs.clearance, atol=1e-6)
+        np.testing.assert_allclose(mine.grasp.width, theirs.width, atol=1e-6)
+        np.testing.assert_array_equal(mine.grasp.contact_point, theirs.contact_point)
+        assert mine.grasp.collision_free == theirs.collision_free
+    assert same > 0.5 * len(found.grasps)
+
+
+def test_answers_keep_the_order_of_the_edges_and_say_why_there_is_no_grasp() -> None:
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-0.1, 0.1, (4000, 3)) * (1, 1, 0)
+    edge = np.array([[0.001, 0.0, 0.0]])
+    cloud = np.concatenate([flat, edge, [[0.0, 0.0, -0.5]]]).astype(np.float32)
+
+    def row(x: float, y: float) -> int:
+        return row_of(cloud, np.array([x, y, 0.0]))
+
+    origin, near, far = row(0, 0), row(0.02, 0), row(0.06, 0)
+    asked = [[origin, origin], [origin, far], [origin, near], [origin, 4001], [near, origin]]
+    outside = {"min": (-1, -1, -0.1), "max": (1, 1, 1)}
+    answer = detector().score(cloud, ask(support=None, workspace=outside), edges=np.array(asked))
+    reasons = [NoGrasp.TOO_SHORT, NoGrasp.TOO_LONG, None, NoGrasp.NO_POINT, None]
+    assert [each.reason for each in answer.evaluations] == reasons
+    assert [each.grasp is None for each in answer.evaluations] == [True, True, False, True, False]
+    one, other = answer.evaluations[2].grasp, answer.evaluations[4].grasp
+    # The hand moves from p_a to p_c, along the sheet.
+    assert one.approach_direction[0] > 0.9
+    assert other.approach_direction[0] < -0.9
+    np.testing.assert_array_equal(one.approach_point, other.contact_point)
+    assert answer.counts["given"] == 5
+    assert answer.counts["scored"] == 2
+
+
+def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> None:
+    rng = np.random.default_rng(0)
+    lower = rng.uniform(-0.05, 0.05, (3000, 3)) * (1, 1, 0)
+    normals = np.concatenate([np.tile([0.0, 0, 1], (3000, 1)), np.tile([0.0, 1, 0], (3000, 1))])
+    cloud = np.concatenate([lower, lower + np.array([0, 0, 0.03])]).astype(np.float32)
+    a = row_of(cloud, np.array([0, 0, 0.03]))
+    c = int(a - 3000)
+    sent = CloudInput(cloud, normals=normals)
+    # The voxels of both sheets are the same ones but for their height: the edge is vertical.
+    both = detector().score(sent, ask(support=None), edges=np.array([[a, c], [c, a]]))
+    assert both.evaluations[0].reason == NoGrasp.NO_DIRECTION
+    assert both.evaluations[1].grasp is not None
+    short = {
+        "max_opening": PANDA.max_opening,
+        "tip_z": PANDA.palm_z + 0.02,
+        "contact_z": PANDA.palm_z + 0.015,
+        "tcp_z": 0.1,
+        "hand": {"boxes": PANDA.hand_boxes},
+        "finger": {"boxes": [[[-0.01, 0, 0.05], [0.01, 0.02, PANDA.palm_z + 0.02]]]},
+    }
+    deep = detector().score(sent, ask(support=None, gripper=short), edges=np.array([[c, a]]))
+    assert deep.evaluations[0].reason == NoGrasp.TOO_DEEP
+
+
+def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
+    cloud = box_on_table()
+    found = detector().detect(cloud, ask(collision="avoid"))
+    poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
+    scored = detector().score(cloud, ask(), hand_poses=poses)
+    assert len(scored.evaluations) == len(poses) > 20
+    near = 0
+    for pose, theirs, mine in zip(poses, found.grasps, scored.evaluations, strict=True):
+        assert mine.grasp is not None
+        np.testing.assert_allclose(mine.grasp.T_cloud_hand, pose, atol=1e-5)
+        np.testing.assert_allclose(mine.grasp.clearance, theirs.clearance, atol=1e-5)
+        assert mine.grasp.collision_free
+        near += np.linalg.norm(mine.grasp.contact_point - theirs.contact_point) < 0.012
+        contact = (mine.grasp.contact_point - pose[:3, 3]) @ pose[:3, :3]
+        assert abs(contact[0]) < PANDA.pad_half_width
+        assert abs(contact[1]) < PANDA.max_opening / 2
+    assert near > 0.8 * len(poses)
+    flipped = detector().score(cloud, ask(), hand_poses=poses @ FLIP)
+    for one, other in zip(scored.evaluations, flipped.evaluations, strict=True):
+        np.testing.assert_allclose(one.grasp.score, other.grasp.score, atol=1e-3)
+        np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
+
+
+def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_said_to_collide() -> None:
+    poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (2, 1, 1))
+    poses[0, :3, 3] = 1.0
+    poses[1, 2, 3] = 0.1  # the tips below the table, the palm in the box
+    air, box = detector().score(box_on_table(500), ask(), hand_poses=poses).evaluations
+    assert air.reason == NoGrasp.NOTHING_BETWEEN
+    assert box.grasp is not None
+    assert not box.grasp.collision_free
+    assert box.grasp.clearance < 0
+
+
+def test_a_cloud_that_is_cropped_away_answers_for_every_edge() -> None:
+    nowhere = ask(workspace={"min": (5, 5, 5), "max": (6, 6, 6)})
+    answer = detector().score(box_on_table(500), nowhere, edges=np.array([[0, 1], [2, 3]]))
+    assert [each.reason for each in answer.evaluations] == [NoGrasp.NO_POINT] * 2
+
+
+GOOD = np.eye(4)[None]
+
+
+@pytest.mark.parametrize(
+    ("given", "field", "value"),
+    [
+        ({}, "edges", "neither"),
+        ({"edges": np.array([[0, 1]]), "hand_poses": GOOD}, "edges", "and hand_poses"),
+        ({"edges": [[0, 1]]}, "edges", "a list"),
+        ({"edges": np.array([[0.0, 1.0]])}, "edges", "dtype float64"),
+        ({"edges": np.array([[0, 1, 2]])}, "edges", "shape (1, 3)"),
+        ({"edges": np.empty((0, 2), int)}, "edges", "0 of them"),
+        ({"edges": np.zeros((16_001, 2), int)}, "edges", "16001 of them"),
+        ({"edges": np.array([[0, 1500]])}, "edges", "row 1500"),
+        ({"edges": np.array([[-1, 0]])}, "edges", "row -1"),
+        ({"hand_poses": np.eye(4)}, "hand_poses", "shape (4, 4)"),
+        ({"hand_poses": GOOD.tolist()}, "hand_poses", "a list"),
+        ({"hand_poses": GOOD * 2}, "hand_poses", "pose 0"),
+        ({"hand_poses": np.concatenate([GOOD, GOOD * np.nan])}, "hand_poses", "pose 1"),
+        ({"hand_poses": GOOD @ np.diag([1, 1, -1, 1])}, "hand_poses", "pose 0"),
+    ],
+)
+def test_what_is_no_edge_and_no_pose_is_refused(
+    given: dict[str, object], field: str, value: str
+) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        detector().score(box_on_table(500), ask(), **given)
+    assert caught.value.field == field
+    assert value in caught.value.value

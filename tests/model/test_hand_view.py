@@ -1,0 +1,240 @@
+"""What a hand sees of the cloud in its own frame, and the network that scores it by that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
+from edgegrasp_model.gripper import gripper_names, load_gripper
+from edgegrasp_model.hand_description import (
+    BEHIND,
+    DEEP,
+    HAND_DESCRIPTION_SIZE,
+    DepthMap,
+    describe_hands,
+    occlusion_fractions,
+    probes,
+    without_support,
+)
+from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import HAND, NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import Cloud
+
+from .scenes import PANDA, SEED, TINY, random_hands
+
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
+CAMERA = np.array([0.3, 0.2, 0.5], dtype=np.float32)
+ABOVE = np.array([0.0, 0.0, 0.6], dtype=np.float32)
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+
+
+def scene(seed: int) -> tuple[Cloud, Candidates]:
+    """A cloud with edge grasps of 60 random pairs."""
+    rng = np.random.default_rng(seed)
+    points = (rng.uniform(-0.5, 0.5, (150, 3)) * (0.06, 0.05, 0.07)).astype(np.float32)
+    cloud = Cloud(points, points / np.linalg.norm(points, axis=1, keepdims=True))
+    return cloud, edge_grasps(cloud, *rng.integers(150, size=(2, 60)), PANDA)
+
+
+def plane(up: np.ndarray, offset: float) -> SupportPlane:
+    return SupportPlane(normal=tuple(up.tolist()), offset=offset)
+
+
+def look(
+    cloud: Cloud,
+    candidates: Candidates,
+    camera: np.ndarray | None = CAMERA,
+    support: SupportPlane | None = None,
+    limit: int = 400,
+) -> HandBatch:
+    support = support or plane(UP, -0.05)
+    up = np.array(support.normal, dtype=np.float32)
+    return HandBatch.from_cloud(cloud, candidates, PANDA, up, support, camera, None, limit)
+
+
+def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
+    with torch.inference_mode():
+        return build_network(config).eval()(batch)
+
+
+def test_views_of_some_hands_are_those_of_all_taken() -> None:
+    points = np.random.default_rng(0).uniform(-0.1, 0.15, (300, 3)).astype(np.float32)
+    cloud, hands, rows = Cloud(points, points), random_hands(9, 0, 0.05), np.array([1, 4, 8])
+    taken = hand_views(cloud, hands, reach_of(PANDA)).take(rows)
+    direct = hand_views(cloud, hands[rows], reach_of(PANDA))
+    np.testing.assert_array_equal(taken.candidate, direct.candidate)
+    np.testing.assert_array_equal(taken.row, direct.row)
+    np.testing.assert_allclose(taken.position, direct.position, atol=1e-6)
+
+
+def test_points_are_those_between_and_around_the_fingers() -> None:
+    cloud, candidates = scene(0)
+    batch = look(cloud, candidates, camera=None)
+    turn, shift = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
+    seen = np.einsum("end,edk->enk", cloud.points - shift[:, None], turn)  # (E, N, 3)
+    seen[:, :, 2] -= PANDA.tip_z
+    inside = (np.abs(seen) < (0.0375, 0.1, np.inf)).all(axis=2)
+    inside &= (seen[:, :, 2] > PANDA.palm_z - 0.026 - PANDA.tip_z) & (seen[:, :, 2] < 0.012)
+    # Points within rounding of the region's edge may fall on its other side.
+    assert (np.abs(batch.point_count.numpy() - inside.sum(axis=1)) <= 1).all()
+    for hand in np.flatnonzero(batch.point_count.numpy() == inside.sum(axis=1)):
+        count = int(batch.point_count[hand])
+        normal = cloud.normals[inside[hand]] @ turn[hand]
+        expected = np.hstack([seen[hand][inside[hand]], normal])
+        np.testing.assert_allclose(batch.points[hand, :count], expected, atol=1e-5)
+        assert (batch.points[hand, count:] == 0).all()
+
+
+def test_too_many_points_are_thinned_evenly() -> None:
+    cloud, candidates = scene(0)
+    every, some = look(cloud, candidates), look(cloud, candidates, limit=10)
+    for hand, count in enumerate(every.point_count.tolist()):
+        assert some.point_count[hand] == min(count, 10)
+        kept = np.flatnonzero(np.diff(np.arange(count + 1) * 10 // max(count, 10)))
+        kept = kept if count > 10 else np.arange(count)
+        torch.testing.assert_close(some.points[hand, : len(kept)], every.points[hand][kept])
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, SEED))
+def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(
+    mirrored: bool, seed: int
+) -> None:
+    cloud, candidates = scene(seed)
+    rng = np.random.default_rng(seed)
+    turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
+    turn = turn @ MIRROR if mirrored else turn
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return (points @ turn.T + shift).astype(np.float32)
+
+    there = Cloud(moved(cloud.points), (cloud.normals @ turn.T).astype(np.float32))
+    again = edge_grasps(there, candidates.approach_index, candidates.contact_index, PANDA)
+    support = plane(turn @ UP, float(turn @ UP @ shift) - 0.05)
+    before, after = look(cloud, candidates), look(there, again, moved(CAMERA), support)
+    assert before.description.shape[1] == HAND_DESCRIPTION_SIZE
+    # Points within rounding of a box's face may fall on its other side: rare, so count them.
+    assert np.isclose(before.description, after.description, atol=2e-3).mean() > 0.98
+    sums = [batch.points.sum(dim=1) for batch in (before, after)]  # (E, 6)
+    assert np.isclose(*sums, atol=2e-3).mean() > 0.95
+    assert np.isclose(scores(before), scores(after), atol=2e-3).mean() > 0.9
+
+
+def test_points_in_a_finger_and_between_the_fingers_are_counted() -> None:
+    # An edge along -z from p_a, the contact on its -y side: the hand looks down, y closing.
+    points = np.array(
+        [[0, 0, 0.02], [0, 0.01, 0.0], [0, -0.01, 0.0], [0, 0.05, 0.0], [0, 0.3, 0]], np.float32
+    )
+    normals = np.array([[0, 0, 1], [0, 1, 0], [0, -1, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    cloud = Cloud(points, normals)
+    grasp = edge_grasps(cloud, np.array([0]), np.array([1]), PANDA)
+    row = describe_hands(cloud, grasp, PANDA, UP, plane(UP, -0.02))[0]
+    in_fingers, between, depth, contact_height = row[0:2], row[7], row[53], row[59]
+    np.testing.assert_allclose(sorted(in_fingers), [0.0, np.log(2)], atol=1e-6)
+    np.testing.assert_allclose(between, np.log(4), atol=1e-6)  # p_a and both sides
+    np.testing.assert_allclose(depth, 0.02, atol=1e-6)
+    np.testing.assert_allclose(contact_height, 0.02, atol=1e-6)
+
+
+def test_without_a_support_plane_heights_are_the_same_stand_in() -> None:
+    cloud, candidates = scene(0)
+    described = describe_hands(cloud, candidates, PANDA, UP, None)
+    assert (described[:, -3:] == np.float32(0.10)).all()
+    known = describe_hands(cloud, candidates, PANDA, UP, plane(UP, -0.03))
+    assert not np.array_equal(known, described)
+    np.testing.assert_array_equal(without_support(known), described)
+
+
+def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
+    batch = look(*scene(3))
+    draws = torch.rand(batch.points.shape[:2], generator=torch.Generator().manual_seed(1))
+    order = draws.argsort(dim=1)
+    there = torch.arange(400) < batch.point_count[:, None]
+    order = order.gather(1, (~there.gather(1, order)).int().argsort(dim=1, stable=True))
+    shuffled = replace(batch, points=batch.points.gather(1, order[:, :, None].expand(-1, -1, 6)))
+    assert not torch.equal(shuffled.points, batch.points)
+    torch.testing.assert_close(scores(shuffled), scores(batch), atol=1e-5, rtol=1e-4)
+    filled = batch.points.clone()
+    filled[~there] = 7.0
+    torch.testing.assert_close(scores(replace(batch, points=filled)), scores(batch))
+    nothing = replace(batch, point_count=torch.zeros_like(batch.point_count))
+    assert scores(nothing).isfinite().all()
+
+
+def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> None:
+    batch = look(*scene(0))
+    together = scores(batch, HAND)
+    for rows in (slice(1), slice(3), slice(20, 37), slice(None, None, 2)):
+        parts = batch.description[rows], batch.points[rows], batch.point_count[rows]
+        assert torch.equal(scores(HandBatch(*parts), HAND), together[rows])
+
+
+def test_the_description_is_standardised_within() -> None:
+    batch = look(*scene(5))
+    plain = scores(batch)
+    network = build_network(TINY["hand"]).eval()
+    size = HAND_DESCRIPTION_SIZE
+    mean, std = torch.linspace(-3, 3, size), torch.linspace(0.5, 4, size)
+    network.set_statistics(mean, std)
+    shifted = replace(batch, description=batch.description * std + mean)
+    with torch.inference_mode():
+        torch.testing.assert_close(network(shifted), plain, atol=1e-4, rtol=1e-4)
+        network.set_statistics(mean, torch.zeros(size))  # numbers that never change
+        assert network(shifted).isfinite().all()
+
+
+def plate(spacing: float = 0.004) -> np.ndarray:
+    """A level plate of 0.1 m in the middle, at a height of 0.1 m, as a cloud.  # (N, 3)."""
+    steps = np.arange(-0.05, 0.05, spacing)
+    x, y = np.meshgrid(steps, steps)
+    return np.stack([x, y, np.full_like(x, 0.1)], axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+@pytest.mark.parametrize("exactly_above", [False, True])
+def test_only_what_is_behind_the_plate_is_hidden(exactly_above: bool) -> None:
+    camera = plate().mean(axis=0) + UP / 2 if exactly_above else ABOVE
+    seen = DepthMap.of_cloud(plate(), camera, UP)
+    places = np.array(
+        [[0, 0, 0.15], [0, 0, 0.1], [0.02, -0.03, 0.0], [0.09, 0, 0.0], [0, 0, -3.0], [3, 0, 0.1]]
+    )
+    hidden = seen.hidden(places.astype(np.float32))
+    np.testing.assert_array_equal(hidden, [0, 0, 1, 0, 1, 0])
+
+
+def test_what_is_just_behind_is_hidden_by_degrees() -> None:
+    seen = DepthMap.of_cloud(plate(), ABOVE, UP)
+    depth = np.array([BEHIND / 2, BEHIND + DEEP / 2, BEHIND + 2 * DEEP], dtype=np.float32)
+    places = np.stack([0 * depth, 0 * depth, 0.1 - depth], axis=1)
+    np.testing.assert_allclose(seen.hidden(places), [0.0, 0.5, 1.0], atol=0.02)
+
+
+def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
+    # A hand from the side, its fingers above and below the plate: y, the closing direction, is up.
+    hand = np.eye(4, dtype=np.float32)
+    hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    hand[:3, 3] = [-0.1, 0.0, 0.1]
+    parts = occlusion_fractions(plate(), hand[None], ABOVE, UP, PANDA)
+    above, below = parts[0][0], parts[1][0]
+    assert above == 0.0
+    assert below > 0.9
+    unknown = occlusion_fractions(plate(), hand[None], None, UP, PANDA)
+    assert len(unknown) == len(parts)
+    assert not np.any(unknown)
+
+
+@pytest.mark.parametrize("name", gripper_names())
+def test_probes_lie_where_they_are_said_to(name: str) -> None:
+    gripper = load_gripper(name)
+    tips_right, tips_left, *_, hand = probes(gripper)
+    assert (tips_right[:, 1] > gripper.max_opening / 2).all()
+    np.testing.assert_allclose(tips_left * (1, -1, 1), tips_right, atol=1e-7)
+    assert (hand[:, 2] < gripper.tip_z).all()

@@ -1,0 +1,35 @@
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.simulation import ClutterSimulation
+
+
+@pytest.fixture(scope="session")
+def _simulation() -> Iterator[ClutterSimulation]:
+    with ClutterSimulation() as simulation:
+        yield simulation
+
+
+@pytest.fixture
+def simulation(_simulation: ClutterSimulation) -> ClutterSimulation:
+    """A simulation that all tests share, with its settings as they are at first."""
+    _simulation.start_contact_fails = False
+    _simulation.world.on_step = None
+    return _simulation
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    with World() as world:
+        yield world
+
+
+@pytest.fixture(scope="session")
+def paper_with() -> Callable[[int], Protocol]:
+    """Makes the paper's protocol with so many objects in a scene."""
+    paper = load_protocol("edgegrasp")
+    return lambda number: replace(paper, scene=replace(paper.scene, num_objects=(number,)))

@@ -1,0 +1,215 @@
+"""A round of clutter removal, and what a person sees of it."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from edgegrasp_sim import trial, window
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
+from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.results import attempts_digest
+from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.top_down import plan_top_down
+from edgegrasp_sim.trial import (
+    PlannedGrasp,
+    Planner,
+    PlannerUnavailableError,
+    Round,
+    RoundDriver,
+    RoundEnd,
+    run_round,
+)
+from edgegrasp_sim.window import Window
+
+MakeProtocol = Callable[[int], Protocol]
+PACKED, PILE = SceneKind
+IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
+IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)
+
+
+@pytest.fixture
+def run(simulation: ClutterSimulation, paper_with: MakeProtocol) -> Callable[..., Round]:
+    """Runs a round with so many objects."""
+
+    def run(
+        planner: Planner,
+        scene: SceneKind,
+        number: int,
+        seed: int = 0,
+        index: int = 0,
+        **more: object,
+    ) -> Round:
+        rules = paper_with(number)
+        return run_round(simulation, planner, scene, rules, seed=seed, index=index, **more)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def cubes() -> Iterator[ClutterSimulation]:
+    with ClutterSimulation(
+        {PACKED: ObjectSet("cubes", ObjectSet.builtin(PACKED).models[:1])}
+    ) as simulation:
+        yield simulation
+
+
+def test_top_down_grasps_clear_a_scene_of_cubes(
+    cubes: ClutterSimulation, paper_with: MakeProtocol
+) -> None:
+    done = run_round(cubes, plan_top_down, PACKED, paper_with(3), seed=0, index=0)
+    assert done.end is RoundEnd.CLEARED
+    assert done.successes == len(done.objects) == 3
+    for attempt in done.attempts:
+        assert attempt.object == ("cube" if attempt.outcome is GraspOutcome.SUCCESS else None)
+
+
+@pytest.mark.parametrize("scene", SceneKind)
+def test_top_down_grasps_find_builtin_objects(run: Callable[..., Round], scene: SceneKind) -> None:
+    rounds = [run(plan_top_down, scene, 5, index=index) for index in range(2)]
+    objects = sum(len(done.objects) for done in rounds)
+    assert objects >= 6
+    assert sum(done.successes for done in rounds) >= 0.3 * objects
+
+
+def test_two_failures_in_a_row_end_a_round(run: Callable[..., Round]) -> None:
+    done = run(lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
+    assert done.end is RoundEnd.FAILURES
+    found = [(attempt.outcome, attempt.cause, attempt.target) for attempt in done.attempts]
+    assert found == [(GraspOutcome.AFTER, FailureCause.MISSED, None)] * 2
+
+
+def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Round]) -> None:
+    clouds: list[int] = []
+    seeds: list[int] = []
+
+    def planner(seen: Observation, seed: int) -> None:
+        clouds.append(len(seen.cloud))
+        seeds.append(seed)
+
+    done = run(planner, PACKED, 2)
+    assert done.end is RoundEnd.NO_GRASP
+    assert (done.attempts, done.no_grasp) == ((), 3)
+    assert len(set(seeds)) == 3
+    assert len(set(clouds)) == 3  # a new view every time
+
+
+def test_scenes_and_views_do_not_depend_on_the_planner(
+    run: Callable[..., Round], paper_with: MakeProtocol
+) -> None:
+    first_clouds = []
+
+    def keep_first(seen: Observation, seed: int) -> PlannedGrasp:
+        first_clouds.append(seen.cloud)
+        return PlannedGrasp(IN_THE_AIR, 1.0, 0.04)
+
+    run(plan_top_down, PILE, 2, seed=4, index=0)
+    run(keep_first, PILE, 2, seed=4, index=1)
+    with ClutterSimulation() as other:
+        run_round(other, keep_first, PILE, paper_with(2), seed=4, index=1)
+    assert np.array_equal(first_clouds[0], first_clouds[2])
+
+
+def test_a_round_repeats_exactly(run: Callable[..., Round]) -> None:
+    first = run(plan_top_down, PILE, 3, index=2)
+    run(plan_top_down, PACKED, 1)
+    again = run(plan_top_down, PILE, 3, index=2)
+    other = run(plan_top_down, PILE, 3, seed=1, index=2)
+    assert attempts_digest([first]) == attempts_digest([again]) != attempts_digest([other])
+    with pytest.raises(ValueError, match="seed is -1"):
+        run(plan_top_down, PILE, 3, seed=-1)
+
+
+def test_an_unavailable_planner_is_asked_again_and_changes_nothing(
+    run: Callable[..., Round], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "FIRST_WAIT", 0.001)
+    asked = 0
+
+    def away_at_times(seen: Observation, seed: int) -> PlannedGrasp | None:
+        nonlocal asked
+        asked += 1
+        if asked % 3:
+            raise PlannerUnavailableError("restarting")
+        return plan_top_down(seen, seed)
+
+    calm = run(plan_top_down, PACKED, 2)
+    interrupted = run(away_at_times, PACKED, 2)
+    assert attempts_digest([calm]) == attempts_digest([interrupted])
+    assert calm.retries == 0
+    assert interrupted.retries == 2 * len(interrupted.attempts)
+    assert interrupted.waited_seconds > 0
+
+
+def test_patience_with_an_unavailable_planner_ends(run: Callable[..., Round]) -> None:
+    def away(seen: Observation, seed: int) -> None:
+        raise PlannerUnavailableError("gone for good")
+
+    with pytest.raises(PlannerUnavailableError, match="gone for good"):
+        run(away, PACKED, 1, patience=0.0)
+
+
+def test_a_planner_may_try_grasps_in_the_scene(run: Callable[..., Round]) -> None:
+    class Careful:
+        """Only executes what held when tried."""
+
+        def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
+            self.try_grasp = try_grasp
+
+        def __call__(self, seen: Observation, seed: int) -> PlannedGrasp | None:
+            grasp = plan_top_down(seen, seed)
+            holds = grasp is not None and self.try_grasp(grasp.T_world_hand).success
+            return grasp if holds else None
+
+    done = run(Careful(), PACKED, 3)
+    assert done.attempts
+    assert done.successes == len(done.attempts)
+
+
+def test_a_round_can_be_driven_by_hand(cubes: ClutterSimulation, paper_with: MakeProtocol) -> None:
+    driver = RoundDriver(cubes, PACKED, paper_with(1), seed=0, index=0)
+    grasp = driver.plan(plan_top_down, driver.look())
+    assert grasp is not None
+    attempt = driver.execute(grasp)
+    assert attempt.success
+    assert attempt.target == attempt.object == "cube"
+    assert driver.end is RoundEnd.CLEARED
+    assert driver.result().attempts == (attempt,)
+
+
+@pytest.mark.parametrize("name", ["giga", "vgn", "robot"])
+def test_other_protocols_run(simulation: ClutterSimulation, name: str) -> None:
+    rules = load_protocol(name)
+    driver = RoundDriver(simulation, PACKED, rules, seed=0, index=0)
+    seen = driver.look()
+    assert len(seen.camera_positions) == rules.camera.views
+    assert set(seen.view_ids) == set(range(rules.camera.views))
+    on_table = np.abs(seen.cloud[:, 2] - seen.table_height) < 0.003
+    assert (on_table.mean() > 0.3) == (name == "robot")
+
+
+def test_a_watched_round_is_the_same(
+    run: Callable[..., Round], simulation: ClutterSimulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(window, "SHOW_SECONDS", 0.0)
+    monkeypatch.setattr(window, "TIME_STEP", 0.0)
+    drawn: list[np.ndarray] = []  # there is no window to draw in
+    monkeypatch.setattr(World, "draw_lines", lambda world, lines, colour: drawn.append(lines))
+    plain = run(plan_top_down, PACKED, 2)
+    watched = run(plan_top_down, PACKED, 2, on_grasp=Window(simulation.world).show)
+    assert attempts_digest([plain]) == attempts_digest([watched])
+    assert [lines.shape for lines in drawn] == [(4, 2, 3)] * len(plain.attempts)
+
+
+def test_the_space_bar_pauses_and_resumes(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    presses = iter([True, False, False, True, False])
+    shown = Window(world)
+    monkeypatch.setattr(World, "space_pressed", lambda world: next(presses))
+    world.step()  # goes on after the second press
+    assert not shown.paused
+    world.step()
+    assert next(presses, None) is None

@@ -1,0 +1,158 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.networks.config import NetworkConfig
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.scene.scene import near_workspace_side
+from edgegrasp_training.examples import (
+    SUPPORT,
+    UP,
+    WORKSPACE,
+    TriedGrasps,
+    pack_balls,
+    pack_hands,
+    random_turn,
+    tried_grasps,
+    turned,
+)
+from edgegrasp_training.recipes import LENGTH_UNIT
+from edgegrasp_training.views import LabelledView
+
+MakeView = Callable[[int], LabelledView]
+Networks = dict[str, NetworkConfig]
+
+
+@pytest.fixture
+def balls(networks: Networks) -> NetworkConfig:
+    return networks["balls"]
+
+
+@pytest.fixture
+def hands(networks: Networks) -> NetworkConfig:
+    return networks["hands"]
+
+
+def grasps_of(view: LabelledView, config: NetworkConfig, *, camera: bool = True) -> TriedGrasps:
+    return tried_grasps(view, config, load_gripper(), viewpoint_known=camera)
+
+
+def test_packed_balls_hold_each_tried_grasp_and_its_contact(
+    made_up_view: MakeView, balls: NetworkConfig
+) -> None:
+    view = made_up_view(1)
+    grasps = grasps_of(view, balls)
+    batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
+    assert len(label) == len(grasps.label) == len(batch.contact)
+    assert (weight == 1).all()
+    contact = grasps.cloud.points[grasps.candidates.contact_index]
+    edge = contact - grasps.cloud.points[grasps.candidates.approach_index]
+    found = batch.points[batch.contact].numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(found, edge @ grasps.turn.T, atol=1e-6)
+    depth = batch.depth.numpy() * LENGTH_UNIT
+    np.testing.assert_allclose(depth, grasps.candidates.depth, atol=1e-6)
+    some = pack_balls(grasps, grasps.balls()[:2], balls)
+    assert some.batch.num_balls == 2
+    assert 0 < len(some.label) < len(label)
+
+
+def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(
+    made_up_view: MakeView, balls: NetworkConfig
+) -> None:
+    view = replace(made_up_view(1), camera_position=np.array([0.5, -0.3, 0.6], np.float32))
+    grasps = grasps_of(view, balls)
+    np.testing.assert_allclose(grasps.turn @ grasps.turn.T, np.eye(3), atol=1e-6)
+    toward_camera = grasps.turn @ (view.camera_position - view.points.mean(axis=0))
+    assert toward_camera[0] > 0.5
+    assert toward_camera[1] == pytest.approx(0, abs=1e-5)
+    assert (grasps.turn @ UP)[2] == pytest.approx(1)
+
+
+def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
+    made_up_view: MakeView, hands: NetworkConfig
+) -> None:
+    view = made_up_view(1)
+    grasps = grasps_of(view, hands)
+    batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
+    rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
+    np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
+    assert batch.num_balls == 2
+    exact = HandBatch.from_cloud(
+        grasps.cloud,
+        grasps.candidates.take(rows),
+        load_gripper(),
+        UP,
+        SUPPORT,
+        view.camera_position,
+        near_workspace_side(view.points, WORKSPACE, UP),
+        hands.hand_points,
+    )
+    torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
+    torch.testing.assert_close(batch.point_count, exact.point_count)
+    varied = pack_hands(grasps, grasps.balls()[:2], hands, np.random.default_rng(0)).batch
+    assert not torch.equal(varied.points, batch.points)
+    there = torch.arange(hands.hand_points) < varied.point_count[:, None]
+    assert (varied.points[there].abs().sum(dim=1) > 0).all()
+    assert (varied.points[~there] == 0).all()
+
+
+def test_a_hand_whose_camera_is_not_known_is_told_of_none(
+    made_up_view: MakeView, hands: NetworkConfig
+) -> None:
+    view = made_up_view(1)
+    known = grasps_of(view, hands).seen
+    unknown = grasps_of(view, hands, camera=False).seen
+    assert known is not None
+    assert unknown is not None
+    changed = (known.description != unknown.description).any(axis=0)
+    camera = slice(-8 - 6, -8 - 3)  # before the direction of up and the eight of the stance
+    assert changed[camera].all()
+    assert (unknown.description[:, camera] == 0).all()
+
+
+def test_augmentation_turns_points_normals_and_approach_alike(
+    made_up_view: MakeView, balls: NetworkConfig
+) -> None:
+    grasps = grasps_of(made_up_view(2), balls)
+    batch = pack_balls(grasps, grasps.balls(), balls).batch
+    other = turned(batch, random_turn("any", np.random.default_rng(0)))
+    assert not torch.allclose(batch.points, other.points)
+    lengths, cosines = batch.points.norm(dim=1), (batch.points * batch.normals).sum(dim=1)
+    torch.testing.assert_close(other.points.norm(dim=1), lengths, atol=1e-5, rtol=1e-4)
+    other_cosines = (other.points * other.normals).sum(dim=1)
+    torch.testing.assert_close(other_cosines, cosines, atol=1e-4, rtol=1e-4)
+    along = (batch.points[batch.contact] * batch.approach).sum(dim=1)
+    along_other = (other.points[other.contact] * other.approach).sum(dim=1)
+    torch.testing.assert_close(along, along_other, atol=1e-4, rtol=1e-4)
+
+
+def test_random_turns_are_any_or_upright_or_none() -> None:
+    rng = np.random.default_rng(0)
+    turns = {kind: [random_turn(kind, rng) for _ in range(50)] for kind in ("any", "upright")}
+    for turn in turns["any"] + turns["upright"]:
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+    raised = {kind: [(turn @ UP)[2] for turn in some] for kind, some in turns.items()}
+    assert min(raised["any"]) < -0.5
+    assert max(raised["any"]) > 0.5
+    np.testing.assert_allclose(raised["upright"], 1.0, atol=1e-6)
+    headings = [turn[0, 0] for turn in turns["upright"]]
+    assert min(headings) < -0.5
+    assert max(headings) > 0.5
+    np.testing.assert_array_equal(random_turn("none", rng), np.eye(3))
+
+
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(
+    made_up_view: MakeView, balls: NetworkConfig
+) -> None:
+    view = made_up_view(1)
+    firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
+    shaken = grasps_of(replace(view, firm=firm.astype(np.int8)), balls).label
+    unknown = grasps_of(view, balls).label
+    assert set(shaken.tolist()) == {0.0, 1.0, np.float32(0.8)}
+    assert len(set(unknown.tolist())) == 2
+    np.testing.assert_array_equal(unknown > 0.5, shaken > 0.5)
+    assert 0.8 < unknown.max() < 1

@@ -1,0 +1,158 @@
+"""Hollow shapes, shapes drawn at random, and stretched ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edgegrasp_sim.engine import World
+from edgegrasp_sim.objects import ObjectModel, ObjectSet
+from edgegrasp_sim.scene import load_object
+from edgegrasp_training.shapes import (
+    DRAWN_NAMES,
+    HOLLOW,
+    HOLLOW_NAMES,
+    LONGEST,
+    NUM_DRAWN,
+    NUM_FREE,
+    NUM_VARIED,
+    PLAIN_HEIGHT,
+    PLAIN_WIDTH,
+    STRETCH,
+    THINNEST,
+    any_made_object,
+    drawn_shape,
+    made_object,
+    revolved,
+    stretched,
+    varied_objects,
+)
+
+
+def _surface(obj: str) -> tuple[np.ndarray, np.ndarray]:
+    rows = [line.split() for line in obj.splitlines()]
+    points = np.array([row[1:] for row in rows if row[0] == "v"], dtype=float)
+    faces = np.array([row[1:] for row in rows if row[0] == "f"], dtype=int) - 1
+    return points, faces
+
+
+def _volume(obj: str) -> float:
+    points, faces = _surface(obj)
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all(), "not closed"
+    a, b, c = points[faces].transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6)
+
+
+@pytest.mark.parametrize("name", HOLLOW)
+def test_hollow_shapes_are_closed_and_face_outwards(name: str) -> None:
+    profile = HOLLOW[name]
+    radius, height = profile[:, 0], profile[:, 1]
+    full = np.pi * radius.max() ** 2 * np.ptp(height)
+    assert 0.05 * full < _volume(revolved(profile)) < 0.9 * full
+
+
+@pytest.mark.parametrize("index", range(0, NUM_FREE, 13))
+def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
+    shape = drawn_shape(index)
+    points, _ = _surface(shape)
+    extents = np.ptp(points, axis=0)
+    assert 0.0 < _volume(shape) < 4.0 * extents.prod()  # parts overlap
+    assert extents.min() > 0.999 * THINNEST - 1e-5
+    assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
+
+
+@pytest.mark.parametrize("index", range(NUM_FREE, NUM_DRAWN, 13))
+def test_plain_shapes_are_closed_and_stand_on_a_shelf(index: int) -> None:
+    shape = drawn_shape(index)
+    width, depth, height = np.ptp(_surface(shape)[0], axis=0)
+    assert 0.4 * width * depth * height < _volume(shape) < 1.001 * width * depth * height
+    assert 0.86 * PLAIN_WIDTH[0] < min(width, depth)  # a hexagon is less wide one way
+    assert max(width, depth) < PLAIN_WIDTH[1] + 1e-5
+    assert PLAIN_HEIGHT[0] - 1e-5 < height < PLAIN_HEIGHT[1] + 1e-5
+
+
+def test_drawn_shapes_differ_and_stay_the_same() -> None:
+    assert len({drawn_shape(index) for index in range(NUM_DRAWN)}) == NUM_DRAWN
+    assert drawn_shape(7) == drawn_shape(7)
+    for index in (-1, NUM_DRAWN):
+        with pytest.raises(IndexError, match=f"{index} of {NUM_DRAWN}"):
+            drawn_shape(index)
+
+
+def test_the_digest_of_a_made_object_is_that_of_its_own_files(tmp_path: Path) -> None:
+    alone = made_object("made-torus", tmp_path / "alone").digest
+    for name in (*HOLLOW_NAMES, *DRAWN_NAMES[:3]):
+        made_object(name, tmp_path / "all")
+    assert made_object("made-torus", tmp_path / "all").digest == alone
+
+
+def test_made_objects_come_of_both_sorts(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    names = {any_made_object(tmp_path, rng).name for _ in range(30)}
+    assert names & set(HOLLOW_NAMES)
+    assert names & set(DRAWN_NAMES)
+
+
+@pytest.fixture
+def shapes(tmp_path: Path) -> tuple[ObjectModel, ...]:
+    return tuple(made_object(name, tmp_path / "shapes") for name in HOLLOW_NAMES)
+
+
+def _extents(model: ObjectModel) -> np.ndarray:
+    with World() as world:
+        body = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), 1.0).body
+        low, high = body.bounds
+        return high - low
+
+
+def test_a_stretched_object_is_longer_by_each_factor(
+    shapes: tuple[ObjectModel, ...], tmp_path: Path
+) -> None:
+    bowl = next(model for model in shapes if model.name == "made-bowl")
+    longer = stretched(bowl, (1.3, 0.8, 2.0), tmp_path / "stretched")
+    assert longer.name == "made-bowl"
+    assert longer.origin is bowl
+    margin = 0.004  # the engine's own, around every shape
+    np.testing.assert_allclose(
+        _extents(longer), _extents(bowl) * (1.3, 0.8, 2.0), atol=2 * margin, rtol=0
+    )
+    assert _extents(longer)[2] > 1.5 * _extents(bowl)[2]
+    twice = stretched(longer, (0.5, 1.0, 2.0), tmp_path / "twice")
+    assert 'scale="0.65000 0.80000 4.00000"' in twice.urdf.read_text()
+
+
+def test_objects_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "box.urdf"
+    path.write_text(
+        '<robot name="box"><link name="a"><visual><geometry><box size="1 1 1"/></geometry>'
+        "</visual></link></robot>"
+    )
+    with pytest.raises(ValueError, match=r"box\.urdf.*plain meshes"):
+        stretched(ObjectModel("box", path), (1.0, 1.0, 1.0), tmp_path)
+
+
+def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(
+    shapes: tuple[ObjectModel, ...], tmp_path: Path
+) -> None:
+    plain = ObjectSet("plain", shapes[:4])
+
+    def descriptions(folder: str, seed: int) -> dict[str, str]:
+        drawn = varied_objects(plain, tmp_path / folder, np.random.default_rng(seed))
+        assert len(drawn.models) <= NUM_VARIED
+        texts = {model.name: model.urdf.read_text() for model in drawn.models}
+        return {name: text.replace(f"/{folder}/", "/") for name, text in texts.items()}
+
+    first = descriptions("a", 1)
+    assert first == descriptions("b", 1)
+    assert first != descriptions("c", 2)
+    named = {model.name for model in plain.models}
+    assert set(first) & named
+    assert set(first) - named
+    factors = np.array(
+        [text.split('scale="')[1].split('"')[0].split() for text in first.values()], dtype=float
+    )
+    assert 1 / STRETCH <= factors.min() < 0.95
+    assert 1.05 < factors.max() <= STRETCH
+    alike = factors[:, 0] == factors[:, 1]
+    assert 0 < alike.sum() < len(factors)
