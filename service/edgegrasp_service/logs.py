@@ -1,18 +1,55 @@
 """Log records as JSON lines or text; a thread writes them, so no log can hold up a request."""
 
+import contextlib
 import json
 import logging
+import logging.handlers
 import os
 import queue
 import threading
 from datetime import UTC, datetime
 from typing import TextIO
 
-from edgegrasp_service.request_id import REQUEST_ID
+from edgegrasp_service.call import CALL, Call
 from edgegrasp_service.settings import Settings, one_line
 
-MAX_WAITING = 4096  # lines; more than that, and new ones are dropped
+MAX_WAITING = 4096  # records; more than that, and new ones are dropped
 STOP_SECONDS = 1.0
+PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
+
+requests = logging.getLogger("edgegrasp_service.requests")
+
+
+def log_call(call: Call) -> None:
+    """Write one line about a call that has ended, and another about a fault of the server."""
+    if call.facts.traceback:
+        fault = {"traceback": call.facts.traceback}
+        requests.error("%s failed with %s", call.method, call.facts.options, extra=fault)
+    level = logging.DEBUG if call.method in PROBES else logging.INFO
+    if call.problem is not None and call.problem.status >= 500:
+        level = logging.WARNING
+    if not requests.isEnabledFor(level):
+        return
+    milliseconds = {name: round(seconds * 1e3, 1) for name, seconds in call.stages.items()}
+    fields = {
+        "transport": call.transport,
+        "method": call.method,
+        "code": call.code,
+        "error": "" if call.problem is None else call.problem.kind,
+        "detail": "" if call.problem is None else call.problem.detail,
+        "seconds": round(call.seconds, 6),
+        "peer": call.peer,
+        "token": call.token,
+        "bytes_in": call.bytes_in,
+        "bytes_out": call.bytes_out,
+        "model": call.facts.model,
+        "points": call.facts.points,
+        "voxels": call.facts.voxels,
+        "grasps": call.facts.grasps,
+        "milliseconds": milliseconds,
+    }
+    known = {name: value for name, value in fields.items() if value not in ("", 0, {})}
+    requests.log(level, "request", extra={"fields": {"request_id": call.request_id} | known})
 
 
 class JsonFormatter(logging.Formatter):
@@ -26,11 +63,9 @@ class JsonFormatter(logging.Formatter):
             "logger": record.name,
             "message": record.getMessage(),
         }
-        if request_id := REQUEST_ID.get():
-            line["request_id"] = request_id
         line |= getattr(record, "fields", {})
-        if record.exc_info:
-            line["exception"] = self.formatException(record.exc_info)
+        if trace := _traceback(self, record):
+            line["exception"] = trace
         return json.dumps(line, default=str)
 
 
@@ -40,51 +75,64 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """The line of a record, and its traceback below."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(" ", "milliseconds")[:23]
-        fields = {"request_id": REQUEST_ID.get()} if REQUEST_ID.get() else {}
-        fields |= getattr(record, "fields", {})
+        fields = getattr(record, "fields", {})
         words = " ".join(f"{name}={value}" for name, value in fields.items())
-        line = f"{time} {record.levelname} {record.name}: {record.getMessage()} {words}".rstrip()
-        trace = f"\n{self.formatException(record.exc_info)}" if record.exc_info else ""
-        return one_line(line) + trace
+        line = f"{time} {record.levelname} {record.name}: {record.getMessage()} {words}"
+        trace = _traceback(self, record)
+        return one_line(line.rstrip()) + (f"\n{trace}" if trace else "")
 
 
-class LogWriter(logging.Handler):
-    """Writes lines to a stream in a thread of its own, and goes on where that fails.
+def _traceback(formatter: logging.Formatter, record: logging.LogRecord) -> str:
+    """Of this process, or of the worker that told of it; empty: there is none."""
+    told: str = getattr(record, "traceback", "")
+    return formatter.formatException(record.exc_info) if record.exc_info else told
+
+
+class LogQueue(logging.handlers.QueueHandler):
+    """Hands lines to a thread that writes them, and goes on where that fails.
 
     Attributes:
         dropped: Lines that no one will read: the disk is full, the stream closed or not read.
     """
 
     def __init__(self, stream: TextIO | None, formatter: logging.Formatter) -> None:
-        super().__init__()
+        super().__init__(queue.Queue(MAX_WAITING))
         self.setFormatter(formatter)
         self.dropped = 0
+        self._closed = False
         self._stream = stream
-        self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING)
-        self._thread = threading.Thread(target=self._write_lines, name="log", daemon=True)
-        self._thread.start()
+        writer = logging.Handler()
+        writer.handle = self._write  # type: ignore[method-assign, assignment]
+        self._listener = logging.handlers.QueueListener(self.queue, writer)
+        self._listener.start()
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """Queue the line of a record."""
-        try:
-            self._lines.put_nowait(self.format(record))
-        except queue.Full:
-            self.dropped += 1
-        except Exception:  # of formatting; a request should not fail for it
-            self.dropped += 1
+    def prepare(self, record: logging.LogRecord) -> str:
+        """The line of a record, while its request is known."""
+        call = CALL.get()
+        if call is not None and not hasattr(record, "fields"):
+            record.fields = {"request_id": call.request_id}
+        return self.format(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Count a line that cannot be formatted, or that there is no room for."""
+        self.dropped += 1
 
     def close(self) -> None:
         """Write what is queued, unless nobody reads it."""
-        try:
-            self._lines.put(None, timeout=STOP_SECONDS)
-            self._thread.join(STOP_SECONDS)
-        except queue.Full:
-            pass
+        if self._closed:
+            return
+        self._closed = True
+        stop = threading.Thread(target=self._stop, daemon=True)
+        stop.start()
+        stop.join(STOP_SECONDS)
         super().close()
 
-    def _write_lines(self) -> None:
-        while (line := self._lines.get()) is not None:
-            self.dropped += not write_line(self._stream, line)
+    def _stop(self) -> None:
+        with contextlib.suppress(queue.Full):
+            self._listener.stop()
+
+    def _write(self, line: str) -> None:
+        self.dropped += not write_line(self._stream, line)
 
 
 def write_line(stream: TextIO | None, line: str) -> bool:
@@ -108,11 +156,11 @@ def write_line(stream: TextIO | None, line: str) -> bool:
     return True
 
 
-def start_logging(settings: Settings, stream: TextIO | None) -> LogWriter:
+def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
     """Send every record of this process to a stream; close what is returned when it ends."""
     terminal = stream is not None and not stream.closed and stream.isatty()
     text = settings.log_format == "text" or (settings.log_format == "auto" and terminal)
-    writer = LogWriter(stream, TextFormatter() if text else JsonFormatter())
-    logging.basicConfig(level=settings.log_level.upper(), handlers=[writer], force=True)
+    handler = LogQueue(stream, TextFormatter() if text else JsonFormatter())
+    logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
-    return writer
+    return handler

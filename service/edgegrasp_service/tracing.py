@@ -1,21 +1,16 @@
 """OpenTelemetry traces: a span for each request, and one for each of its stages inside it."""
 
-import threading
 import time
 from typing import Any
-from weakref import WeakKeyDictionary
 
-from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.call import Call
-from edgegrasp_service.errors import ErrorReport, InvalidSettings
-from edgegrasp_service.observer import Observer
-from edgegrasp_service.request_id import TRACEPARENT
+from edgegrasp_service.errors import InvalidSettings
 
 NANOSECONDS = 1_000_000_000
 
 
-class Tracer(Observer):
-    """Makes spans of what it observes; a caller's `traceparent` is the parent of its request's.
+class Tracer:
+    """Makes spans of calls; a caller's `traceparent` is the parent of its request's.
 
     Args:
         provider: An OpenTelemetry tracer provider.
@@ -28,55 +23,36 @@ class Tracer(Observer):
         self._trace = trace
         self._propagator = TraceContextTextMapPropagator()
         self._tracer = provider.get_tracer("edgegrasp_service")
-        self._spans: WeakKeyDictionary[Call, Any] = WeakKeyDictionary()
-        self._lock = threading.Lock()
 
-    def started(self, call: Call) -> None:
-        """Begin the span of a request."""
-        parent = self._propagator.extract({"traceparent": TRACEPARENT.get()})
+    def trace_call(self, call: Call) -> None:
+        """Make the spans of a call that has ended; of those only that had to do with grasps."""
+        if "admission" not in call.stages:
+            return
+        start = time.time_ns() - int((time.monotonic() - call.start) * NANOSECONDS)
+        attributes: dict[str, str | int] = {
+            "edgegrasp.transport": call.transport,
+            "edgegrasp.request_id": call.request_id,
+            "edgegrasp.model": call.facts.model,
+            "edgegrasp.code": "OK" if call.problem is None else call.problem.code,
+        }
+        for name, count in call.facts.counts.items():
+            attributes[f"edgegrasp.count.{name}"] = count
         span = self._tracer.start_span(
             call.method,
-            context=parent,
+            context=self._propagator.extract({"traceparent": call.traceparent}),
             kind=self._trace.SpanKind.SERVER,
-            start_time=time.time_ns() - int(call.seconds * NANOSECONDS),
-            attributes={
-                "edgegrasp.transport": call.transport,
-                "edgegrasp.request_id": call.request_id,
-            },
+            start_time=start,
+            attributes=attributes,
         )
-        with self._lock:
-            self._spans[call] = span
-
-    def stage(self, call: Call, name: str, seconds: float) -> None:
-        """Add the span of a stage that ended now."""
-        if (parent := self._span(call)) is None:
-            return
-        end = time.time_ns()
-        context = self._trace.set_span_in_context(parent)
-        start = end - int(seconds * NANOSECONDS)
-        self._tracer.start_span(name, context=context, start_time=start).end(end)
-
-    def answered(self, call: Call, answer: Detection | Scoring) -> None:
-        """Note the weights and the counts."""
-        if (span := self._span(call)) is not None:
-            span.set_attribute("edgegrasp.model", answer.model)
-            for name, count in answer.counts.items():
-                span.set_attribute(f"edgegrasp.count.{name}", int(count))
-
-    def finished(self, call: Call, problem: ErrorReport | None) -> None:
-        """End the span of a request."""
-        if (span := self._span(call)) is None:
-            return
-        span.set_attribute("edgegrasp.code", "OK" if problem is None else problem.code.name)
-        if problem is not None and problem.status >= 500:
-            span.set_status(self._trace.StatusCode.ERROR, problem.kind)
-        span.end()
-        with self._lock:
-            self._spans.pop(call, None)
-
-    def _span(self, call: Call) -> Any:
-        with self._lock:
-            return self._spans.get(call)
+        if call.problem is not None and call.problem.status >= 500:
+            span.set_status(self._trace.StatusCode.ERROR, call.problem.kind)
+        inside = self._trace.set_span_in_context(span)
+        begin = start
+        for name, seconds in call.stages.items():
+            end = begin + int(seconds * NANOSECONDS)
+            self._tracer.start_span(name, context=inside, start_time=begin).end(end)
+            begin = end
+        span.end(start + int(call.seconds * NANOSECONDS))
 
 
 def otlp_provider(endpoint: str) -> Any:
