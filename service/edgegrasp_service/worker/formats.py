@@ -54,11 +54,10 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
     return _READERS[file_format](data, max_points)
 
 
-def check_count(count: int, max_points: int, field: str = "cloud") -> None:
-    """Raise PayloadTooLarge for more than `max_points` points."""
-    if count > max_points:
-        fix = f"Send at most {max_points} points, e.g. downsampled."
-        raise PayloadTooLarge(field, f"{count} points", fix)
+def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLarge:
+    """The error for more than `max_points` points."""
+    fix = f"Send at most {max_points} points, e.g. downsampled."
+    return PayloadTooLarge(field, f"{count} points", fix)
 
 
 # .npy and .npz
@@ -117,7 +116,9 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
             f"{found} bytes of data where the .npy header, shape {shape}, promises {expected}",
             "Send the whole file.",
         )
-    check_count(math.prod(shape[:-1] if shape[-1:] == (3,) else shape[:2]), max_points, field)
+    count = math.prod(shape[:-1] if shape[-1:] == (3,) else shape[:2])
+    if count > max_points:
+        raise too_many(count, max_points, field)
     array = np.frombuffer(data, dtype=dtype, offset=stream.tell())
     array = array.reshape(shape, order="F" if fortran_order else "C")
     return array.astype(dtype.newbyteorder("="), copy=False)
@@ -199,7 +200,8 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
         raise _no_ply(f"{len(data)} bytes that are no whole PLY file")
     encoding = next((line[1] for line in lines if line[0:1] == ["format"] and len(line) > 1), "")
     count, record = _ply_vertices(lines)
-    check_count(count, max_points)
+    if count > max_points:
+        raise too_many(count, max_points)
     body = data[end.end() :]
     if encoding in PLY_BYTE_ORDERS:
         order = PLY_BYTE_ORDERS[encoding]
@@ -256,7 +258,8 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb where there are any."""
     header, body = _split_pcd(data)
     count, record = _pcd_layout(header)
-    check_count(count, max_points)
+    if count > max_points:
+        raise too_many(count, max_points)
     encoding = " ".join(header["DATA"])
     if encoding == "binary_compressed":
         return _organised(_read_compressed_pcd(data, body, count, record), header)
@@ -393,7 +396,8 @@ def _read_xyz(data: bytes, max_points: int) -> CloudInput:
             value = f"line {row} with {len(words)} words in an .xyz file"
             raise InvalidRequest("cloud", value, XYZ_FIX)
         numbers += words
-    check_count(len(numbers) // 3, max_points)
+    if len(numbers) // 3 > max_points:
+        raise too_many(len(numbers) // 3, max_points)
     if not numbers:
         raise InvalidRequest("cloud", f"{len(data)} bytes without a line of an .xyz file", XYZ_FIX)
     return CloudInput(_numbers_from_words(numbers, ".xyz").reshape(-1, 3))

@@ -20,10 +20,10 @@ from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
     PCL_COLORS,
     PCL_NORMALS,
-    check_count,
     cloud_of_pcl_fields,
     read_file,
     read_npy,
+    too_many,
 )
 
 Array = NDArray[Any]
@@ -122,15 +122,18 @@ def decode_points(points: object, max_points: int) -> Array:
                 f"{len(points)} bytes, which are no whole number of points",
                 "Send 12 bytes a point: little-endian float32 x, y, z.",
             )
-        check_count(len(points) // 12, max_points)
+        if len(points) // 12 > max_points:
+            raise too_many(len(points) // 12, max_points)
         return np.frombuffer(points, dtype="<f4").reshape(-1, 3)
     if not isinstance(points, list):
         raise InvalidRequest("points", brief(points), "Send a list of [x, y, z] in metres.")
-    check_count(len(points), max_points)
+    if len(points) > max_points:
+        raise too_many(len(points), max_points)
     if not points:
         return np.empty((0, 3))
     array = _numbers("points", points, holes=True)
-    check_count(array.size // 3, max_points)
+    if array.size // 3 > max_points:
+        raise too_many(array.size // 3, max_points)
     return array.astype(np.float64)
 
 
@@ -164,19 +167,15 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
 
 def _numbers(field: str, values: list[Any], holes: bool = False) -> Array:
     """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
-    ragged = InvalidRequest(
-        field,
-        "rows of different lengths",
-        "Send [x, y, z] rows." if holes else "Send rows of one length.",
-    )
+    one_length = "Send [x, y, z] rows." if holes else "Send rows of one length."
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
     except ValueError:
-        raise ragged from None
+        raise InvalidRequest(field, "rows of different lengths", one_length) from None
     kinds = set(map(type, array.ravel().tolist()))
     if list in kinds:
-        raise ragged
+        raise InvalidRequest(field, "rows of different lengths", one_length)
     allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
     if not kinds <= allowed:
         bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
@@ -219,7 +218,8 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
         PayloadTooLarge: More than `max_points` points.
     """
     layout = _parse(PointCloud2, fields, "point_cloud2")
-    check_count(layout.height * layout.width, max_points, "point_cloud2")
+    if layout.height * layout.width > max_points:
+        raise too_many(layout.height * layout.width, max_points, "point_cloud2")
     record = _record(layout)
     if layout.row_step < layout.width * layout.point_step:
         value = f"{layout.row_step} for {layout.width} points of {layout.point_step} bytes"
@@ -301,7 +301,9 @@ def fuse_depth_images(
     depths: list[NDArray[np.float64]] = []
     for row, view in enumerate(views):
         depths.append(_depth(view.depth, f"depth_images.{row}.depth"))
-        check_count(sum(depth.size for depth in depths), max_points, "depth_images")
+        pixels = sum(depth.size for depth in depths)
+        if pixels > max_points:
+            raise too_many(pixels, max_points, "depth_images")
     clouds = [_points_of_pixels(depth, view) for depth, view in zip(depths, views, strict=True)]
     cameras = [_position(view) for view in views]
     if len(views) == 1:
