@@ -7,34 +7,41 @@ to. The nursery never has a second thread.
 
 import contextlib
 import gc
+import json
 import os
-import pickle
 import resource
 import signal
 import socket
 import struct
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import WorkerLost, report
+from edgegrasp_service.errors import Problem, WorkerLost, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Facts, Limits
+from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
 
-HEADER = struct.Struct(">QQ")  # bytes of a pickled object, and of the body that follows it
+HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 
 
 @dataclass(frozen=True)
+class Start:
+    """What the nursery is told first."""
+
+    settings: dict[str, Any]  # those that are not secret
+
+
+@dataclass(frozen=True)
 class Ready:
-    """What a worker says first."""
+    """What the nursery and its workers say first."""
 
     pid: int
-    models: list[dict[str, Any]]  # as `answer.describe` gives them
+    models: list[dict[str, Any]]  # as `answer.describe` gives them; of workers
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,9 @@ class Failed:
     """Why there will be no worker."""
 
     reason: str
+
+
+MESSAGES = {kind.__name__: kind for kind in (Start, Ready, Failed, Job, Answer)}
 
 
 def main(load: Callable[[Settings], Any] | None = None) -> None:
@@ -54,13 +64,12 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
     pool = socket.socket(fileno=0)
-    received = receive(pool)
-    if received is None:
+    if (told := receive(pool)) is None:
         return
-    settings: Settings = received[0]
+    settings = Settings(**told.settings)
     try:
         start = _prepare(settings, load)
-        send(pool, None)
+        send(pool, Ready(os.getpid(), []))
     except EdgeGraspError as error:
         send(pool, Failed(str(error)))
         return
@@ -110,8 +119,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         return
     _limit_memory(settings.max_worker_bytes)
     send(pool, Ready(os.getpid(), models))
-    while (received := receive(pool)) is not None:
-        job = replace(received[0], body=received[1])
+    while (job := receive(pool)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
             answer: Answer = answerer.answer(job)
@@ -120,8 +128,8 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
             send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
             return
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        send(pool, replace(answer, body=b""), answer.body)
-        del received, job, answer  # or the next request would add to them
+        send(pool, answer)
+        del job, answer  # or the next request would add to them
 
 
 def _limit_memory(most: int) -> None:
@@ -132,24 +140,42 @@ def _limit_memory(most: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
-def pack(message: object, body: bytes = b"") -> bytes:
-    """What is sent before the body: the lengths, and the message pickled."""
-    pickled = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    return HEADER.pack(len(pickled), len(body)) + pickled
-
-
-def send(to: socket.socket, message: object, body: bytes = b"") -> None:
-    """Send one message and its body, which is not copied."""
-    to.sendall(pack(message, body))
+def send(to: socket.socket, message: object) -> None:
+    """Send one message."""
+    head, body = pack(message)
+    to.sendall(head)
     to.sendall(body)
 
 
-def receive(source: socket.socket) -> tuple[Any, bytes] | None:
-    """The next message and its body; None: the other side has closed."""
+def receive(source: socket.socket) -> Any:
+    """The next message; None: the other side has closed."""
     if not (head := _read(source, HEADER.size)):
         return None
     length, body_length = HEADER.unpack(head)
-    return pickle.loads(_read(source, length)), bytes(_read(source, body_length))
+    return unpack(_read(source, length), bytes(_read(source, body_length)))
+
+
+def pack(message: object) -> tuple[bytes, bytes]:
+    """One of MESSAGES as bytes: the lengths and its plain fields, and its body, not copied."""
+    text = json.dumps([type(message).__name__, message], default=_plain).encode()
+    body: bytes = getattr(message, "body", b"")
+    return HEADER.pack(len(text), len(body)) + text, body
+
+
+def unpack(text: bytes | bytearray, body: bytes) -> Any:
+    """The message of its plain fields, as JSON, and its body."""
+    name, fields = json.loads(text)
+    if "body" in fields:
+        fields["body"] = body
+    if name == "Answer":
+        fields["facts"] = Facts(**fields["facts"])
+        fields["error"] = fields["error"] and Problem(**fields["error"])
+    return MESSAGES[name](**fields)
+
+
+def _plain(value: Any) -> Any:
+    """Of JSON, where it does not know a value: the fields of a message, and nothing of a body."""
+    return "" if isinstance(value, bytes) else vars(value)
 
 
 def _read(source: socket.socket, size: int) -> bytearray:
