@@ -158,7 +158,7 @@ class GraspService:
                 call.end_stage("admission")
                 yield ticket
         except Exception as error:
-            call.problem = report(error)
+            call.problem = call.problem or report(error)  # gRPC aborts with an error of its own
             raise
         except BaseException:
             call.problem = report(Cancelled("The caller cancelled the request."))
