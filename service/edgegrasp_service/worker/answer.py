@@ -13,6 +13,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
@@ -25,11 +26,6 @@ from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
 from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
 
 Result = TypeVar("Result", Detection, Scoring)
-
-MODEL_FACTS = (
-    "name", "architecture", "digest", "parameters", "crop_radius", "voxel_size", "gripper",
-    "default", "hand_description", "device",
-)  # fmt: skip
 
 
 class Catalogue(Protocol):
@@ -71,8 +67,9 @@ def load_catalogue(settings: Settings) -> Catalogue:
 
 def describe(catalogue: Catalogue) -> list[dict[str, Any]]:
     """The facts of each set of weights, keyed as the fields of edgegrasp.v1.Model."""
+    known = grasp_pb2.Model.DESCRIPTOR.fields_by_name
     return [
-        {name: value for name, value in facts.items() if name in MODEL_FACTS}
+        {name: value for name, value in facts.items() if name in known}
         for facts in catalogue.describe()
     ]
 

@@ -10,7 +10,6 @@ import edgegrasp_client
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model import results
 from edgegrasp_service import schemas
-from edgegrasp_service.worker.answer import MODEL_FACTS
 
 
 def fields(message: type) -> list[str]:
@@ -101,6 +100,5 @@ def test_answers(message: type, ours: type, body: type, client: type) -> None:
 
 def test_models() -> None:
     names = fields(grasp_pb2.Model)
-    assert list(MODEL_FACTS) == names
     assert [field.name for field in dataclasses.fields(edgegrasp_client.Model)] == names
     assert list(schemas.ModelBody.model_fields) == names
