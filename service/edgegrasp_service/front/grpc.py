@@ -11,7 +11,8 @@ import math
 import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -27,6 +28,7 @@ from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.errors import AddressInUse, Cancelled, NotReady, Overloaded, Problem, report
 from edgegrasp_service.front.problems import abort, error_detail
 from edgegrasp_service.front.service import STOPPING, GraspService, Reloader, check_headers
+from edgegrasp_service.worker.job import Method
 
 logger = logging.getLogger(__name__)
 
@@ -149,20 +151,14 @@ class _Methods:
     def handlers(self) -> dict[str, Handler]:
         """By the methods' names."""
         return {
-            "DetectGrasps": _handler(self._detect),
-            "ScoreGrasps": _handler(self._score),
+            "DetectGrasps": _handler(partial(self._answer, "DetectGrasps")),
+            "ScoreGrasps": _handler(partial(self._answer, "ScoreGrasps")),
             "DetectGraspsStream": _handler(self._stream),
             "ListModels": _handler(self._list_models),
             "ReloadModels": _handler(self._reload_models),
         }
 
-    async def _detect(self, messages: Any, context: Any) -> None:
-        await self._answer("DetectGrasps", context)
-
-    async def _score(self, messages: Any, context: Any) -> None:
-        await self._answer("ScoreGrasps", context)
-
-    async def _answer(self, method: Literal["DetectGrasps", "ScoreGrasps"], context: Any) -> None:
+    async def _answer(self, method: Method, messages: Any, context: Any) -> None:
         service, call = self._service, current_call()
         async with service.admit(call, service.settings.max_body_bytes) as ticket:
             body = await self._read(context)

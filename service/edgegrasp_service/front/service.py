@@ -7,7 +7,6 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
-from typing import Literal
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.call import CALL, REQUEST_ID_HEADER, Call
@@ -24,7 +23,7 @@ from edgegrasp_service.errors import (
 from edgegrasp_service.front.admission import Admission, Ticket
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job, Transport
+from edgegrasp_service.worker.job import Answer, Job, Method, Transport
 from edgegrasp_service.worker.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -66,7 +65,7 @@ class GraspService:
     Attributes:
         tokens: Replaced when they are read anew.
         stopping: Set: new requests are refused.
-        in_flight: Calls that have not ended, streams left out.
+        in_flight: Calls that have not ended.
     """
 
     def __init__(
@@ -168,7 +167,7 @@ class GraspService:
         self,
         call: Call,
         ticket: Ticket,
-        method: Literal["DetectGrasps", "ScoreGrasps"],
+        method: Method,
         body: bytes,
         content_type: str = "",
         query: str = "",
