@@ -58,7 +58,7 @@ def check_alive(server, cloud: np.ndarray, seconds: float = 3.0) -> None:
             begin = time.monotonic()
             assert http.get("/health/live").status_code == 200
             slowest = max(slowest, time.monotonic() - begin)
-    assert slowest < 2.0
+    assert slowest < 3.0
     with GraspClient(server.grpc_address, timeout=PATIENCE) as client:
         assert len(client.detect(cloud).grasps) == 10
 

@@ -176,8 +176,8 @@ async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
     running.stages.shut("run")
     for name in ("first", "second"):
         await stream.write(request(name, cloud))
-    await running.until(lambda: running.waiting == 1)
     await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.waiting == 1)
     stream.cancel()
     await running.until(lambda: running.ended == ["cancelled", "cancelled"])
     running.stages.open("run")

@@ -19,7 +19,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import SECRETS, Settings
 from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import (
+from edgegrasp_service.worker.pipe import (
     HEADER,
     LOST,
     Failed,
@@ -33,7 +33,7 @@ from edgegrasp_service.worker.process import (
 
 # -P: nothing is imported from the folder the server was started in.
 NURSERY = (
-    sys.executable, "-P", "-c", "from edgegrasp_service.worker.process import main; main()"
+    sys.executable, "-P", "-c", "from edgegrasp_service.worker.pipe import main; main()"
 )  # fmt: skip
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
