@@ -1,5 +1,6 @@
 """What goes between the pool and its processes: messages of plain JSON, and bodies as bytes."""
 
+import contextlib
 import json
 import socket
 import struct
@@ -80,8 +81,7 @@ def _read(source: socket.socket, size: int) -> bytearray:
     """So many bytes; empty where the other side closes before."""
     data = bytearray(size)
     view, done = memoryview(data), 0
-    while done < size:
-        if not (count := source.recv_into(view[done:])):
-            return bytearray()
-        done += count
-    return data
+    with contextlib.suppress(ConnectionError):
+        while done < size and (count := source.recv_into(view[done:])):
+            done += count
+    return data if done == size else bytearray()

@@ -33,7 +33,7 @@ from edgegrasp_service.worker.pipe import (
 
 # -P: nothing is imported from the folder the server was started in.
 NURSERY = (
-    sys.executable, "-P", "-c", "from edgegrasp_service.worker.pipe import main; main()"
+    sys.executable, "-P", "-c", "from edgegrasp_service.worker.process import main; main()"
 )  # fmt: skip
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
