@@ -19,10 +19,8 @@ from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import METHODS as HTTP_METHODS
 from edgegrasp_service.front.http import HttpMiddleware, create_app
 from edgegrasp_service.front.http_protocol import HttpProtocol
-from edgegrasp_service.front.reload import Reloader
-from edgegrasp_service.front.service import GraspService, Observer
-from edgegrasp_service.logs import LogQueue, log_call, start_logging, write_line
-from edgegrasp_service.metrics import Metrics
+from edgegrasp_service.front.service import GraspService, Observer, Reloader
+from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import load_tls, load_tokens
 from edgegrasp_service.settings import Settings
@@ -217,7 +215,7 @@ def run(settings: Settings) -> None:
         log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
         observers: list[Observer] = []
         if settings.otlp_endpoint:
-            from edgegrasp_service.tracing import Tracer, otlp_provider
+            from edgegrasp_service.observability import Tracer, otlp_provider
 
             provider = otlp_provider(settings.otlp_endpoint)
             ends.callback(provider.shutdown)

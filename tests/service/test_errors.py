@@ -41,7 +41,7 @@ async def ask(running, cloud) -> tuple[httpx.Response, aio.AioRpcError]:
 
 async def test_every_error_of_the_table(serve, cloud) -> None:
     running = await serve()
-    for kind, (code, http_status) in STATUS.items():
+    for number, (kind, (code, http_status)) in enumerate(STATUS.items(), 1):
         running.stages.fail("prepare", kind_of(kind))
         response, status = await ask(running, cloud)
         assert (response.status_code, status.code().name) == (http_status, code)
@@ -58,6 +58,8 @@ async def test_every_error_of_the_table(serve, cloud) -> None:
         assert problem["retry_after"] == retry_after == (7.0 if busy else None)
         assert response.headers.get("retry-after") == ("7" if busy else None)
         check_google_details(trailers["grpc-status-details-bin"], detail)
+        await running.until(lambda number=number: len(running.calls) == 2 * number)
+        assert running.ended[-2:] == [kind_of(kind)] * 2
     running.stages.folder.joinpath("fault-prepare").unlink(missing_ok=True)
     client = running.connect("grpc")
     assert (await client.detect(cloud)).fine

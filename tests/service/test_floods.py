@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from grpc import aio
 
-from edgegrasp.v1 import grasp_pb2
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 
 PATIENCE = 30
@@ -58,7 +58,7 @@ def check_alive(server, cloud: np.ndarray, seconds: float = 3.0) -> None:
             begin = time.monotonic()
             assert http.get("/health/live").status_code == 200
             slowest = max(slowest, time.monotonic() - begin)
-    assert slowest < 2.0
+    assert slowest < 3.0
     with GraspClient(server.grpc_address, timeout=PATIENCE) as client:
         assert len(client.detect(cloud).grasps) == 10
 
@@ -347,3 +347,45 @@ def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud
     assert any("Too many open files" in line for line in lines)
     assert len(lines) < 20
     assert not any("Traceback" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def real_server(start_server):
+    with start_server("--workers", "2", "--max-voxels", "10000000") as running:
+        yield running
+
+
+def test_a_cloud_far_too_dense(real_server, cloud) -> None:
+    """Row 4: 2 M points in a cube of 1 m are within every limit here, and take minutes."""
+    dense = np.random.default_rng(0).random((2_000_000, 3), np.float32).astype("<f4").tobytes()
+    codes = []
+
+    def attack() -> None:
+        with grpc.insecure_channel(
+            real_server.grpc_address, (("grpc.max_send_message_length", -1),)
+        ) as channel:
+            stub = grasp_pb2_grpc.GraspServiceStub(channel)
+            with pytest.raises(grpc.RpcError) as caught:
+                stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=dense), timeout=2.0)
+            codes.append(caught.value.code())
+
+    threads = [threading.Thread(target=attack) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    begin = time.monotonic()
+    with GraspClient(real_server.http_url, timeout=PATIENCE) as client:
+        client.detect(cloud, num_approach_points=2, num_candidates=20)
+    assert time.monotonic() - begin < 12  # 38 s and more where nothing is killed
+    assert set(codes) == {grpc.StatusCode.DEADLINE_EXCEEDED}
+
+
+def test_too_many_voxels_are_named(start_server) -> None:
+    room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
+    with (
+        start_server("--workers", "1", "--max-voxels", "20000") as server,
+        GraspClient(server.grpc_address, timeout=PATIENCE) as client,
+        pytest.raises(Exception, match=r"voxels.*workspace"),
+    ):
+        client.detect(room)

@@ -114,6 +114,7 @@ async def test_while_draining_both_transports_say_so(serve, connect, cloud) -> N
         assert (await http.get("/health/live")).status_code == 200
         running.stages.shut("finish")
         accepted = [asyncio.create_task(client.detect(cloud, seed=seed)) for seed in (1, 2)]
+        await running.until(lambda: running.stages.begun["finish"] == 1)
         await running.until(lambda: running.waiting == 1)
         running.stop.set()
         assert (await watch.read()).status == Status.NOT_SERVING

@@ -161,9 +161,10 @@ async def test_a_full_server_is_told_of_in_the_stream(serve, streams, cloud) -> 
 
 async def test_streams_are_bounded(serve, streams, cloud) -> None:
     running = await serve(max_streams=1)
-    first, second = streams(running), streams(running)
+    first = streams(running)
     await first.write(request("first", cloud))
     assert (await first.read()).request_id == "first"
+    second = streams(running)
     assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     await first.done_writing()
     assert await first.code() is grpc.StatusCode.OK
@@ -175,8 +176,8 @@ async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
     running.stages.shut("run")
     for name in ("first", "second"):
         await stream.write(request(name, cloud))
-    await running.until(lambda: running.waiting == 1)
     await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.waiting == 1)
     stream.cancel()
     await running.until(lambda: running.ended == ["cancelled", "cancelled"])
     running.stages.open("run")

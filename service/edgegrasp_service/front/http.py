@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections.abc import Coroutine
-from typing import Any, Literal
+from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
@@ -16,9 +16,8 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.problems import problem_response
-from edgegrasp_service.front.reload import Reloader
-from edgegrasp_service.front.service import GraspService, check_headers
-from edgegrasp_service.metrics import Metrics
+from edgegrasp_service.front.service import GraspService, Reloader, check_headers
+from edgegrasp_service.observability import Metrics
 from edgegrasp_service.schemas import (
     TIMEOUT,
     DetectionBody,
@@ -29,7 +28,7 @@ from edgegrasp_service.schemas import (
     openapi_detect,
     openapi_score,
 )
-from edgegrasp_service.worker.job import Answer
+from edgegrasp_service.worker.job import Answer, Method
 
 ASSETS = "/docs/assets"
 PIECE = 2**18  # bytes of an answer given to the connection at a time
@@ -226,9 +225,7 @@ def _problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 class _GraspResponse(Response):
     """Takes a ticket, receives the request, has it answered, and sends the answer."""
 
-    def __init__(
-        self, service: GraspService, method: Literal["DetectGrasps", "ScoreGrasps"]
-    ) -> None:
+    def __init__(self, service: GraspService, method: Method) -> None:
         super().__init__()
         self._service = service
         self._method = method

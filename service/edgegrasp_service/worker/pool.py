@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import logging
 import os
-import pickle
 import resource
 import signal
 import socket
@@ -18,9 +17,19 @@ from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
-from edgegrasp_service.settings import Settings
+from edgegrasp_service.settings import SECRETS, Settings
 from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import HEADER, LOST, Failed, Ready, pack, receive, send
+from edgegrasp_service.worker.pipe import (
+    HEADER,
+    LOST,
+    Failed,
+    Ready,
+    Start,
+    pack,
+    receive,
+    send,
+    unpack,
+)
 
 # -P: nothing is imported from the folder the server was started in.
 NURSERY = (
@@ -239,16 +248,15 @@ class _Nursery:
             process = subprocess.Popen(command, stdin=theirs.fileno(), env=environment)
         nursery = cls(process, control)
         try:
-            secretless = settings.model_copy(update={"tokens": (), "admin_tokens": ()})
-            send(control, secretless)
+            send(control, Start(settings.model_dump(mode="json", exclude=set(SECRETS))))
             answer = await _in_thread(lambda: receive(control))
         except BaseException:
             nursery.close()
             raise
-        failure = Failed("the process that loads them died") if answer is None else answer[0]
-        if isinstance(failure, Failed):
+        if not isinstance(answer, Ready):
             nursery.close()
-            raise InvalidSettings(failure.reason)
+            reason = answer.reason if answer else "the process that loads weights died"
+            raise InvalidSettings(reason)
         control.setblocking(False)
         return nursery
 
@@ -314,8 +322,8 @@ class _Worker(asyncio.Protocol):
         self.answer = asyncio.get_running_loop().create_future()
         self.answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
         assert self._transport is not None
-        self._transport.write(pack(replace(job, body=b""), job.body))
-        self._transport.write(job.body)
+        for part in pack(job):
+            self._transport.write(part)
         return self.answer
 
     def abandon(self) -> None:
@@ -349,12 +357,11 @@ class _Worker(asyncio.Protocol):
         end = HEADER.size + length
         if len(self._received) < end + body_length:
             return
-        message = pickle.loads(memoryview(self._received)[HEADER.size : end])
-        body = bytes(memoryview(self._received)[end:])
+        message = unpack(self._received[HEADER.size : end], bytes(memoryview(self._received)[end:]))
         self._received = bytearray()
-        self._take(message, body)
+        self._take(message)
 
-    def _take(self, message: object, body: bytes) -> None:
+    def _take(self, message: object) -> None:
         if isinstance(message, Ready):
             self.pid, self.models = message.pid, message.models
             self._ready.set_result(None)
@@ -365,7 +372,7 @@ class _Worker(asyncio.Protocol):
             if self._killing is not None:
                 self._killing.cancel()
                 self._killing = None
-            answer.set_result(replace(message, body=body))
+            answer.set_result(message)
             if message.error is not None and message.error.kind == WORKER_LOST:
                 self.kill()  # it ran out of memory: what is left of it cannot be trusted
             else:

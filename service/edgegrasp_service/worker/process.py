@@ -8,14 +8,11 @@ to. The nursery never has a second thread.
 import contextlib
 import gc
 import os
-import pickle
 import resource
 import signal
 import socket
-import struct
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,25 +20,9 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import WorkerLost, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Facts, Limits
+from edgegrasp_service.worker.pipe import LOST, Failed, Ready, receive, send
 
-HEADER = struct.Struct(">QQ")  # bytes of a pickled object, and of the body that follows it
 ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
-LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
-
-
-@dataclass(frozen=True)
-class Ready:
-    """What a worker says first."""
-
-    pid: int
-    models: list[dict[str, Any]]  # as `answer.describe` gives them
-
-
-@dataclass(frozen=True)
-class Failed:
-    """Why there will be no worker."""
-
-    reason: str
 
 
 def main(load: Callable[[Settings], Any] | None = None) -> None:
@@ -54,13 +35,12 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
     pool = socket.socket(fileno=0)
-    received = receive(pool)
-    if received is None:
+    if (told := receive(pool)) is None:
         return
-    settings: Settings = received[0]
+    settings = Settings(**told.settings)
     try:
         start = _prepare(settings, load)
-        send(pool, None)
+        send(pool, Ready(os.getpid(), []))
     except EdgeGraspError as error:
         send(pool, Failed(str(error)))
         return
@@ -74,6 +54,8 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
             try:
                 pool.close()
                 _work(socket.socket(fileno=descriptors[0]), settings, start)
+            except Exception:
+                traceback.print_exc()
             finally:
                 os._exit(0)
         os.close(descriptors[0])
@@ -110,8 +92,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         return
     _limit_memory(settings.max_worker_bytes)
     send(pool, Ready(os.getpid(), models))
-    while (received := receive(pool)) is not None:
-        job = replace(received[0], body=received[1])
+    while (job := receive(pool)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
             answer: Answer = answerer.answer(job)
@@ -120,8 +101,8 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
             send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
             return
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        send(pool, replace(answer, body=b""), answer.body)
-        del received, job, answer  # or the next request would add to them
+        send(pool, answer)
+        del job, answer  # or the next request would add to them
 
 
 def _limit_memory(most: int) -> None:
@@ -130,34 +111,3 @@ def _limit_memory(most: int) -> None:
         data_pages = int(Path("/proc/self/statm").read_text().split()[5])
         limit = data_pages * resource.getpagesize() + most
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-
-
-def pack(message: object, body: bytes = b"") -> bytes:
-    """What is sent before the body: the lengths, and the message pickled."""
-    pickled = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
-    return HEADER.pack(len(pickled), len(body)) + pickled
-
-
-def send(to: socket.socket, message: object, body: bytes = b"") -> None:
-    """Send one message and its body, which is not copied."""
-    to.sendall(pack(message, body))
-    to.sendall(body)
-
-
-def receive(source: socket.socket) -> tuple[Any, bytes] | None:
-    """The next message and its body; None: the other side has closed."""
-    if not (head := _read(source, HEADER.size)):
-        return None
-    length, body_length = HEADER.unpack(head)
-    return pickle.loads(_read(source, length)), bytes(_read(source, body_length))
-
-
-def _read(source: socket.socket, size: int) -> bytearray:
-    """So many bytes; empty where the other side closes before."""
-    data = bytearray(size)
-    view, done = memoryview(data), 0
-    while done < size:
-        if not (count := source.recv_into(view[done:])):
-            return bytearray()
-        done += count
-    return data
