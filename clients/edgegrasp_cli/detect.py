@@ -110,10 +110,10 @@ def _detect_here(
     file: Path, weights: list[Path], grippers: list[Path], device: str, options: dict[str, Any]
 ) -> Any:
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.cloud_decoding import decode_file
+    from edgegrasp_service.worker.formats import read_file
 
     parsed = parse_options(options)
-    cloud = decode_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
+    cloud = read_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
 
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 

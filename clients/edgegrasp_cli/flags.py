@@ -97,7 +97,7 @@ def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
         InvalidRequest: A value is of the wrong type or out of range.
     """
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.options_text import options_from_query
+    from edgegrasp_service.worker.http_bodies import options_from_query
 
     options = options_from_query(
         (name, value if isinstance(value, str) else json.dumps(value))

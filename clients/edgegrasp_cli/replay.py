@@ -67,7 +67,6 @@ def request(
     Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
     """
     from edgegrasp_service.recording import replay as answer_again
-
     from edgegrasp_service.settings import load_settings
 
     again = answer_again(file, load_settings(config))

@@ -34,7 +34,7 @@ def serve(
 
     loaded, origins = load_settings_and_origins(config, **settings)
     if print_config:
-        from edgegrasp_service.settings_text import config_text
+        from edgegrasp_service.settings import config_text
 
         print(config_text(loaded, origins), end="")
         return

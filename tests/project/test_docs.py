@@ -25,7 +25,7 @@ def scripts_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         del sys.modules[name]
 
 
-@pytest.mark.parametrize("name", ["options", "settings", "results"])
+@pytest.mark.parametrize("name", ["settings", "results"])
 def test_generated_pages_are_current(name: str) -> None:
     page = importlib.import_module(f"make_{name}").page()
     assert (DOCS / f"{name}.md").read_text() == page, f"run: python docs/make_{name}.py"
