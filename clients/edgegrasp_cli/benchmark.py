@@ -268,13 +268,17 @@ def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: b
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from rich.console import Console
 
-    from edgegrasp_sim.results import percent
+    from edgegrasp_sim.results import over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
+    gsr, dr = (
+        f"{percent(rate)} %, {over_seeds(rate)} over seeds"
+        for rate in (summary["grasp_success_rate"], summary["declutter_rate"])
+    )
     console.print(
-        f"{planner}: GSR {percent(summary['grasp_success_rate'])} "
+        f"{planner}: GSR {gsr} "
         f"({summary['successes']} of {summary['attempts']} grasps), "
-        f"DR {percent(summary['declutter_rate'])} "
+        f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
     failures = {cause: count for cause, count in summary["failures"].items() if count}

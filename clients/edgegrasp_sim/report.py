@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.replay import Replay
-from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent, planner_title
+from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
 from edgegrasp_sim.trial import Attempt, Round
 
 PICTURES = 6
@@ -181,9 +181,11 @@ def _key_figures(summary: dict[str, Any]) -> list[Row]:
     names = ["GSR % [95 % interval]", "DR % [95 % interval]"]
     for seed in summary["grasp_success_rate"]["by_seed"]:
         names.append(f"seed {seed}: GSR, DR")
+    names.append("mean ± standard deviation over seeds: GSR, DR")
     rates = [summary[name] for name in RATE_LABELS]
     by_seed = zip(*(rate["by_seed"].values() for rate in rates), strict=True)
     values = [*map(percent, rates), *(", ".join(map(_share, both)) for both in by_seed)]
+    values.append(", ".join(map(over_seeds, rates)))
     return [
         ("", ""),
         *zip(names, values, strict=True),

@@ -347,6 +347,12 @@ def percent(rate: dict[str, Any]) -> str:
     return f"{100 * rate['value']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
+def over_seeds(rate: dict[str, Any]) -> str:
+    """Mean of the seeds' rates, and standard deviation where there are several, in per cent."""
+    numbers = (rate["mean_over_seeds"], rate["std_over_seeds"])
+    return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None)
+
+
 def _rate(
     successes: NDArray[np.int64], trials: NDArray[np.int64], seeds: NDArray[np.int64]
 ) -> dict[str, Any]:
