@@ -254,21 +254,6 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
     return Cloud(voxels.mean(dense), voxels.mean(normals))
 
 
-def _statistical_outlier_removal(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) to keep: those with usual mean distances to their neighbours."""
-    distances, _ = _nearest(points)
-    mean = distances.mean(axis=1)
-    near: NDArray[np.bool_] = mean < mean.mean() + OUTLIER_DEVIATIONS * mean.std(ddof=1)
-    return near
-
-
-def _radius_outlier_removal(points: Float64) -> NDArray[np.bool_]:
-    """Which points (N,) to keep: those with at least NEIGHBORS others within ISOLATED."""
-    distances, _ = _nearest(points, NEIGHBORS + 1)
-    near: NDArray[np.bool_] = distances[:, -1] <= ISOLATED
-    return near
-
-
 def estimate_normals(points: Float64) -> Float64:
     """Unit normals (N, 3) of either sign: least variance among each point's neighbours."""
     distances, rows = _nearest(points)
