@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -57,7 +57,6 @@ def grasp(pose: np.ndarray, score: float = 0.9, width: float = 0.06) -> Grasp:
     return Grasp(**fields | {"approach_direction": pose[:3, 2]})
 
 
-@settings(max_examples=100, deadline=None)
 @given(quaternion=quaternions)
 def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ...]) -> None:
     rotation = Rotation.from_quat(quaternion)
@@ -77,7 +76,6 @@ def test_a_quaternion_is_xyzw() -> None:
         matrix_from_quaternion([0, 0, 0, 0])
 
 
-@settings(max_examples=50, deadline=None)
 @given(pose=poses(), frame=st.sampled_from(FRAMES))
 def test_frames_round_trip(pose: np.ndarray, frame: HandFrame) -> None:
     np.testing.assert_allclose(from_frame(to_frame(pose, frame), frame), pose, atol=1e-12)
@@ -120,7 +118,6 @@ def test_axes_that_make_no_frame_are_refused(axes: tuple[str, str]) -> None:
         HandFrame(*axes)
 
 
-@settings(max_examples=50, deadline=None)
 @given(pose=poses(), T_hand_link=poses())
 def test_moveit_grasps_round_trip(pose: np.ndarray, T_hand_link: np.ndarray) -> None:
     message = moveit_grasp(grasp(pose), "camera", T_hand_link=T_hand_link)
@@ -169,7 +166,6 @@ def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
     }
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     cases=st.lists(st.tuples(poses(), st.floats(0, 1), st.floats(0, 0.1)), max_size=3),
     T_object_cloud=poses(),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -34,7 +34,6 @@ DOWN, UP = np.array([[0.0, 0.0, -1.0]]), np.array([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("method", ["farthest", "uniform"])
-@settings(deadline=None)
 @given(seed=st.integers(0, SEED), count=st.integers(1, 60), size=st.integers(1, 40))
 def test_approach_points_are_different_rows(method: str, seed: int, count: int, size: int) -> None:
     points = np.random.default_rng(seed).normal(size=(size, 3)).astype(np.float32)
@@ -63,7 +62,6 @@ def random_pairs(seed: int, gripper: Gripper = PANDA) -> tuple[Cloud, Candidates
 
 
 @pytest.mark.parametrize("name", gripper_names())
-@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_poses_follow_the_definition_of_an_edge_grasp(name: str, seed: int) -> None:
     gripper = load_gripper(name)
@@ -98,7 +96,6 @@ def test_a_point_makes_no_edge_with_itself() -> None:
     assert len(edge_grasps(cloud, same, same, PANDA)) == 0
 
 
-@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_hands_are_drawn_back_just_out_of_the_table(seed: int) -> None:
     _, candidates, _ = random_pairs(seed)
@@ -180,18 +177,6 @@ def test_only_hands_on_wide_things_are_moved_and_copied_for_that() -> None:
     assert len(centred_grasps(wide.points, crop, candidates, PANDA)) > 0
     np.testing.assert_array_equal(candidates.T_cloud_hand, before)
     assert len(centred_grasps(wide.points, crop, Candidates.none(), PANDA)) == 0
-
-
-@pytest.mark.parametrize("name", ["robotiq-2f-85", "robotiq-2f-140", "wsg-50"])
-def test_every_hand_has_the_contact_between_its_fingers(name: str) -> None:
-    hand, cloud = load_gripper(name), can(0.075)
-    rng = np.random.default_rng(2)
-    approach = np.sort(rng.choice(900, 8, replace=False))
-    crop = crop_balls(cloud.points, approach, 0.07)
-    candidates = edge_grasps(cloud, approach[crop.ball_of_point], crop.ball_rows, hand)
-    with np.errstate(all="raise"):
-        further = centred_grasps(cloud.points, crop, candidates, hand)
-    assert np.isfinite(further.T_cloud_hand).all()
 
 
 @pytest.mark.parametrize(

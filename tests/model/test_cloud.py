@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp_model.errors import InvalidRequest
@@ -89,7 +89,6 @@ def sphere(count: int = 2000, radius: float = 0.05) -> np.ndarray:
     return (radius * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, SEED), size=st.floats(0.002, 0.1))
 def test_voxels_are_means_of_the_points_in_them_whatever_their_order(
     seed: int, size: float

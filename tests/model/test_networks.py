@@ -8,12 +8,12 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND, VN_EDGEGRASP
-from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND
 from edgegrasp_model.networks.layers import PackedLinear, ball_chunks, by_chunks
 
 from .scenes import SEED, TINY, RandomScene
@@ -34,54 +34,20 @@ def random(seed: int, *shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def as_written_in_the_paper(network: EdgeGraspNet, batch: BallBatch) -> torch.Tensor:
-    """The same network neighbour by neighbour and grasp by grasp, with none of the savings."""
-
-    def linear(layer, values):
-        return F.linear(values, layer.weight, layer.bias)
-
-    def convolve(conv, features):
-        outputs = []
-        for i, neighbors in enumerate(batch.neighbors):
-            offset = batch.points[neighbors] - batch.points[i]  # (k, 3)
-            hidden = linear(conv.hidden, torch.cat((features[neighbors], offset), dim=1)).relu()
-            outputs.append(linear(conv.output, hidden).max(0).values)
-        return torch.stack(outputs).relu()
-
-    f1 = convolve(network.conv1, torch.cat((batch.points, batch.normals), dim=1))
-    f2 = convolve(network.conv2, f1)
-    f3 = convolve(network.conv3, f2)
-    local = torch.cat((f1, f2, f3), dim=1)
-    logits = []
-    for contact, approach, depth in zip(batch.contact, batch.approach, batch.depth, strict=True):
-        in_ball = local[batch.ball_of_point == batch.ball_of_point[contact]]
-        pooled = network.ball_feature.mlp_1(in_ball).max(0).values
-        joined = torch.cat((in_ball, pooled.expand(len(in_ball), -1)), dim=1)
-        hidden = linear(network.ball_feature.join, joined).relu()
-        ball = network.ball_feature.mlp_2(hidden).max(0).values
-        grasp = torch.cat((batch.points[contact], batch.normals[contact], depth[None], approach))
-        hidden = linear(network.join, torch.cat((grasp, f3[contact], ball))).relu()
-        logits.append(network.classifier(hidden)[0])
-    return torch.stack(logits)
-
-
-@pytest.mark.parametrize(
-    ("config", "count"),
-    [(EDGEGRASP, 3_048_993), (VN_EDGEGRASP, 1_702_268), (EDGEGRASP_SMALL, 385_185)],
-)
-def test_parameter_counts(config, count):
-    assert sum(parameter.numel() for parameter in build_network(config).parameters()) == count
-
-
-def test_the_savings_change_no_score():
-    network, batch = build_network(TINY["edgegrasp"]).double(), RandomScene.of_seed(1).batch()
-    expected = as_written_in_the_paper(network, batch).detach()
-    assert expected.std() > 1e-4
-    torch.testing.assert_close(scores(network, batch), expected, rtol=0, atol=1e-12)
+@settings(max_examples=8)
+@given(seed=st.integers(0, SEED))
+def test_vn_scores_are_invariant_under_rotation_and_translation(seed):
+    rng, scene = np.random.default_rng(seed), RandomScene.of_seed(seed)
+    moved = scene.turned(Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3))
+    # In double precision no two vectors of a random cloud come within rounding of a tie.
+    network = build_network(TINY["vn-edgegrasp"]).double()
+    expected, found = scores(network, scene.batch()), scores(network, moved.batch())
+    assert expected.std() > 1e-6
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
 @architectures
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, SEED))
 def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, seed):
     network, scene = build_network(TINY[architecture]).double(), RandomScene.of_seed(seed)
@@ -136,19 +102,6 @@ def test_gradients_reach_every_parameter(architecture):
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.abs().max() > 0, name
-
-
-def test_gradients_are_those_of_finite_differences():
-    network, batch = build_network(TINY["edgegrasp"]).double(), RandomScene.of_seed(1).batch()
-    network(batch).sum().backward()
-    weight = network.conv1.hidden.weight
-    step = random(1, *weight.shape).double() * 1e-6
-    with torch.no_grad():
-        weight += step
-        above = network(batch).sum()
-        weight -= 2 * step
-        below = network(batch).sum()
-    torch.testing.assert_close((weight.grad * step).sum(), (above - below) / 2, rtol=1e-4, atol=0)
 
 
 def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone():

@@ -1,5 +1,5 @@
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -30,7 +30,6 @@ def test_the_widest_clearance_comes_first_then_the_score_decides() -> None:
     assert ranked(score, free, "clearance", clearance=clearance).tolist() == [1, 2, 0, 3]
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_rotation_distance_is_the_angle_or_that_of_the_flipped_hand(seed: int) -> None:
     one, other = Rotation.random(2, rng=np.random.default_rng(seed))

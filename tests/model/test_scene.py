@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
@@ -126,7 +126,6 @@ def least_distance(generators: np.ndarray, offset: np.ndarray) -> float:
     return float(np.sqrt(2 * lsq_linear(generators.T, offset, (-1, 1), tol=1e-14).cost))
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_distances_of_boxes_are_those_of_a_convex_optimiser(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -144,7 +143,6 @@ def test_distances_of_boxes_are_those_of_a_convex_optimiser(seed: int) -> None:
         assert swept[row] <= moved + 1e-9
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_boxes_moved_apart_by_their_depth_just_touch(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -178,9 +176,3 @@ def test_a_request_gives_boxes_in_the_canonical_frame() -> None:
         apart = np.linalg.norm(found[:, None] - want, axis=2)
         np.testing.assert_allclose(apart.min(axis=0), 0.0, atol=1e-6)
         np.testing.assert_allclose(apart.min(axis=1), 0.0, atol=1e-6)
-
-
-def test_no_boxes_hit_nothing() -> None:
-    none = SolidBoxes(np.empty((0, 3)), np.empty((0, 3, 3)))
-    assert separation(none, none).shape == signed_distance(none, none).shape == (0,)
-    assert separation(none, none, np.empty((0, 3))).shape == (0,)
