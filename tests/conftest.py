@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-# A busy machine fails no test and every run tries the same examples; `make fuzz` tries many new ones.
+# No busy machine fails a test, and every run tries the same examples; `make fuzz` tries new ones.
 settings.register_profile("tests", max_examples=20, deadline=None, derandomize=True)
 settings.register_profile(
     "fuzz",
