@@ -59,15 +59,6 @@ def test_balls_may_be_as_large_as_the_scene(
     assert metadata.network == replace(recipe("edgegrasp-small").network, crop_radius=0.5)
 
 
-def test_the_authors_checkpoint_becomes_one_file(
-    shared_dir: Path, run: Callable[..., str], tmp_path: Path
-) -> None:
-    weights = tmp_path / "vn-edgegrasp.safetensors"
-    run("import-checkpoint", shared_dir / "reference" / "vn_edge_grasp", weights)
-    _, metadata = load_checkpoint(weights)
-    assert metadata.name == metadata.network.architecture == "vn-edgegrasp"
-
-
 def test_an_experiment_writes_figures_and_goes_on_where_it_was(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

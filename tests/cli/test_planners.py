@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from edgegrasp_cli.planners.baselines import (
-    OwnCandidates,
     PaperCandidates,
     clean_cloud,
     paper_grasps,
@@ -141,16 +140,6 @@ def test_random_candidates_follow_the_seed_and_stay_above_the_table() -> None:
     assert not np.array_equal(poses, sampler(observation, np.random.default_rng(1)))
     few = replace(observation, cloud=observation.cloud[:5], view_ids=observation.view_ids[:5])
     assert len(sampler(few, np.random.default_rng(0))) == 0
-
-
-def test_our_own_candidates_are_those_of_a_detection() -> None:
-    observation = seen_under("edgegrasp")
-    options = {"collision": "avoid", "num_approach_points": 16, "num_candidates": 300}
-    sampler = OwnCandidates(PAPER, options)
-    poses = sampler(observation, np.random.default_rng(0))
-    assert 0 < len(poses) <= 300
-    assert np.array_equal(poses, sampler(observation, np.random.default_rng(0)))
-    assert (poses[:, 2, 2] < 1e-5 - 1.0).any()  # top-down grasps are among them
 
 
 FEW = {"num_approach_points": 8, "num_candidates": 100}

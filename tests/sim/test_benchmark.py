@@ -66,35 +66,6 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     assert attempts_digest(rounds) == digest
 
 
-def test_an_interrupted_run_goes_on_and_changes_nothing(
-    alone: tuple[BenchmarkConfig, str], tmp_path: Path
-) -> None:
-    config, digest = alone
-    folder = ResultFolder(tmp_path)
-    facts = manifest(config, {"name": "top-down"})
-    folder.open(facts)
-
-    def stop_after_two(done: object) -> None:
-        told.append(done)
-        if len(told) == 2:
-            raise KeyboardInterrupt
-
-    told: list[object] = []
-    with pytest.raises(KeyboardInterrupt):
-        run_benchmark(config, make_planner, folder=folder, on_round=stop_after_two)
-    assert len(folder.rounds()) == 2
-
-    folder.open(facts)
-    again: list[object] = []
-    rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
-    assert len(again) == 2
-    assert attempts_digest(rounds) == digest
-    assert attempts_digest(folder.rounds()) == digest
-
-    with pytest.raises(ValueError, match="different planner"):
-        folder.open(manifest(config, {"name": "other"}))
-
-
 def test_the_manifest_holds_what_decides_the_figures() -> None:
     config = BenchmarkConfig(SceneKind.PACKED, 2, protocol=TWO_OBJECTS)
     facts = json.loads(json.dumps(manifest(config, {"name": "top-down"})))
@@ -143,6 +114,8 @@ def test_a_killed_run_goes_on_and_changes_nothing(
     rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
     assert len(again) == 4 - kept
     assert attempts_digest(rounds) == attempts_digest(folder.rounds()) == digest
+    with pytest.raises(ValueError, match="different planner"):
+        folder.open(manifest(config, {"name": "other"}))
 
 
 # Starting a Ray cluster leaves sockets and processes to the garbage collector.

@@ -94,17 +94,6 @@ def test_tables_put_scenes_and_models_side_by_side() -> None:
     assert [line.get_label() for line in curves] == ["packed, a", "pile, a", "packed, b"]
 
 
-def test_baselines_name_their_planner_in_the_rows() -> None:
-    rows = [
-        {**result("planner", name, "pile", "", 0.4), "planner": {"name": name}}
-        for name in ("edge-sample", "oracle")
-    ]
-    table = experiment_table({"cases": rows})
-    assert table.splitlines()[0] == "| planner | pile: GSR | DR |"
-    assert "| oracle | 40.0 [" in table
-    experiment_figure({"cases": rows})
-
-
 def test_published_figures_are_found_by_protocol_scene_and_samples() -> None:
     methods = [row["method"] for row in published("edgegrasp", "packed", "64-4k")]
     assert methods == ["EdgeGraspNet", "VN-EdgeGraspNet"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edgegrasp_sim.picture import PALM_Z, STEM_LENGTH, TIP_Z, draw_grasps, fork
+from edgegrasp_sim.picture import TIP_Z, draw_grasps, fork
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,6 @@ def red_pixels(path: Path) -> int:
     image = imread(path)
     red, green, blue = image[..., 0], image[..., 1], image[..., 2]
     return int(((red > 0.7) & (green < 0.1) & (blue < 0.1)).sum())
-
-
-def test_fork_has_the_fingers_as_far_apart_as_the_width() -> None:
-    stem, palm, right, left = fork(np.eye(4), 0.06)
-    np.testing.assert_allclose(stem, [(0, 0, PALM_Z - STEM_LENGTH), (0, 0, PALM_Z)])
-    np.testing.assert_allclose(palm, [(0, -0.03, PALM_Z), (0, 0.03, PALM_Z)])
-    np.testing.assert_allclose(right[:, 2], [PALM_Z, TIP_Z])
-    np.testing.assert_allclose(left - right, [(0, 0.06, 0)] * 2)
 
 
 def test_fork_follows_the_hand() -> None:

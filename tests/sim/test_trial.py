@@ -68,14 +68,6 @@ def test_top_down_grasps_clear_a_scene_of_cubes(
         assert attempt.object == ("cube" if attempt.outcome is GraspOutcome.SUCCESS else None)
 
 
-@pytest.mark.parametrize("scene", SceneKind)
-def test_top_down_grasps_find_builtin_objects(run: Callable[..., Round], scene: SceneKind) -> None:
-    rounds = [run(plan_top_down, scene, 5, index=index) for index in range(2)]
-    objects = sum(len(done.objects) for done in rounds)
-    assert objects >= 6
-    assert sum(done.successes for done in rounds) >= 0.3 * objects
-
-
 def test_two_failures_in_a_row_end_a_round(run: Callable[..., Round]) -> None:
     done = run(lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
     assert done.end is RoundEnd.FAILURES

@@ -148,24 +148,6 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
     assert digest in card
 
 
-def test_pausing_and_resuming_with_a_teacher_is_the_same_as_going_through(
-    make_trainer: MakeTrainer, teacher: Teacher, tmp_path: Path
-) -> None:
-    def run(folder: str, until: int) -> Trainer:
-        made = make_trainer(
-            tmp_path / folder, "balls", teacher=teacher, schedule="cosine", rotations="none"
-        )
-        made.run(lambda step, loss: None, until=until)
-        return made
-
-    through = run("through", 12)
-    run("paused", 7)
-    resumed = run("paused", 12)
-    assert resumed.step == through.step == 12
-    for name, weight in through.network.state_dict().items():
-        torch.testing.assert_close(weight, resumed.network.state_dict()[name], rtol=0, atol=0)
-
-
 def test_only_hands_teach_and_only_balls_are_taught(
     make_trainer: MakeTrainer, networks: Networks, teacher: Teacher, tmp_path: Path
 ) -> None:
