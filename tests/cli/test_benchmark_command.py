@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 OWN_PLANNER = """
 from edgegrasp_sim.top_down import plan_top_down

@@ -13,7 +13,7 @@ from edgegrasp_cli.planners.baselines import (
 )
 from edgegrasp_cli.planners.choice import PlannerChoice, named_planner, open_planner
 from edgegrasp_cli.planners.detection import request_options, select_grasp
-from edgegrasp_cli.planners.validate import FUSED_VOXEL, densities, reference_successes
+from edgegrasp_cli.planners.validate import reference_successes
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_sim.camera import Observation
@@ -222,16 +222,3 @@ def test_every_candidate_of_a_labelled_view_counts_alike(tmp_path: Path) -> None
     assert share.views == 2
     with pytest.raises(FileNotFoundError, match=r"pile_\*\.npz"):
         reference_successes(tmp_path, SceneKind.PILE)
-
-
-def test_only_resampled_surfaces_are_equally_dense() -> None:
-    def cloud(voxel: float) -> list[float]:
-        with ClutterSimulation() as simulation:
-            simulation.reset(SceneKind.PACKED, np.random.default_rng(0), 3)
-            streams = np.random.default_rng(1), np.random.default_rng(2)
-            seen = simulation.observe(*streams, surface_voxel=voxel)
-        return densities([(seen.cloud, seen.camera_position)])
-
-    pixels, resampled = cloud(0.0), cloud(FUSED_VOXEL)
-    assert pixels[-1] > 2 * pixels[1]
-    assert max(resampled[1:]) < 1.6 * min(resampled[1:])

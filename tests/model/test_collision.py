@@ -21,7 +21,6 @@ from .scenes import PANDA
 
 HAND = np.eye(4, dtype=np.float32)[None]
 POSES = 600
-SWEPT_POSES = 150
 DOUBT = 0.0005  # metres around touching in which neither is held to be right
 DOT = 0.0005  # radius of the spheres that stand for points, metres
 FLOOR = -0.08  # height of the support plane, metres

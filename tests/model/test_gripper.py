@@ -132,13 +132,6 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> No
     assert np.expm1(described[2]).round() >= hands
 
 
-def test_a_bracket_beside_the_fingers_is_no_palm() -> None:
-    fields = panda_fields()
-    fields["hand"]["boxes"].append([[0.04, -0.02, 0.0], [0.09, 0.02, 0.1]])
-    assert gripper_from_fields(fields).palm_z == 0.0658
-    assert len(gripper_from_fields(fields).boxes(0.05)) == 4
-
-
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [

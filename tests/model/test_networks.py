@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F  # noqa: N812
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -14,7 +13,7 @@ from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND
-from edgegrasp_model.networks.layers import PackedLinear, ball_chunks, by_chunks
+from edgegrasp_model.networks.layers import PackedLinear
 
 from .scenes import SEED, TINY, RandomScene
 
@@ -121,20 +120,6 @@ def test_a_batch_without_grasps_has_no_scores(architecture):
 
 @has_onednn
 @libraries
-@pytest.mark.parametrize("outputs", [1, 24])
-def test_a_product_is_the_linear_layer_whatever_the_library(monkeypatch, onednn, outputs):
-    monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
-    weight, bias, values = random(1, outputs, 40), random(2, outputs), random(3, 70, 40)
-    own = weight[:, 3:30]  # a part of a matrix, as shared layers have
-    expected = F.linear(values[:, 3:30], own, bias)
-    for rectified in (False, True):
-        with torch.inference_mode():
-            found = PackedLinear(own, bias, rectified=rectified)(values[:, 3:30])
-        torch.testing.assert_close(found, expected.relu() if rectified else expected)
-
-
-@has_onednn
-@libraries
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, threads):
     monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
@@ -151,29 +136,6 @@ def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, thre
                     assert torch.equal(torch.roll(moved, -shift, dims=0), whole)
     finally:
         torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize("gradients", [False, True])
-def test_a_layer_by_pieces_is_the_layer(gradients):
-    mlp, values = layers.mlp((6, 16, 16, 3)), random(1, 75, 6)
-    with torch.set_grad_enabled(gradients):
-        found = by_chunks(mlp, values, rows=32)
-    torch.testing.assert_close(found, mlp(values))
-    assert found.requires_grad == gradients
-
-
-@pytest.mark.parametrize("rows", [3, 16, 1000])
-def test_pieces_hold_every_row_and_the_maxima_are_those_of_the_balls(rows):
-    batch = RandomScene.of_seed(1).batch(torch.float32)
-    values = random(1, len(batch.points), 5)
-    expected = torch.stack([ball.amax(0) for ball in torch.split(values, batch.ball_sizes)])
-    with torch.no_grad():
-        pieces, found = ball_chunks(values, batch, rows), layers.BallMaximum(batch.num_balls)
-        for piece in pieces:
-            assert len(piece.values) == len(piece.ball_of_point) == sum(piece.sizes) == rows
-            found.add(piece.values, piece)
-    assert torch.equal(torch.cat([piece.values for piece in pieces])[: len(values)], values)
-    assert torch.equal(found.result(), expected)
 
 
 @pytest.mark.parametrize(

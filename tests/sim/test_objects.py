@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim.benchmark import BenchmarkConfig, run_benchmark
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import (
     FAMILIES,
@@ -21,7 +20,6 @@ from edgegrasp_sim.objects import (
     write_family,
 )
 from edgegrasp_sim.scene import add_table, load_object
-from edgegrasp_sim.top_down import plan_top_down
 
 MARGIN = 0.006  # metres that the engine's boxes are wider than what is in them
 
@@ -128,16 +126,6 @@ def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_pa
     for file in sorted(urdf.parent.iterdir()):
         assert (again.parent / file.name).read_bytes() == file.read_bytes()
     assert not list(cache.glob(".unfinished*"))
-
-
-def test_rounds_run_on_a_folder_of_meshes(meshes: Path, cache: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "packed" / "test"
-    folder.mkdir(parents=True)
-    (folder / "ring.obj").write_bytes((meshes / "ring.obj").read_bytes())
-    config = BenchmarkConfig(SceneKind.PACKED, 1, objects=tmp_path)
-    (done,) = run_benchmark(config, lambda: plan_top_down)
-    assert set(done.objects) == {"ring"}
-    assert done.attempts
 
 
 @pytest.mark.parametrize(

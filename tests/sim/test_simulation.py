@@ -2,13 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.camera import WORKSPACE, look_at
 from edgegrasp_sim.engine import ASSETS, World
 from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
-from edgegrasp_sim.poses import quaternion_xyzw, require_pose, translation
+from edgegrasp_sim.poses import require_pose, translation
 from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.validate import measure_agreement
@@ -255,17 +254,6 @@ def test_outcomes_agree_with_the_reference_simulator(
     agreement = measure_agreement(shared_dir, kind, grasps_per_scene=20, to_the_end=to_the_end)
     assert agreement.tried == (20,) * 4
     assert agreement.share >= LEAST_AGREEMENT[kind]
-
-
-def test_quaternions_are_those_of_the_rotation() -> None:
-    turns = Rotation.random(100, rng=np.random.default_rng(0))
-    halves = Rotation.from_rotvec(np.pi * np.eye(3))
-    for rotation in Rotation.concatenate([turns, halves]):
-        T = np.eye(4)
-        T[:3, :3] = rotation.as_matrix()
-        quaternion = quaternion_xyzw(T)
-        assert np.linalg.norm(quaternion) == pytest.approx(1.0)
-        assert abs(np.dot(quaternion, rotation.as_quat())) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

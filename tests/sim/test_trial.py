@@ -162,17 +162,6 @@ def test_a_planner_may_try_grasps_in_the_scene(run: Callable[..., Round]) -> Non
     assert done.successes == len(done.attempts)
 
 
-def test_a_round_can_be_driven_by_hand(cubes: ClutterSimulation, paper_with: MakeProtocol) -> None:
-    driver = RoundDriver(cubes, PACKED, paper_with(1), seed=0, index=0)
-    grasp = driver.plan(plan_top_down, driver.look())
-    assert grasp is not None
-    attempt = driver.execute(grasp)
-    assert attempt.success
-    assert attempt.target == attempt.object == "cube"
-    assert driver.end is RoundEnd.CLEARED
-    assert driver.result().attempts == (attempt,)
-
-
 @pytest.mark.parametrize("name", ["giga", "vgn", "robot"])
 def test_other_protocols_run(simulation: ClutterSimulation, name: str) -> None:
     rules = load_protocol(name)
@@ -195,13 +184,3 @@ def test_a_watched_round_is_the_same(
     watched = run(plan_top_down, PACKED, 2, on_grasp=Window(simulation.world).show)
     assert attempts_digest([plain]) == attempts_digest([watched])
     assert [lines.shape for lines in drawn] == [(4, 2, 3)] * len(plain.attempts)
-
-
-def test_the_space_bar_pauses_and_resumes(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    presses = iter([True, False, False, True, False])
-    shown = Window(world)
-    monkeypatch.setattr(World, "space_pressed", lambda world: next(presses))
-    world.step()  # goes on after the second press
-    assert not shown.paused
-    world.step()
-    assert next(presses, None) is None
