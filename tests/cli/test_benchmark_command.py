@@ -39,9 +39,7 @@ def test_the_oracle_is_above_random_candidates(oracle: Path, edge_sample: Path) 
     assert ceiling["declutter_rate"]["value"] > baseline["declutter_rate"]["value"]
 
 
-def test_a_planner_of_one_s_own_needs_only_its_name(
-    benchmark: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planner_of_one_s_own_needs_only_its_name(benchmark, tmp_path, monkeypatch) -> None:
     (tmp_path / "my_planner.py").write_text(OWN_PLANNER)
     monkeypatch.syspath_prepend(tmp_path)
     as_class = benchmark(tmp_path / "class", "my_planner:MyPlanner", rounds=1)
@@ -87,9 +85,7 @@ def test_a_recorded_attempt_comes_out_the_same(oracle: Path, run, tmp_path: Path
     assert picture.read_bytes()[1:4] == b"PNG"
 
 
-def test_wrong_replays_and_comparisons_end_with_a_sentence(
-    oracle: Path, benchmark: Callable, refused, tmp_path: Path
-) -> None:
+def test_wrong_replays_and_comparisons_end_with_a_sentence(oracle, benchmark, refused, tmp_path):
     assert "attempt is 99" in refused("replay", "attempt", oracle, "--attempt", 99)
     assert "round is 7" in refused("replay", "attempt", oracle, "--round", 7)
     assert "holds no benchmark" in refused("replay", "attempt", tmp_path)
@@ -98,9 +94,7 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(
     assert "differ in protocol" in refused("compare", oracle, tmp_path)
 
 
-def test_two_planners_are_compared_scene_by_scene(
-    oracle: Path, edge_sample: Path, run, tmp_path: Path
-) -> None:
+def test_two_planners_are_compared_scene_by_scene(oracle, edge_sample, run, tmp_path) -> None:
     output = run("compare", edge_sample, oracle, "--output", tmp_path / "compared.json")
     assert "2 scenes" in output
     compared = json.loads((tmp_path / "compared.json").read_text())
@@ -109,16 +103,6 @@ def test_two_planners_are_compared_scene_by_scene(
         assert compared[name]["difference"] == pytest.approx(ceiling - base)
         low, high = compared[name]["difference_95"]
         assert low <= compared[name]["difference"] <= high
-
-
-def test_both_transports_give_the_same_attempts(
-    dummy_server, benchmark: Callable, tmp_path: Path
-) -> None:
-    digests = {
-        benchmark(tmp_path / str(number), "server", "--server", address)["attempts_digest"]
-        for number, address in enumerate((dummy_server.http_url, dummy_server.grpc_address))
-    }
-    assert len(digests) == 1
 
 
 def test_a_server_killed_and_restarted_changes_nothing(

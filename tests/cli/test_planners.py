@@ -103,9 +103,7 @@ MOST_KEPT = 1500  # candidates that the reference kept of a scene
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_random_candidates_and_their_clouds_are_the_reference_s(
-    shared_dir: Path, name: str
-) -> None:
+def test_random_candidates_and_their_clouds_are_the_reference_s(shared_dir, name) -> None:
     golden = np.load(shared_dir / "reference" / "golden" / f"{name}.npz")
     edges, kept = golden["ball_edges"].astype(np.int64), golden["edge_rows"]
     theirs = Cloud(golden["points"], golden["normals"])
@@ -182,9 +180,7 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
         pass
 
 
-def test_another_package_may_name_its_planner(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_package_may_name_its_planner(tmp_path, monkeypatch) -> None:
     about = tmp_path / "their_package-0.1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 0.1\n")

@@ -171,9 +171,7 @@ def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
     T_object_cloud=poses(),
     T_hand_gripper=poses(),
 )
-def test_isaac_grasps_round_trip(
-    cases: list[Any], T_object_cloud: np.ndarray, T_hand_gripper: np.ndarray
-) -> None:
+def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
     grasps = [grasp(*case) for case in cases]
     text = isaac_grasps(
         grasps,

@@ -120,9 +120,7 @@ DESCRIBED = [
 
 
 @pytest.mark.parametrize(("problem", "expected"), DESCRIBED, ids=lambda value: str(value)[:40])
-def test_errors_that_the_server_describes(
-    problem: Problem, expected: type[GraspClientError], failing, cloud
-) -> None:
+def test_errors_that_the_server_describes(problem, expected, failing, cloud) -> None:
     client, server = failing([problem], retry=False)
     with pytest.raises(expected, match="what happened") as caught:
         client.detect(cloud)

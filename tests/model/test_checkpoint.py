@@ -138,9 +138,7 @@ def test_damaged_weights_are_refused(path: Path, value: float) -> None:
         load_checkpoint(path)
 
 
-def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(
-    path: Path,
-) -> None:
+def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(path) -> None:
     loaded, read = load_checkpoint(path)
     check_reference_logits(loaded, read)
     check_reference_logits(loaded, replace(read, reference_logits=()))  # of older files

@@ -138,9 +138,7 @@ def bullet_scene() -> BulletScene:
 
 
 @pytest.mark.parametrize("margin", [0.0, 0.004])
-def test_hands_at_rest_collide_where_bullet_says_so(
-    bullet_scene: BulletScene, margin: float
-) -> None:
+def test_hands_at_rest_collide_where_bullet_says_so(bullet_scene, margin) -> None:
     hands = hands_about_the_points(POSES, seed=2)
     found = collides(scene(), hands, PANDA, Collision(approach_length=0.0, margin=margin))
     measured = clearances(scene(), hands, PANDA)

@@ -92,9 +92,7 @@ def test_too_many_points_are_thinned_evenly() -> None:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @given(seed=st.integers(0, SEED))
-def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(
-    mirrored: bool, seed: int
-) -> None:
+def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(mirrored, seed) -> None:
     cloud, candidates = scene(seed)
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)

@@ -48,9 +48,7 @@ def test_hands_see_the_points_within_reach(seed: int) -> None:
 
 @grippers
 @pytest.mark.parametrize("count", [30, 2000])
-def test_hands_hit_the_points_in_their_boxes_and_are_as_far_from_them(
-    name: str, count: int
-) -> None:
+def test_hands_hit_the_points_in_their_boxes_and_are_as_far_from_them(name, count) -> None:
     gripper, points = load_gripper(name), cloud(1, count)
     boxes = gripper.boxes(gripper.max_opening)
     distance = oracles.signed_distance_to_boxes(points, HANDS, boxes)

@@ -56,9 +56,7 @@ def logits(network: torch.nn.Module, batch: BallBatch) -> np.ndarray:
 
 
 @scenes
-def test_vn_logits_correlate_and_the_best_grasp_is_the_same(
-    shared_dir: Path, vn_network: torch.nn.Module, scene: str
-) -> None:
+def test_vn_logits_correlate_and_the_best_grasp_is_the_same(shared_dir, vn_network, scene) -> None:
     batch, golden = golden_batch(shared_dir, scene)
     scores = logits(vn_network, batch)
     assert np.corrcoef(scores, golden)[0, 1] >= 0.995
@@ -68,9 +66,7 @@ def test_vn_logits_correlate_and_the_best_grasp_is_the_same(
 
 
 @scenes
-def test_edgegrasp_logits_are_the_same(
-    shared_dir: Path, random_network: torch.nn.Module, scene: str
-) -> None:
+def test_edgegrasp_logits_are_the_same(shared_dir, random_network, scene) -> None:
     batch, _ = golden_batch(shared_dir, scene)
     golden = np.load(shared_dir / "reference" / "edge_grasp_random" / "logits.npz")[scene]
     np.testing.assert_allclose(logits(random_network, batch), golden, rtol=0, atol=1e-3)

@@ -61,9 +61,7 @@ def test_python_example_prints_five_grasps(dummy_server, cloud_file: Path) -> No
     assert over_grpc.stdout.partition("counts")[0] == over_rest.stdout.partition("counts")[0]
 
 
-def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(
-    dummy_server, cloud_file: Path
-) -> None:
+def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(dummy_server, cloud_file) -> None:
     few = cloud_file.with_name("few.npy")
     np.save(few, np.zeros((3, 3), np.float32))
     names = [str(cloud_file), str(few), str(cloud_file)]

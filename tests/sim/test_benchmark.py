@@ -93,9 +93,7 @@ def test_wrong_settings_are_refused(tmp_path: Path) -> None:
     assert available_cores() >= 1
 
 
-def test_a_killed_run_goes_on_and_changes_nothing(
-    alone: tuple[BenchmarkConfig, str], tmp_path: Path
-) -> None:
+def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     config, digest = alone
     folder = ResultFolder(tmp_path)
     folder.open(manifest(config, {"name": "top-down"}))
@@ -153,9 +151,7 @@ def test_errors_on_a_cluster_are_those_of_a_process_here(
         run_benchmark(alone[0], make_planner, ray="local")
 
 
-def test_a_missing_ray_or_cluster_is_named(
-    alone: tuple[BenchmarkConfig, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:
     config, _ = alone
     with pytest.raises(ValueError, match="differ between the machines"):
         RoundRunner(config, make_planner, digest="another digest")

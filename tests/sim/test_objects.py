@@ -136,9 +136,7 @@ def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_pa
         ("v 0 0 zero\nf 1 2 3\n", "cannot be read"),
     ],
 )
-def test_a_file_without_a_solid_is_refused(
-    cache: Path, tmp_path: Path, content: str, message: str
-) -> None:
+def test_a_file_without_a_solid_is_refused(cache, tmp_path, content, message) -> None:
     pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
     (tmp_path / "thing.obj").write_text(content)
     with pytest.raises(ValueError, match=rf"thing\.obj.*({message})"):
@@ -153,9 +151,7 @@ def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("package", ["coacd", "trimesh"])
-def test_a_missing_package_is_named(
-    meshes: Path, cache: Path, package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named(meshes, cache, package, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(RuntimeError, match=rf"{package} is not .*edgegrasp\[meshes\]"):
         ObjectSet.from_folder(meshes, SceneKind.PILE)

@@ -40,9 +40,7 @@ def grasps_near(simulation: ClutterSimulation, number: int) -> list[np.ndarray]:
     ]
 
 
-def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(
-    simulation: ClutterSimulation,
-) -> None:
+def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(simulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     before = simulation.placements
     result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))  # in the air
@@ -123,9 +121,7 @@ def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimu
     assert simulation.execute_grasp(grasps[0]).opening == last.opening
 
 
-def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(
-    simulation: ClutterSimulation,
-) -> None:
+def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation) -> None:
     simulation.reset("pile", np.random.default_rng(5))
     steps = 0
 
@@ -248,9 +244,7 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
 @pytest.mark.parametrize(
     ("kind", "to_the_end"), [(SceneKind.PACKED, True), (SceneKind.PILE, False)]
 )
-def test_outcomes_agree_with_the_reference_simulator(
-    shared_dir: Path, kind: SceneKind, to_the_end: bool
-) -> None:
+def test_outcomes_agree_with_the_reference_simulator(shared_dir, kind, to_the_end) -> None:
     agreement = measure_agreement(shared_dir, kind, grasps_per_scene=20, to_the_end=to_the_end)
     assert agreement.tried == (20,) * 4
     assert agreement.share >= LEAST_AGREEMENT[kind]

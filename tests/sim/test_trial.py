@@ -58,9 +58,7 @@ def cubes() -> Iterator[ClutterSimulation]:
         yield simulation
 
 
-def test_top_down_grasps_clear_a_scene_of_cubes(
-    cubes: ClutterSimulation, paper_with: MakeProtocol
-) -> None:
+def test_top_down_grasps_clear_a_scene_of_cubes(cubes, paper_with) -> None:
     done = run_round(cubes, plan_top_down, PACKED, paper_with(3), seed=0, index=0)
     assert done.end is RoundEnd.CLEARED
     assert done.successes == len(done.objects) == 3
@@ -90,9 +88,7 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert len(set(clouds)) == 3  # a new view every time
 
 
-def test_scenes_and_views_do_not_depend_on_the_planner(
-    run: Callable[..., Round], paper_with: MakeProtocol
-) -> None:
+def test_scenes_and_views_do_not_depend_on_the_planner(run, paper_with) -> None:
     first_clouds = []
 
     def keep_first(seen: Observation, seed: int) -> PlannedGrasp:
@@ -116,9 +112,7 @@ def test_a_round_repeats_exactly(run: Callable[..., Round]) -> None:
         run(plan_top_down, PILE, 3, seed=-1)
 
 
-def test_an_unavailable_planner_is_asked_again_and_changes_nothing(
-    run: Callable[..., Round], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unavailable_planner_is_asked_again_and_changes_nothing(run, monkeypatch) -> None:
     monkeypatch.setattr(trial, "FIRST_WAIT", 0.001)
     asked = 0
 
@@ -173,9 +167,7 @@ def test_other_protocols_run(simulation: ClutterSimulation, name: str) -> None:
     assert (on_table.mean() > 0.3) == (name == "robot")
 
 
-def test_a_watched_round_is_the_same(
-    run: Callable[..., Round], simulation: ClutterSimulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watched_round_is_the_same(run, simulation, monkeypatch) -> None:
     monkeypatch.setattr(window, "SHOW_SECONDS", 0.0)
     monkeypatch.setattr(window, "TIME_STEP", 0.0)
     drawn: list[np.ndarray] = []  # there is no window to draw in

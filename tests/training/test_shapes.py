@@ -86,9 +86,7 @@ def _extents(model: ObjectModel) -> np.ndarray:
         return high - low
 
 
-def test_a_stretched_object_is_longer_by_each_factor(
-    shapes: tuple[ObjectModel, ...], tmp_path: Path
-) -> None:
+def test_a_stretched_object_is_longer_by_each_factor(shapes, tmp_path) -> None:
     bowl = next(model for model in shapes if model.name == "made-bowl")
     longer = stretched(bowl, (1.3, 0.8, 2.0), tmp_path / "stretched")
     assert longer.name == "made-bowl"
@@ -112,9 +110,7 @@ def test_objects_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
         stretched(ObjectModel("box", path), (1.0, 1.0, 1.0), tmp_path)
 
 
-def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(
-    shapes: tuple[ObjectModel, ...], tmp_path: Path
-) -> None:
+def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_path) -> None:
     plain = ObjectSet("plain", shapes[:4])
 
     def descriptions(folder: str, seed: int) -> dict[str, str]:

@@ -99,9 +99,7 @@ def test_no_test_object_is_in_a_training_view(shared_dir: Path, kind: SceneKind)
 
 
 @pytest.mark.parametrize("kind", SceneKind)
-def test_no_test_object_is_in_the_data_of_the_shipped_weights(
-    shared_dir: Path, kind: SceneKind
-) -> None:
+def test_no_test_object_is_in_the_data_of_the_shipped_weights(shared_dir, kind) -> None:
     card = (SAMPLE.parents[1] / "docs" / "training_data.md").read_text()
     listed = re.findall(r"^- (\S+) `([0-9a-f]{64})`: \d+$", card, re.MULTILINE)
     assert len(listed) > 300
