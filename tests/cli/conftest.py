@@ -54,7 +54,7 @@ def benchmark(run: Command) -> Callable[..., dict[str, Any]]:
 @pytest.fixture(scope="session")
 def oracle(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("oracle")
-    benchmark(folder, "oracle", "--num-approach-points", 8, "--num-candidates", 60)
+    benchmark(folder, "oracle", "--num-approach-points", 16, "--num-candidates", 200)
     return folder
 
 
