@@ -6,7 +6,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json proto/openapi.json
+GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json \
+	proto/edgegrasp/v1/grasp.proto proto/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
 .DEFAULT_GOAL := help
 .PHONY: help venv lint format test bench fuzz demo proto constraints clean
@@ -29,8 +30,8 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/mypy $(wildcard examples/*.py)
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/unasync.py --check
-	mkdir -p build/proto
-	PYTHON=$(BIN)/python scripts/generate_proto.sh build/proto
+	mkdir -p build
+	PYTHON=$(BIN)/python scripts/generate_proto.sh build
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
 
 format: $(INSTALLED) ## rewrite the code in the project's style

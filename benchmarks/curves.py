@@ -8,7 +8,6 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,29 +50,30 @@ def main() -> None:
 def curves(observation: Observation) -> dict[str, dict[int, Callable[[], object]]]:
     """What to run for each value of each quantity."""
     small, cloud = detector(EDGEGRASP_SMALL), observation.cloud
-    clouds = {count: cloud_of(count, cloud) for count in POINTS}
-    usual = request(observation)
 
-    def threaded(count: int) -> None:
-        torch.set_num_threads(count)
-        try:
-            small.detect(cloud, usual)
-        finally:
+    def detect(
+        points: int | None = None, threads: int = 1, *, every: bool = False, **numbers: int
+    ) -> Callable[[], object]:
+        seen = cloud if points is None else cloud_of(points, cloud)
+        options = request(observation, **numbers)
+        if every:
+            options = options.model_copy(update={"collision": Collision(mode="ignore")})
+
+        def run() -> None:
+            torch.set_num_threads(threads)
+            small.detect(seen, options)
             torch.set_num_threads(1)
 
-    def around(approach_points: int) -> Callable[[], object]:
-        return partial(small.detect, cloud, request(observation, approach_points))
+        return run
 
-    def scoring(candidates: int) -> Callable[[], object]:
-        asked = request(observation, MANY_APPROACH_POINTS, candidates)
-        every = asked.model_copy(update={"collision": Collision(mode="ignore")})
-        return partial(small.detect, cloud, every)
-
+    many = {"num_approach_points": MANY_APPROACH_POINTS, "every": True}
     return {
-        "points": {n: partial(small.detect, clouds[n], usual) for n in POINTS},
-        "approach points": {n: around(n) for n in APPROACH_POINTS},
-        f"candidates ({MANY_APPROACH_POINTS} approach points)": {n: scoring(n) for n in CANDIDATES},
-        "threads": {n: partial(threaded, n) for n in THREADS},
+        "points": {n: detect(n) for n in POINTS},
+        "approach points": {n: detect(num_approach_points=n) for n in APPROACH_POINTS},
+        f"candidates ({MANY_APPROACH_POINTS} approach points)": {
+            n: detect(num_candidates=n, **many) for n in CANDIDATES
+        },
+        "threads": {n: detect(threads=n) for n in THREADS},
     }
 
 
@@ -109,7 +109,9 @@ def peak_memory(run: Callable[[], object]) -> float:
 def draw(curves: Mapping[str, Any], path: Path) -> None:
     """Time above memory, a column for each quantity."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
+    short = EngFormatter(sep="")  # 1000 as 1k
     figure = Figure(figsize=(14, 5), layout="constrained")
     axes = figure.subplots(2, len(curves), sharex="col", squeeze=False)
     for (above, below), (name, curve) in zip(axes.T, curves.items(), strict=True):
@@ -119,20 +121,11 @@ def draw(curves: Mapping[str, Any], path: Path) -> None:
             plot.set(xscale="log", ylim=(0, 1.1 * max(measured)))  # room for the highest marker
             plot.grid(visible=True, alpha=0.3)
         below.set(xlabel=name)
-        below.set_xticks(values, [_in_short(value) for value in values], minor=False)
+        below.set_xticks(values, [short(value) for value in values], size="small")
         below.minorticks_off()
-        below.tick_params(axis="x", labelsize="small")
     axes[0, 0].set_ylabel("seconds")
     axes[1, 0].set_ylabel("peak memory, MB")
     figure.savefig(path, dpi=90)
-
-
-def _in_short(count: int) -> str:
-    """1000 as 1k."""
-    for unit, name in ((1_000_000, "M"), (1_000, "k")):
-        if count >= unit:
-            return f"{count // unit}{name}"
-    return str(count)
 
 
 if __name__ == "__main__":

@@ -7,23 +7,21 @@ request must have an outcome, the server's memory must not have grown, and it mu
 """
 
 import argparse
-import http.client
 import io
 import json
 import queue
-import socket
 import sys
 import threading
 import time
-import urllib.parse
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import grpc
+import httpx
 import numpy as np
 from benchmarks.measuring import RESULTS, Served, served, write_results
 from numpy.typing import NDArray
@@ -104,13 +102,14 @@ def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
     def report(plan: Plan, transport: str, came: str, seconds: float) -> None:
         outcomes.put((plan, transport, came, seconds))
 
+    ways = {
+        send_unary: server.grpc_address,
+        send_streams: server.grpc_address,
+        send_rest: server.http_url,
+    }
     threads = [
-        threading.Thread(target=work, args=(address, next_plans, report), daemon=True)
-        for work, address in (
-            (send_unary, server.grpc_address),
-            (send_streams, server.grpc_address),
-            (send_rest, server.http_url),
-        )
+        threading.Thread(target=send, args=(address, next_plans, report), daemon=True)
+        for send, address in ways.items()
         for _ in range(EACH)
     ]
     start = time.monotonic()
@@ -130,8 +129,7 @@ def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
         came[f"{transport} {plan.kind}: {outcome}"] += 1
         slowest = max(slowest, seconds)
         if outcome not in EXPECTED[plan.kind]:
-            wrong.append({"number": plan.number, "kind": plan.kind, "points": plan.size,
-                          "transport": transport, "outcome": outcome})  # fmt: skip
+            wrong.append({**asdict(plan), "transport": transport, "outcome": outcome})
         if done % every == 0:
             memory.append((done, server.memory()))
     for thread in threads:
@@ -147,7 +145,7 @@ def soak(server: Served, todo: Iterator[Plan], requests: int) -> dict[str, Any]:
         "memory_slope_mb_per_1000": slope(memory, requests),
         "memory_most_mb": round(max(used for _, used in memory), 1),
         "server_threads": server.threads(),
-        "server_files": settled_files(server),
+        "server_files": server.files(),
     }
 
 
@@ -157,16 +155,6 @@ def slope(memory: list[tuple[int, float]], requests: int) -> float:
     if len(after) < 2:
         return 0.0
     return round(float(np.polyfit(after[:, 0] / 1000, after[:, 1], 1)[0]), 4)
-
-
-def settled_files(server: Served) -> int:
-    """Open files once the connections of the clients are closed."""
-    for _ in range(50):
-        before = server.files()
-        time.sleep(0.1)
-        if server.files() == before:
-            break
-    return server.files()
 
 
 def faults(results: dict[str, Any]) -> list[str]:
@@ -186,22 +174,17 @@ def faults(results: dict[str, Any]) -> list[str]:
 
 def message(plan: Plan) -> grasp_pb2.DetectGraspsRequest:
     """A request as gRPC carries it; malformed in one of several ways."""
-    points = plan.points()
-    if plan.kind == "malformed":
-        match plan.number % 5:
-            case 0:
-                return grasp_pb2.DetectGraspsRequest()
-            case 1:
-                return grasp_pb2.DetectGraspsRequest(points=points.tobytes()[:-1])
-            case 2:
-                points[-1] = np.nan
-            case 3:
-                file = grasp_pb2.EncodedCloud(format="ply", data=points.tobytes())
-                return grasp_pb2.DetectGraspsRequest(encoded=file)
-            case _:
-                options = grasp_pb2.DetectOptions(seed=-1)
-                return grasp_pb2.DetectGraspsRequest(points=points.tobytes(), options=options)
-    return grasp_pb2.DetectGraspsRequest(points=points.tobytes())
+    points, request = plan.points(), grasp_pb2.DetectGraspsRequest
+    if plan.kind != "malformed":
+        return request(points=points.tobytes())
+    holes = np.where(np.arange(len(points))[:, None] == 7, np.float32(np.nan), points)
+    return [
+        request(),
+        request(points=points.tobytes()[:-1]),
+        request(points=holes.tobytes()),
+        request(encoded=grasp_pb2.EncodedCloud(format="ply", data=points.tobytes())),
+        request(points=points.tobytes(), options=grasp_pb2.DetectOptions(seed=-1)),
+    ][plan.number % 5]
 
 
 def outcome(plan: Plan, code: str, digest: int | None) -> str:
@@ -247,31 +230,28 @@ def send_streams(address: str, next_plans: NextPlans, report: Report) -> None:
 
 
 def _stream(stub: Any, plans: list[Plan], report: Report) -> None:
-    start = time.monotonic()
-    to_send: queue.SimpleQueue[Plan | None] = queue.SimpleQueue()
+    start, done = time.monotonic(), threading.Event()
+
+    def requests() -> Iterator[grasp_pb2.DetectGraspsStreamRequest]:
+        for plan in plans:
+            number, request = str(plan.number), message(plan)
+            yield grasp_pb2.DetectGraspsStreamRequest(request_id=number, request=request)
+        if plans[-1].kind == "cancelled":  # the stream is still open when its client leaves
+            done.wait(SECONDS)
+
+    call = stub.DetectGraspsStream(requests(), timeout=SECONDS)
     for plan in plans:
-        to_send.put(plan)
-    left = [plan for plan in plans if plan.kind == "cancelled"]
-    if not left:
-        to_send.put(None)
-    call = stub.DetectGraspsStream(_requests(to_send), timeout=SECONDS)
-    unanswered = plans[: len(plans) - len(left)]
-    try:
-        while unanswered:
-            came = _stream_answer(unanswered[0], next(call, None))
-            report(unanswered.pop(0), "stream", came, time.monotonic() - start)
-        if not left and next(call, None) is not None:
-            report(plans[-1], "stream", "an answer too many", time.monotonic() - start)
-    except grpc.RpcError as error:
-        for plan in unanswered:
-            came = outcome(plan, error.code().name, None)
-            report(plan, "stream", came, time.monotonic() - start)
-    if left:
-        time.sleep(left[0].wait)
-        call.cancel()
-        to_send.put(None)
-    for plan in left:
-        report(plan, "stream", CANCELLED, time.monotonic() - start)
+        if plan.kind == "cancelled":
+            time.sleep(plan.wait)
+            call.cancel()
+            came = CANCELLED
+        else:
+            try:
+                came = _stream_answer(plan, next(call, None))
+            except grpc.RpcError as error:
+                came = outcome(plan, error.code().name, None)
+        report(plan, "stream", came, time.monotonic() - start)
+    done.set()
 
 
 def _stream_answer(plan: Plan, response: grasp_pb2.DetectGraspsStreamResponse | None) -> str:
@@ -285,60 +265,41 @@ def _stream_answer(plan: Plan, response: grasp_pb2.DetectGraspsStreamResponse | 
     return outcome(plan, "OK", response.detection.counts["crc32"])
 
 
-def _requests(
-    to_send: "queue.SimpleQueue[Plan | None]",
-) -> Iterator[grasp_pb2.DetectGraspsStreamRequest]:
-    while (plan := to_send.get()) is not None:
-        yield grasp_pb2.DetectGraspsStreamRequest(
-            request_id=str(plan.number), request=message(plan)
-        )
-
-
 def send_rest(http_url: str, next_plans: NextPlans, report: Report) -> None:
-    """One connection that is kept alive, and one more for each request that is abandoned."""
-    host = urllib.parse.urlsplit(http_url).netloc
-    connection = http.client.HTTPConnection(host, timeout=SECONDS)
-    while plans := next_plans(1):
-        start = time.monotonic()
-        if plans[0].kind == "cancelled":
-            came = _abandon(host, plans[0])
-        else:
-            try:
-                came = _post(connection, plans[0])
-            except TimeoutError:
-                came = STUCK
-            except (http.client.HTTPException, OSError) as error:
-                connection.close()
-                came = type(error).__name__
-        report(plans[0], "rest", came, time.monotonic() - start)
-    connection.close()
+    """One connection that is kept alive, but for requests that are abandoned."""
+    with httpx.Client(base_url=http_url, timeout=SECONDS) as client:
+        while plans := next_plans(1):
+            start = time.monotonic()
+            report(plans[0], "rest", _post(client, plans[0]), time.monotonic() - start)
 
 
-def _post(connection: http.client.HTTPConnection, plan: Plan) -> str:
+def _post(client: httpx.Client, plan: Plan) -> str:
     body, media_type, query = _body(plan)
     headers = {"Content-Type": media_type, "X-Request-ID": str(plan.number)}
-    connection.request("POST", f"/v1/grasps{query}", body, headers)
-    response = connection.getresponse()
-    content = json.loads(response.read())
-    if response.getheader("X-Request-ID") not in (None, str(plan.number)):
+    content: bytes | Iterator[bytes] = body
+    timeout = SECONDS
+    if plan.kind == "cancelled":
+        timeout = max(plan.wait, 1e-4)
+        if plan.number % 2 == 0:  # the client leaves half way through the body
+            content, headers["Content-Length"] = _half(body), str(len(body))
+    try:
+        url = f"/v1/grasps{query}"
+        response = client.post(url, content=content, headers=headers, timeout=timeout)
+    except (httpx.TimeoutException, TimeoutError):
+        return CANCELLED if plan.kind == "cancelled" else STUCK
+    except httpx.HTTPError as error:
+        return type(error).__name__
+    if response.headers.get("X-Request-ID") not in (None, str(plan.number)):
         return CROSSED
-    if response.status == 200:
-        return outcome(plan, "OK", content["counts"]["crc32"])
-    refused = response.status in (400, 415)
-    return outcome(plan, "INVALID_ARGUMENT" if refused else str(response.status), None)
+    if response.status_code == 200:
+        return outcome(plan, "OK", response.json()["counts"]["crc32"])
+    refused = response.status_code in (400, 415)
+    return outcome(plan, "INVALID_ARGUMENT" if refused else str(response.status_code), None)
 
 
-def _abandon(host: str, plan: Plan) -> str:
-    """Close the connection half way through the body, or before the answer."""
-    body, media_type, _ = _body(plan)
-    head = f"POST /v1/grasps HTTP/1.1\r\nHost: {host}\r\nContent-Type: {media_type}\r\n"
-    head += f"Content-Length: {len(body)}\r\n\r\n"
-    sent = body if plan.number % 2 else body[: len(body) // 2]
-    name, _, port = host.rpartition(":")
-    with socket.create_connection((name, int(port)), timeout=SECONDS) as connection:
-        connection.sendall(head.encode() + sent)
-        time.sleep(plan.wait)
-    return CANCELLED
+def _half(body: bytes) -> Iterator[bytes]:
+    yield body[: len(body) // 2]
+    raise TimeoutError
 
 
 def _body(plan: Plan) -> tuple[bytes, str, str]:

@@ -1,8 +1,8 @@
 """Writes the tables of docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
 
 Results found below RESULTS_DIR (folders of `edgegrasp benchmark`, `edgegrasp experiment` and
-`edgegrasp train`) are first boiled down to docs/results/, where what is found again replaces what
-was there; the tables are written from that folder alone.
+`edgegrasp train`) are first summarised in docs/results/, where they replace earlier results of the
+same name; the tables are written from that folder alone.
 """
 
 import csv
@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from pages import filled, table
 
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_sim.experiments import experiment_table, percent
+from edgegrasp_sim.experiments import experiment_table
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.report import published
-from edgegrasp_sim.results import ResultFolder, planner_title, record_of
+from edgegrasp_sim.report import published, published_rates
+from edgegrasp_sim.results import ResultFolder, percent, planner_title, record_of
 from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
@@ -41,12 +40,12 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "families": (),
 }
 # Counted in the authors' checkpoint files.
-AUTHORS_PARAMETERS = {"edgegrasp": 3_048_993, "vn-edgegrasp": 1_702_268}
+AUTHORS_PARAMETERS = {"edgegrasp": "3,048,993", "vn-edgegrasp": "1,702,268"}
 NOT_YET = "Not measured yet.\n"
 
 
 def collect(results: Path, kept: Path) -> None:
-    """Boil down every result below a folder into another.
+    """Summarise every result below a folder in another.
 
     Raises:
         FileNotFoundError: there is nothing of the kind.
@@ -143,7 +142,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         )
     for row in published("edgegrasp", scene):
         title = f"*{row['method']}* ({row['source']})"
-        lines.append((title, "edgegrasp", row.get("samples", ""), "", *_rates(row), ""))
+        lines.append((title, "edgegrasp", row.get("samples", ""), "", *published_rates(row), ""))
     return table(head, lines)
 
 
@@ -159,8 +158,7 @@ def _parameters_table() -> str:
     for name, config in RECIPES.items():
         network = build_network(config, torch.Generator().manual_seed(0))
         count = sum(parameter.numel() for parameter in network.parameters())
-        theirs = AUTHORS_PARAMETERS.get(name)
-        lines.append((name, f"{count:,}", "" if theirs is None else f"{theirs:,}"))
+        lines.append((name, f"{count:,}", AUTHORS_PARAMETERS.get(name, "")))
     return table(("weights", "parameters", "in the authors' checkpoint"), lines)
 
 
@@ -176,7 +174,6 @@ def _training(curves: Curves) -> str:
 def curves_figure(curves: Curves) -> Figure:
     """Validation loss and AUROC against steps, a line for each run."""
     figure = Figure(figsize=(9.6, 3.4), dpi=90, layout="constrained")
-    FigureCanvasAgg(figure)
     for axes, column, label in zip(
         figure.subplots(1, 2),
         ("validation_loss", "auroc"),
@@ -198,20 +195,11 @@ def _published_table(methods: Sequence[str]) -> Iterator[str]:
         cells: list[str] = []
         for scene in SCENES:
             (row,) = [r for r in published("edgegrasp", scene) if r["method"] == method]
-            cells += _rates(row)
+            cells += published_rates(row)
         lines.append((f"*{method}*", row.get("samples", ""), *cells))
     if lines:
         head = ("published", "samples", "packed: GSR", "DR", "pile: GSR", "DR")
         yield table(head, lines)
-
-
-def _rates(row: dict[str, Any]) -> tuple[str, str]:
-    """Published GSR and DR: mean, and standard deviation where it is known."""
-    gsr, dr = (
-        " ± ".join(f"{number:.1f}" for number in row.get(name, ()))
-        for name in ("grasp_success_rate", "declutter_rate")
-    )
-    return gsr, dr
 
 
 def _curve(file: Path) -> list[dict[str, float]]:

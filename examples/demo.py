@@ -79,23 +79,20 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
 
 
 def report(transport: str, detection: Detection) -> None:
-    """Print a detection as a table."""
-    grasps = detection.grasps
+    """Print the best grasps of a detection, and its counts."""
+    seconds = detection.seconds["total"]
     print(
-        f"{len(grasps)} grasps over {transport} from {detection.model}"
-        f" in {detection.seconds['total']:.2f} s; the best {min(LISTED, len(grasps))}:"
+        f"{len(detection.grasps)} grasps over {transport} from {detection.model}, {seconds:.2f} s:"
     )
     print("rank  score  width (mm)   TCP x, y, z (m)        approach direction")
-    for rank, grasp in enumerate(grasps[:LISTED], start=1):
+    for rank, grasp in enumerate(detection.grasps[:LISTED], start=1):
         x, y, z = grasp.T_cloud_tcp[:3, 3]
         u, v, w = grasp.approach_direction
         print(
             f"{rank:4}  {grasp.score:.3f}  {1000 * grasp.width:10.1f}   "
             f"{x:.3f}, {y:.3f}, {z:.3f}    {u:+.2f}, {v:+.2f}, {w:+.2f}"
         )
-    if len(grasps) < FEWEST_GRASPS:
-        print("counts:", ", ".join(f"{name} {count}" for name, count in detection.counts.items()))
-    print()
+    print("counts:", ", ".join(f"{name} {count}" for name, count in detection.counts.items()), "\n")
 
 
 def write_ply(path: Path, cloud: NDArray[np.float32]) -> None:

@@ -1,14 +1,17 @@
 #!/bin/sh
-# Regenerates what is generated of the interface: the Python stubs beside proto/edgegrasp/v1/*.proto,
-# the contract beside them, and the OpenAPI document. Into proto/, or into the folder given.
+# Regenerates the interface: what follows from the options of a request, the Python stubs beside
+# proto/edgegrasp/v1/*.proto, the contract beside them, and the OpenAPI document.
+# Into this checkout, or into the same places under the folder given.
 # PYTHON names the interpreter that has the dev extra.
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 python=${PYTHON:-$root/.venv/bin/python}
-out=${1:-$root/proto}
+out=${1:-$root}
 PATH=$(dirname "$python"):$PATH # protoc looks there for the mypy plugins
-"$python" -m grpc_tools.protoc --proto_path="$root/proto" \
-    --python_out="$out" --grpc_python_out="$out" --mypy_out="quiet:$out" --mypy_grpc_out="quiet:$out" \
-    "$root"/proto/edgegrasp/v1/*.proto
-"$python" "$root/scripts/contract.py" "$out"
-"$python" "$root/scripts/openapi.py" "$out"
+mkdir -p "$out/proto"
+"$python" "$root/scripts/generate_options.py" "$out"
+"$python" -m grpc_tools.protoc --proto_path="$out/proto" --python_out="$out/proto" \
+    --grpc_python_out="$out/proto" --mypy_out="quiet:$out/proto" \
+    --mypy_grpc_out="quiet:$out/proto" "$out"/proto/edgegrasp/v1/*.proto
+"$python" "$root/scripts/contract.py" "$out/proto"
+"$python" "$root/scripts/openapi.py" "$out/proto"

@@ -6,17 +6,17 @@ usage: scripts/openapi.py [FOLDER]    writes openapi.json there, or into proto/
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.dummy import DummyCatalogue
-from edgegrasp_service.http_app import create_app
+from edgegrasp_service.front.http import create_app
 
 NAME = "openapi.json"
 
 
 def document() -> str:
-    """The document; no limit of a server is in it."""
-    app = create_app(GraspService(DummyCatalogue))
+    """The document; nothing of a running server is in it."""
+    nobody: Any = None
+    app = create_app(nobody, nobody, nobody)
     return json.dumps(app.openapi(), indent=1, ensure_ascii=False) + "\n"
 
 

@@ -52,14 +52,6 @@ class Candidates:
     T_cloud_hand: Float32  # (E, 4, 4)
 
 
-@dataclass(frozen=True)
-class TextbookGrasps:
-    """Ranked edge grasps, the best first."""
-
-    score: Float32  # (E,)
-    T_cloud_hand: Float32  # (E, 4, 4)
-
-
 def prepare(cloud: Float32) -> tuple[Float32, Float32]:
     """Points (N, 3) and normals (N, 3) that the network sees, of a dense cloud (D, 3)."""
     dense = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.astype(np.float64)))
@@ -151,8 +143,8 @@ def detect(
     approach_points: int = 32,
     most: int = 2000,
     seed: int = 0,
-) -> TextbookGrasps:
-    """Ranked grasps of a dense cloud (D, 3), metres, `most` of them scored."""
+) -> tuple[Float32, Float32]:
+    """Scores (E,) and `T_cloud_hand` (E, 4, 4), best first, of a dense cloud (D, 3), metres."""
     rng = np.random.default_rng(seed)
     points, normals = prepare(cloud)
     rows = farthest_points(points, approach_points, rng)
@@ -166,4 +158,4 @@ def detect(
     best = np.argsort(-score)
     T_cloud_hand = found.T_cloud_hand[best].copy()
     T_cloud_hand[:, :3, 3] -= COM_Z * T_cloud_hand[:, :3, 2]
-    return TextbookGrasps(score[best], T_cloud_hand)
+    return score[best], T_cloud_hand

@@ -95,9 +95,9 @@ def benchmark(
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
-    from edgegrasp_sim.results import ResultFolder, summarise
+    from edgegrasp_sim.results import ResultFolder, below_gate, summarise
 
-    with ending_with_a_sentence("benchmark", resumes=output is not None):
+    with interruptible("benchmark", resumes=output is not None):
         rules = load_protocol(protocol)
         choice = PlannerChoice(
             planner,
@@ -130,7 +130,9 @@ def benchmark(
             print(f"report: {write_report(folder)}")
     _print_summary(summary, title)
     if gate is not None:
-        _check_gate(summary, gate)
+        if below := below_gate(summary, gate):
+            sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
+        print("not below the gate")
 
 
 def compare(
@@ -142,22 +144,17 @@ def compare(
     from rich.console import Console
     from rich.table import Table
 
-    from edgegrasp_sim.results import ResultFolder
+    from edgegrasp_sim.results import RATE_LABELS, ResultFolder, percent
     from edgegrasp_sim.results import compare as figures_of
 
-    with ending_with_a_sentence("compare"):
-        figures = figures_of(ResultFolder(first), ResultFolder(second))
+    figures = figures_of(ResultFolder(first), ResultFolder(second))
     if output is not None:
         output.write_text(json.dumps(figures, indent=1) + "\n")
     table = Table("", str(first), str(second), "difference, paired")
-    for name, label in (("grasp_success_rate", "GSR %"), ("declutter_rate", "DR %")):
+    for name, label in RATE_LABELS.items():
         row = figures[name]
-        table.add_row(
-            label,
-            _interval(row["first"]["value"], row["first"]["wilson_95"]),
-            _interval(row["second"]["value"], row["second"]["wilson_95"]),
-            _interval(row["difference"], row["difference_95"], sign="+"),
-        )
+        difference = {"value": row["difference"], "wilson_95": row["difference_95"]}
+        table.add_row(f"{label} %", *map(percent, (row["first"], row["second"], difference)))
     console = Console()
     console.print(table)
     better, worse = figures["second_better"], figures["second_worse"]
@@ -169,18 +166,11 @@ def compare(
 
 
 @contextmanager
-def ending_with_a_sentence(command: str, *, resumes: bool = False) -> Iterator[None]:
-    """End the program with a message where its user can mend something, or has interrupted it."""
-    from edgegrasp_client import GraspClientError
-    from edgegrasp_model.errors import EdgeGraspError
-    from edgegrasp_sim.trial import PlannerUnavailableError
-
+def interruptible(command: str, *, resumes: bool) -> Iterator[None]:
+    """End the program with a message where workers cannot run, or its user interrupts it."""
     try:
         yield
-    except (
-        *(EdgeGraspError, GraspClientError, PlannerUnavailableError),
-        *(ValueError, FileNotFoundError, RuntimeError),
-    ) as error:
+    except RuntimeError as error:
         sys.exit(f"edgegrasp {command}: {error}")
     except KeyboardInterrupt:
         again = "; the same command goes on from there" if resumes else ""
@@ -230,36 +220,21 @@ def _progress(
     config: "BenchmarkConfig", folder: "ResultFolder | None"
 ) -> "Iterator[Callable[[Round], None]]":
     """A bar with the time left; yields what to call after each round."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress, TimeElapsedColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    from edgegrasp_sim.results import count
+
     tasks = config.tasks()
     finished = sum(folder.has(*task) for task in tasks) if folder is not None else 0
-    attempts = successes = objects = retries = 0
-    with Progress(*columns) as progress:
+    came: list[Round] = []
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn()) as progress:
         bar = progress.add_task(config.scene.value, total=len(tasks), completed=finished)
 
         def on_round(done: "Round") -> None:
-            nonlocal attempts, successes, objects, retries
-            attempts += len(done.attempts)
-            successes += done.successes
-            objects += len(done.objects)
-            retries += done.retries
+            came.append(done)
+            successes, attempts, objects = count(came).sum(axis=1)
             text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
-            if retries:
+            if retries := sum(each.retries for each in came):
                 text += f" asked again {retries} times"
             progress.update(bar, advance=1, description=text)
 
@@ -293,21 +268,17 @@ def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: b
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from rich.console import Console
 
-    def percent(rate: dict[str, Any]) -> str:
-        if rate["value"] is None:
-            return "undefined"
-        low, high = rate["wilson_95"]
-        over = ""
-        if rate["std_over_seeds"] is not None:
-            mean, std = rate["mean_over_seeds"], rate["std_over_seeds"]
-            over = f", {100 * mean:.1f} ± {100 * std:.1f} over seeds"
-        return f"{100 * rate['value']:.1f} % [{100 * low:.1f}, {100 * high:.1f}]{over}"
+    from edgegrasp_sim.results import over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
+    gsr, dr = (
+        f"{percent(rate)} %, {over_seeds(rate)} over seeds"
+        for rate in (summary["grasp_success_rate"], summary["declutter_rate"])
+    )
     console.print(
-        f"{planner}: GSR {percent(summary['grasp_success_rate'])} "
+        f"{planner}: GSR {gsr} "
         f"({summary['successes']} of {summary['attempts']} grasps), "
-        f"DR {percent(summary['declutter_rate'])} "
+        f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
@@ -317,20 +288,3 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
             f"the planner was unavailable and asked again {summary['planner_retries']} times, "
             f"waiting {summary['planner_waited_seconds']:.1f} s"
         )
-
-
-def _check_gate(summary: dict[str, Any], gate: Path) -> None:
-    from edgegrasp_sim.results import below_gate
-
-    with ending_with_a_sentence("benchmark"):
-        below = below_gate(summary, gate)
-    if below:
-        sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
-    print("not below the gate")
-
-
-def _interval(value: float | None, interval: Any, sign: str = "") -> str:
-    if value is None:
-        return "undefined"
-    low, high = interval
-    return f"{100 * value:{sign}.1f} ({100 * low:{sign}.1f} to {100 * high:{sign}.1f})"

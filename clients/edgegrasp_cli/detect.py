@@ -2,10 +2,8 @@
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -19,9 +17,6 @@ from edgegrasp_cli.flags import (
     parse_option_flags,
     takes_flags,
 )
-
-if TYPE_CHECKING:
-    from edgegrasp_client import Model
 
 Option = typer.Option
 WEIGHTS_HELP = "Weights file or folder besides those that ship, where there is no server."
@@ -51,13 +46,12 @@ def detect(
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
-    with _ending_with_a_sentence("detect"):
-        fields = _options(options_file, options)
-        if server:
-            with connect(server, timeout, **connection) as client:
-                detection: Any = client.detect(file, **fields)
-        else:
-            detection = _detect_here(file, weights or [], grippers or [], device, fields)
+    fields = _options(options_file, options)
+    if server:
+        with connect(server, timeout, **connection) as client:
+            detection: Any = client.detect(file, **fields)
+    else:
+        detection = _detect_here(file, weights or [], grippers or [], device, fields)
     if as_document:
         print(json.dumps(_json_document(detection)))
     else:
@@ -79,12 +73,15 @@ def models(
     table = Table(
         "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
     )
-    with _ending_with_a_sentence("models"):
-        if server:
-            with connect(server, timeout, **connection) as client:
-                found = client.models()
-        else:
-            found = _models_here(weights or [])
+    if server:
+        with connect(server, timeout, **connection) as client:
+            found = client.models()
+    else:
+        from edgegrasp_client import Model
+        from edgegrasp_model.detector import ModelCatalogue
+
+        facts = ModelCatalogue.load(weights or []).describe()
+        found = [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
     for row in found:
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
@@ -98,18 +95,6 @@ def models(
     Console().print(table)
 
 
-@contextmanager
-def _ending_with_a_sentence(command: str) -> Iterator[None]:
-    """End the program with the message of an error that the caller can mend."""
-    from edgegrasp_client import GraspClientError
-    from edgegrasp_model.errors import EdgeGraspError
-
-    try:
-        yield
-    except (GraspClientError, EdgeGraspError, OSError) as error:
-        sys.exit(f"edgegrasp {command}: {error}")
-
-
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     """The options of the flags, and of the file where there is no flag."""
     try:
@@ -117,7 +102,7 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(fields, dict):
             raise ValueError("a JSON object is needed")
     except ValueError as error:
-        sys.exit(f"edgegrasp detect: {file}: {error}")
+        raise ValueError(f"{file}: {error}") from error
     return fields | parse_option_flags(given)
 
 
@@ -125,23 +110,15 @@ def _detect_here(
     file: Path, weights: list[Path], grippers: list[Path], device: str, options: dict[str, Any]
 ) -> Any:
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.cloud_decoding import decode_file
+    from edgegrasp_service.worker.formats import read_file
 
     parsed = parse_options(options)
-    cloud = decode_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
+    cloud = read_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
 
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
     return catalogue.get(parsed.model).detect(cloud, parsed)
-
-
-def _models_here(weights: list[Path]) -> "list[Model]":
-    from edgegrasp_client import Model
-    from edgegrasp_model.detector import ModelCatalogue
-
-    facts = ModelCatalogue.load(weights).describe()
-    return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
 
 
 def _json_document(detection: Any) -> dict[str, Any]:
@@ -157,20 +134,17 @@ def _json_document(detection: Any) -> dict[str, Any]:
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:
     """Arrays as lists, floats as float32, NaN as None."""
-    return {name: _plain_value(value) for name, value in fields.items()}
-
-
-def _plain_value(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(np.float32(value))
-    if not isinstance(value, np.ndarray):
-        return value
-    if value.dtype.kind in "iu":
-        return value.tolist()
-    floats = value.astype(np.float32)
-    if np.isnan(floats).any():  # of scores, which are flat
-        return [None if np.isnan(number) else number for number in floats.tolist()]
-    return floats.tolist()
+    plain = dict(fields)
+    for name, value in fields.items():
+        if isinstance(value, float):
+            plain[name] = float(np.float32(value))
+        elif isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            numbers = value.astype(np.float32).astype(object)
+            numbers[np.isnan(value)] = None
+            plain[name] = numbers.tolist()
+        elif isinstance(value, np.ndarray):
+            plain[name] = value.tolist()
+    return plain
 
 
 def _print_detection(detection: Any) -> None:

@@ -16,7 +16,7 @@ from edgegrasp_cli.benchmark import (
     Seeds,
     Split,
     Workers,
-    ending_with_a_sentence,
+    interruptible,
     run_rounds,
 )
 from edgegrasp_cli.flags import option_flags, parse_option_flags, takes_flags
@@ -60,17 +60,15 @@ def experiment(
     not varied there are 32 approach points and 2,000 candidates, unless flags say otherwise.
     """
     from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores
-    from edgegrasp_sim.experiments import EXPERIMENTS
+    from edgegrasp_sim.experiments import cases_of
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
     from edgegrasp_sim.results import ResultFolder, record_of
 
-    with ending_with_a_sentence("experiment", resumes=True):
-        if name not in EXPERIMENTS:
-            raise ValueError(f"name is {name!r}; choose one of {', '.join(EXPERIMENTS)}")
+    with interruptible("experiment", resumes=True):
         scenes = [SceneKind(each) for each in scene or [kind.value for kind in SceneKind]]
         asked = SAMPLES | parse_option_flags(options)
-        cases = EXPERIMENTS[name](load_protocol(protocol), scenes, model or [""], output)
+        cases = cases_of(name, load_protocol(protocol), scenes, model or [""], output)
         done: list[dict[str, Any]] = []
         for number, case in enumerate(cases, 1):
             print(f"{number}/{len(cases)}: {case.name}", flush=True)

@@ -4,7 +4,6 @@ import functools
 import inspect
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
@@ -98,7 +97,7 @@ def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
         InvalidRequest: A value is of the wrong type or out of range.
     """
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.options_text import options_from_query
+    from edgegrasp_service.worker.http_bodies import options_from_query
 
     options = options_from_query(
         (name, value if isinstance(value, str) else json.dumps(value))
@@ -157,7 +156,7 @@ def _token(file: Path | None) -> str | None:
     try:
         return file.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        sys.exit(f"edgegrasp: token file {file}: {error}")
+        raise ValueError(f"token file {file}: {error}") from error
 
 
 def _flag_type(annotation: Any) -> tuple[Any, str | None]:

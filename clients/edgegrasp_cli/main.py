@@ -51,15 +51,15 @@ def load_command(name: str) -> Any:
     if isinstance(function, typer.Typer):  # a group of commands
         for command in function.registered_commands:
             if command.callback is not None:
-                command.callback = _naming_missing_packages(name, command.callback)
+                command.callback = _ending_with_a_sentence(name, command.callback)
         return typer.main.get_command(function)
     single = typer.Typer(add_completion=False)
-    single.command(name)(_naming_missing_packages(name, function))
+    single.command(name)(_ending_with_a_sentence(name, function))
     return typer.main.get_command(single)
 
 
-def _naming_missing_packages(name: str, function: Callable[..., None]) -> Callable[..., None]:
-    """The function; a package that turns out to be missing ends the program with a message."""
+def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callable[..., None]:
+    """The function; errors that its user can mend end the program with their message."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -67,6 +67,11 @@ def _naming_missing_packages(name: str, function: Callable[..., None]) -> Callab
             function(*args, **kwargs)
         except ModuleNotFoundError as error:
             sys.exit(_missing(name, error))
+        except Exception as error:
+            own = type(error).__module__.startswith("edgegrasp_")
+            if own or isinstance(error, (ValueError, OSError)):
+                sys.exit(f"edgegrasp {name}: {error}")
+            raise
 
     return run
 

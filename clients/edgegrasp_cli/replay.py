@@ -35,21 +35,19 @@ def attempt(
     """Make one recorded attempt again, in the scene and view it was made in."""
     from edgegrasp_sim.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
-    from edgegrasp_sim.report import DrawnAttempt, attempt_title
+    from edgegrasp_sim.report import attempt_title
     from edgegrasp_sim.results import ResultFolder
 
-    try:
-        folder = ResultFolder(results)
-        first = folder.manifest()["seeds"][0]
-        with Replay(folder, objects, gui=gui) as repeated:
-            done = repeated.find(first if seed is None else seed, round, number)
-            now, seen = repeated.repeat(done.seed, round, number)
-    except (ValueError, FileNotFoundError) as error:
-        sys.exit(f"edgegrasp replay: {error}")
+    folder = ResultFolder(results)
+    first = folder.manifest()["seeds"][0]
+    with Replay(folder, objects, gui=gui) as repeated:
+        done = repeated.find(first if seed is None else seed, round, number)
+        now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        drawn = [DrawnAttempt.of(before)]
-        draw_grasps(picture, seen.cloud, drawn, camera_position=seen.camera_position, title=title)
+        draw_grasps(
+            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
+        )
     print(title)
     if any(
         getattr(now, name) != getattr(before, name)
@@ -69,14 +67,9 @@ def request(
     Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
     """
     from edgegrasp_service.recording import replay as answer_again
-
-    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_service.settings import load_settings
 
-    try:
-        again = answer_again(file, load_settings(config))
-    except (EdgeGraspError, ValueError, OSError) as error:
-        sys.exit(f"edgegrasp replay: {error}")
+    again = answer_again(file, load_settings(config))
     refused = again.answer.error
     print(f"{again.answer.facts.grasps} grasps" if refused is None else refused.detail)
     before, now = (_without_times(again.job, body) for body in (again.recorded, again.answer.body))

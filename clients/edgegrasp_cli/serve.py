@@ -1,7 +1,6 @@
 """`edgegrasp serve`: every setting of the server but its secrets is a flag."""
 
 import os
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,18 +30,14 @@ def serve(
     """
     # gRPC's own lines are no JSON, and a pipe that nobody reads would stop it: no lines.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
-    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_service.settings import load_settings_and_origins
 
-    try:
-        loaded, origins = load_settings_and_origins(config, **settings)
-        if print_config:
-            from edgegrasp_service.settings_text import config_text
+    loaded, origins = load_settings_and_origins(config, **settings)
+    if print_config:
+        from edgegrasp_service.settings import config_text
 
-            print(config_text(loaded, origins), end="")
-            return
-        from edgegrasp_service.server import run
+        print(config_text(loaded, origins), end="")
+        return
+    from edgegrasp_service.server import run
 
-        run(loaded)
-    except EdgeGraspError as error:
-        sys.exit(f"edgegrasp serve: {error}")
+    run(loaded)

@@ -5,7 +5,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -47,12 +47,10 @@ def generate_data(
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0
-    try:
-        finished = generate(output, objects, options, workers)
-        for _, grasps, successes in track(finished, "scenes", total=missing):
-            tried, held = tried + grasps, held + successes
-    except FileNotFoundError as error:
-        sys.exit(f"edgegrasp generate-data: {error}")
+    for _, grasps, successes in track(
+        generate(output, objects, options, workers), "scenes", total=missing
+    ):
+        tried, held = tried + grasps, held + successes
     write_data_card(output, find_views([output]), _command())
     share = f", {100 * held / tried:.1f} % held" if tried else ""
     print(f"{missing} scenes made, {scenes - missing} kept; {tried} grasps tried{share}.")
@@ -112,7 +110,8 @@ def train(
     done a model card. Running the same command again goes on from the last state. The scores of a
     teacher are kept beside the run folder, in `taught`.
     """
-    from edgegrasp_model.errors import InvalidCheckpoint
+    from rich.progress import Progress
+
     from edgegrasp_training.recipes import recipe
     from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer, TrainingOptions
@@ -129,21 +128,25 @@ def train(
         mixed_precision=mixed_precision,
         seed=seed,
     )
-    try:
-        training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
-        training_views = part_of(training_views, training_share, seed)
-        metadata = recipe(model)
-        taught = run.parent / "taught"
-        guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
-        if crop_radius is not None:
-            metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
-        trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
-    except (ValueError, FileNotFoundError, InvalidCheckpoint) as error:
-        sys.exit(f"edgegrasp train: {error}")
+    training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
+    training_views = part_of(training_views, training_share, seed)
+    metadata = recipe(model)
+    taught = run.parent / "taught"
+    guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
+    if crop_radius is not None:
+        metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
+    trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
     print(f"{len(training_views)} training and {len(validation_views)} validation views")
-    _run(trainer, until)
+    with Progress() as progress:
+        task = progress.add_task("steps", total=steps, completed=trainer.step)
+
+        def on_step(step: int, loss: float) -> None:
+            progress.update(task, completed=step, description=f"loss {loss:.3f}")
+
+        trainer.run(on_step, until)
     if trainer.finished:
-        evaluation = trainer.finish(_provenance(data), _command())
+        provenance = {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
+        evaluation = trainer.finish(provenance, _command())
         print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {run}")
     else:
         print(f"paused at step {trainer.step}; the same command goes on")
@@ -159,37 +162,17 @@ def import_checkpoint(
     gripper: Annotated[str, Option(help="Gripper it was trained for.")] = "panda",
 ) -> None:
     """Convert a checkpoint in the authors' layout to one safetensors file."""
-    from edgegrasp_model.errors import EdgeGraspError
     from edgegrasp_model.gripper import load_gripper
     from edgegrasp_model.networks.checkpoint import save_checkpoint
     from edgegrasp_model.networks.import_checkpoint import import_checkpoint as convert
 
-    try:
-        load_gripper(gripper)
-        network, metadata = convert(
-            directory, voxel_size=voxel_size, crop_radius=crop_radius, gripper=gripper
-        )
-    except (EdgeGraspError, ValueError) as error:
-        sys.exit(f"edgegrasp import-checkpoint: {error}")
+    load_gripper(gripper)
+    network, metadata = convert(
+        directory, voxel_size=voxel_size, crop_radius=crop_radius, gripper=gripper
+    )
     path = output or Path(f"{metadata.name}.safetensors")
     save_checkpoint(path, network, metadata)
     print(f"{path}: {metadata.network.architecture}, use it with --weights {path}")
-
-
-def _run(trainer: Any, until: int | None) -> None:
-    from rich.progress import Progress
-
-    with Progress() as progress:
-        task = progress.add_task("steps", total=trainer.options.steps, completed=trainer.step)
-
-        def on_step(step: int, loss: float) -> None:
-            progress.update(task, completed=step, description=f"loss {loss:.3f}")
-
-        trainer.run(on_step, until)
-
-
-def _provenance(data: list[Path]) -> dict[str, Any]:
-    return {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
 
 
 def _command() -> str:

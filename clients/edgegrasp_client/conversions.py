@@ -18,24 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_client.results import Grasp
 
-__all__ = [
-    "CONTACT_GRASPNET",
-    "PANDA_JOINTS",
-    "VGN",
-    "FingerJoints",
-    "HandFrame",
-    "IsaacGrasp",
-    "from_frame",
-    "graspnet_frame",
-    "isaac_grasps",
-    "matrix_from_quaternion",
-    "moveit_grasp",
-    "pose_from_moveit_grasp",
-    "quaternion_from_matrix",
-    "read_isaac_grasps",
-    "to_frame",
-]
-
 Float64 = NDArray[np.float64]
 Message = dict[str, Any]
 
@@ -175,7 +157,10 @@ def moveit_grasp(
         "id": name,
         "pre_grasp_posture": _posture(joints, grasp.width, frame_id),
         "grasp_posture": _posture(joints, 0.0, frame_id),
-        "grasp_pose": {"header": _header(frame_id), "pose": _pose(T_cloud_link)},
+        "grasp_pose": {
+            "header": _header(frame_id),
+            "pose": _pose(T_cloud_link),
+        },
         "grasp_quality": float(grasp.score),
         "pre_grasp_approach": _translation(approach, approach_distance, frame_id),
         "post_grasp_retreat": _translation(retreat, retreat_distance, frame_id),
@@ -356,7 +341,11 @@ def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
         "effort": [],
         "time_from_start": {"sec": 0, "nanosec": 0},
     }
-    return {"header": _header(frame_id), "joint_names": list(joints.names), "points": [point]}
+    return {
+        "header": _header(frame_id),
+        "joint_names": list(joints.names),
+        "points": [point],
+    }
 
 
 def _translation(direction: Float64, distance: float, frame_id: str) -> Message:
@@ -373,11 +362,12 @@ def _xyz(vector: Float64) -> Message:
 
 
 def _isaac_fields(grasp: Grasp, T_object_gripper: Float64, joints: FingerJoints) -> Message:
-    x, y, z, w = quaternion_from_matrix(T_object_gripper[:3, :3]).tolist()
+    pose = _pose(T_object_gripper)
+    w, *xyz = (pose["orientation"][axis] for axis in "wxyz")
     return {
         "confidence": float(grasp.score),
-        "position": T_object_gripper[:3, 3].tolist(),
-        "orientation": {"w": w, "xyz": [x, y, z]},
+        "position": list(pose["position"].values()),
+        "orientation": {"w": w, "xyz": xyz},
         "cspace_position": _joint_positions(joints.at(0.0)),
         "pregrasp_cspace_position": _joint_positions(joints.at(grasp.width)),
     }

@@ -91,6 +91,7 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "overloaded": OverloadedError,
     "worker-lost": ServerUnavailableError,
     "cancelled": ServerUnavailableError,
+    "request-timeout": DeadlineError,
     "deadline-exceeded": DeadlineError,
 }
 

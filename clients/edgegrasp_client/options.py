@@ -1,4 +1,7 @@
-"""Options of a request; what is left out, or None, takes the server's default."""
+"""Options of a request; what is left out, or None, takes the server's default.
+
+Generated from the server's own definition by `make proto`; do not edit.
+"""
 
 from collections.abc import Sequence
 from typing import Any, Literal, NotRequired, TypedDict
@@ -8,83 +11,141 @@ from numpy.typing import NDArray
 Vector = Sequence[float] | NDArray[Any]  # x, y, z in the cloud's frame
 
 
-class Workspace(TypedDict):
-    """An axis-aligned box in the cloud's frame."""
+class HandPart(TypedDict):
+    """Boxes of the hand or of one finger, hand frame."""
 
-    min: Vector  # lower corner, metres
-    max: Vector  # upper corner, metres
+    # [min corner, max corner] each
+    boxes: Sequence[Sequence[Vector]]
+
+
+class Linkage(TypedDict):
+    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+
+    # length of the link that carries a finger, metres
+    radius: float
+    # outward part (y) of that link in the open gripper, metres
+    reach: float
+
+
+class GripperGeometry(TypedDict):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    # shown in results
+    name: NotRequired[str]
+    # metres between the open fingers' inner faces
+    max_opening: float
+    # fingertips of the open gripper, metres along z
+    tip_z: float
+    # where contacts are put, metres along z; between palm and fingertips
+    contact_z: float
+    # origin of the TCP frame, metres along z
+    tcp_z: float
+    # the hand without its fingers
+    hand: HandPart
+    # one finger, its inner face at y = 0; mirrored
+    finger: HandPart
+    # how the fingers swing; None: they close in a straight line
+    swing: NotRequired[Linkage | None]
 
 
 class SupportPlane(TypedDict):
-    """The points p with normal . p = offset."""
+    """The plane objects rest on: the points x with normal . x = offset; the normal points up."""
 
     kind: NotRequired[Literal["plane"]]
-    normal: Vector  # unit, away from the table
-    offset: float  # metres
-    max_depth_error: NotRequired[float]  # largest relative error of depths that is corrected
+    # unit normal, away from the table
+    normal: Vector
+    # normal . x of its points, metres
+    offset: float
+    # share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up
+    # to this until the plane that it sees lies in place; 0: not at all
+    max_depth_error: NotRequired[float]
 
 
 class RansacPlane(TypedDict):
-    """Look for the plane in the cloud; its points are removed, the plane stays as an obstacle."""
+    """Look for the plane in the cloud: the largest of those near the level."""
 
     kind: Literal["ransac"]
-    distance: NotRequired[float]  # metres from the plane within which points belong to it
-    max_tilt: NotRequired[float]  # radians between its normal and up
-    min_share: NotRequired[float]  # share of the cloud's points it must hold
+    # metres from the plane within which points belong to it
+    distance: NotRequired[float]
+    # radians between its normal and up; a quarter turn: any plane
+    max_tilt: NotRequired[float]
+    # share of the seen surface it must hold
+    min_share: NotRequired[float]
+
+
+class Workspace(TypedDict):
+    """An axis-aligned box in the cloud's frame; points outside are dropped first."""
+
+    # lower corner, metres
+    min: Vector
+    # upper corner, metres
+    max: Vector
 
 
 class Box(TypedDict):
     """An axis-aligned box in the cloud's frame."""
 
     kind: Literal["box"]
-    min: Vector  # lower corner, metres
-    max: Vector  # upper corner, metres
+    # lower corner, metres
+    min: Vector
+    # upper corner, metres
+    max: Vector
+
+
+class HalfSpace(TypedDict):
+    """Everything on one side of a plane: the points x with normal . x >= offset."""
+
+    kind: Literal["half_space"]
+    # unit, into the region
+    normal: Vector
+    # normal . x on the plane, metres
+    offset: float
+
+
+class Indices(TypedDict):
+    """Points by their row in the cloud as it was sent."""
+
+    kind: Literal["indices"]
+    # rows of the cloud as sent; row-major where organised
+    indices: Sequence[int] | NDArray[Any]
+
+
+class Mask(TypedDict):
+    """Points by one truth value for each row of the cloud as it was sent."""
+
+    kind: Literal["mask"]
+    # as many values as the cloud has rows
+    mask: Sequence[bool] | NDArray[Any]
 
 
 class OrientedBox(TypedDict):
     """A box in any orientation."""
 
     kind: Literal["oriented_box"]
-    center: Vector  # its middle, metres
-    half_extents: Vector  # half its lengths along its own axes, metres
-    quaternion: NotRequired[Vector]  # x, y, z, w: T_cloud_box
+    # its middle, metres
+    center: Vector
+    # half its lengths along its own axes, metres
+    half_extents: Vector
+    # x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)
+    quaternion: NotRequired[Vector]
+
+
+class Segments(TypedDict):
+    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+
+    kind: Literal["segments"]
+    # values of segment_ids
+    ids: Sequence[int] | NDArray[Any]
 
 
 class Sphere(TypedDict):
     """A ball."""
 
     kind: Literal["sphere"]
-    center: Vector  # its middle, metres
-    radius: float  # metres
-
-
-class HalfSpace(TypedDict):
-    """The points p with normal . p >= offset."""
-
-    kind: Literal["half_space"]
-    normal: Vector  # unit, into the region
-    offset: float  # metres
-
-
-class Indices(TypedDict):
-    """Points by their row in the cloud as sent."""
-
-    kind: Literal["indices"]
-    indices: Sequence[int] | NDArray[Any]
-
-
-class Mask(TypedDict):
-    """Points by one truth value for each row of the cloud as sent."""
-
-    kind: Literal["mask"]
-    mask: Sequence[bool] | NDArray[Any]
-
-
-class Segments(TypedDict):
-    """Points by the segment they belong to: `segment_ids` beside the cloud."""
-
-    kind: Literal["segments"]
-    ids: Sequence[int] | NDArray[Any]
+    # its middle, metres
+    center: Vector
+    # metres
+    radius: float
 
 
 Shape = Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments
@@ -93,88 +154,102 @@ Shape = Box | OrientedBox | Sphere | HalfSpace | Indices | Mask | Segments
 class Region(TypedDict, total=False):
     """What lies in any of `include` and in none of `exclude`."""
 
-    include: Sequence[Shape]  # none: everywhere
+    # union of shapes; empty: everywhere
+    include: Sequence[Shape]
+    # union of shapes taken away
     exclude: Sequence[Shape]
 
 
 class Cone(TypedDict):
     """Directions within an angle of one."""
 
-    direction: Vector  # the way the hand moves toward the object, +z of the hand
-    max_angle: float  # radians
+    # the way the hand moves toward the object, +z of the hand; any length but zero
+    direction: Vector
+    # radians between it and the hand's way
+    max_angle: float
 
 
 class ApproachDirection(TypedDict, total=False):
     """Directions in which the hand may move: those in any cone or in the preset."""
 
+    # any of these
     cones: Sequence[Cone]
-    preset: Literal["top-down", "side"] | None  # relative to up
+    # or this, relative to up
+    preset: Literal["top-down", "side"] | None
+
+
+Obstacle = Box | OrientedBox
 
 
 class Collision(TypedDict, total=False):
-    """What the hand must not meet, and on which way."""
+    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
 
-    mode: Literal["avoid", "penalise", "ignore"]  # left out, worth half, or not looked for
-    margin: float  # metres kept free around the hand
-    opening: float | None  # metres between the fingers on the way in; None: the maximum
-    approach_length: float  # metres of straight way in
-    retreat_length: float  # metres of straight way out
+    # grasps whose hand collides: left out, their scores worth half in the ranking, or not looked
+    # for
+    mode: Literal["avoid", "penalise", "ignore"]
+    # metres kept free around the hand: its boxes are grown by this on every side
+    margin: float
+    # metres between the fingers on the way in; None: the gripper's maximum
+    opening: float | None
+    # metres of straight way in along the approach
+    approach_length: float
+    # metres of straight way out
+    retreat_length: float
+    # way out: back along the approach, or along up
     retreat_direction: Literal["back", "up"]
-    obstacles: Sequence[Box | OrientedBox]  # beside the cloud
-
-
-class HandPart(TypedDict):
-    """Boxes of the hand or of one finger, hand frame."""
-
-    boxes: Sequence[Sequence[Vector]]  # [min corner, max corner] each, metres
-
-
-class Linkage(TypedDict):
-    """A linkage that carries each finger along an arc."""
-
-    radius: float  # length of the link that carries a finger, metres
-    reach: float  # outward part (y) of that link in the open gripper, metres
-
-
-class GripperGeometry(TypedDict):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
-
-    name: NotRequired[str]
-    max_opening: float  # metres between the open fingers' inner faces
-    tip_z: float  # fingertips, metres along z
-    contact_z: float  # where contacts are put, metres along z
-    tcp_z: float  # origin of the TCP frame, metres along z
-    hand: HandPart
-    finger: HandPart  # one finger, its inner face at y = 0
-    swing: NotRequired[Linkage | None]  # None: the fingers close in a straight line
+    # solid boxes beside the cloud
+    obstacles: Sequence[Obstacle]
 
 
 class Suppression(TypedDict, total=False):
-    """Drops a grasp near a better one: nearer than both distances."""
+    """Drop a grasp near a better one: nearer than both distances."""
 
-    translation: float  # metres between TCPs
-    rotation: float  # radians between hands
+    # metres between TCPs
+    translation: float
+    # radians between hands, the 180 degree flip about the approach ignored
+    rotation: float
 
 
 class DetectOptions(TypedDict, total=False):
-    """What `detect` and `score` take besides the cloud."""
+    """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
-    model: str  # weights to use; empty: the server's default
-    gripper: str | GripperGeometry | None  # None: the one the weights were trained for
-    num_approach_points: int  # approach points sampled
-    num_candidates: int  # candidates scored at most
-    sampling: Literal["farthest", "uniform"]  # of approach points
-    seed: int  # same cloud, options and seed, same grasps
-    viewpoint: Vector | Sequence[Vector] | None  # camera positions, metres; orient the normals
-    up: Vector  # direction away from gravity
-    support: SupportPlane | RansacPlane | None  # plane the objects rest on; the hand stays above
-    workspace: Workspace | None  # points outside are dropped
-    approach_region: Region | None  # where approach points may lie
-    contact_region: Region | None  # where contact points may lie
-    approach_direction: ApproachDirection | None  # ways the hand may move; None: not from below
-    collision: Literal["avoid", "penalise", "ignore"] | Collision  # what the hand must not meet
-    min_score: float  # lowest score returned
-    top_k: int  # grasps returned at most
-    suppression: Suppression | None  # non-maximum suppression; None: none
-    order: Literal["score", "highest", "clearance"]  # what comes first
-    debug: bool  # whether to return the processed cloud and every candidate
+    # weights to use; empty: the server's default
+    model: str
+    # name of a gripper, or a gripper; None: the one the weights were trained for
+    gripper: str | GripperGeometry | None
+    # approach points sampled
+    num_approach_points: int
+    # candidates scored at most
+    num_candidates: int
+    # how approach points are sampled
+    sampling: Literal["farthest", "uniform"]
+    # seed of every random choice
+    seed: int
+    # camera position, metres; orients the normals. Several positions: `view_ids` beside the cloud
+    # says which one saw each point
+    viewpoint: Vector | Sequence[Vector] | None
+    # direction away from gravity; any length but zero
+    up: Vector
+    # plane the objects rest on; no part of the hand goes below it
+    support: SupportPlane | RansacPlane | None
+    # points outside are dropped
+    workspace: Workspace | None
+    # where approach points may lie; None: everywhere
+    approach_region: Region | None
+    # where contact points may lie; None: everywhere
+    contact_region: Region | None
+    # ways the hand may move; None: not from below
+    approach_direction: ApproachDirection | None
+    # what the hand must not meet; a bare mode will do
+    collision: Literal["avoid", "penalise", "ignore"] | Collision
+    # lowest score returned
+    min_score: float
+    # grasps returned at most
+    top_k: int
+    # non-maximum suppression; None: none
+    suppression: Suppression | None
+    # what comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
+    # others by score; or the clearance
+    order: Literal["score", "highest", "clearance"]
+    # whether to return the processed cloud and every candidate
+    debug: bool

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeAlias
 
 from edgegrasp_sim import engine, hand, objects, scene, trial
@@ -19,7 +20,7 @@ from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import PATIENCE, Closes, Planner, Round, run_round
+from edgegrasp_sim.trial import PATIENCE, Planner, Round, run_round
 from edgegrasp_sim.window import Window
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
@@ -28,6 +29,16 @@ Task: TypeAlias = tuple[int, int]  # seed and index of a round
 MAX_CRASHES = 3  # in a row, without a finished round between them
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
+CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module, for the manifest
+    (engine, ("time_step", "solver_iterations", "gravity")),
+    (scene, ("table_friction", "packed_attempts", "pile_drop_height", "rest_speed")),
+    (objects, ("object_mass", "object_friction")),
+    (hand, ("max_opening", "hand_mass", "finger_friction", "finger_spinning_friction")),
+    (hand, ("finger_force", "gear_force", "tool_force", "close_seconds", "collision_depth")),
+    (hand, ("pregrasp_distance", "retreat_distance", "side_grasp_angle", "step_length")),
+    (hand, ("min_opening",)),
+    (trial, ("min_points",)),
+)
 LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
@@ -120,7 +131,7 @@ def run_benchmark(
     elif workers == 1:
         run = _run_here(config, make_planner, missing, gui)
     else:
-        run = _run_pools(config, make_planner, missing, workers)
+        run = _run_in_processes(config, make_planner, missing, workers)
     for done in run:
         rounds[done.seed, done.index] = done
         if folder is not None:
@@ -142,11 +153,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         "run": {
             "scene": config.scene.value,
             "protocol": config.protocol.to_json(),
-            "objects": {
-                "name": drawn.name,
-                "models": len(drawn.models),
-                "digest": drawn.digest,
-            },
+            "objects": {"name": drawn.name, "models": len(drawn.models), "digest": drawn.digest},
             "planner": planner,
             "constants": constants(),
         },
@@ -154,10 +161,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         "seeds": list(config.seeds),
         "objects_folder": str(config.objects) if config.objects is not None else None,
         "split": config.split,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: _version(name) for name in PACKAGES},
-        },
+        "versions": {"python": platform.python_version()} | {n: _version(n) for n in PACKAGES},
         "host": {
             "name": platform.node(),
             "platform": platform.platform(),
@@ -169,32 +173,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 
 def constants() -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
-    return {
-        "time_step": engine.TIME_STEP,
-        "solver_iterations": engine.SOLVER_ITERATIONS,
-        "gravity": engine.GRAVITY,
-        "table_friction": scene.TABLE_FRICTION,
-        "object_mass": objects.OBJECT_MASS,
-        "object_friction": objects.OBJECT_FRICTION,
-        "packed_attempts": scene.PACKED_ATTEMPTS,
-        "pile_drop_height": scene.PILE_DROP_HEIGHT,
-        "rest_speed": scene.REST_SPEED,
-        "max_opening": hand.MAX_OPENING,
-        "hand_mass": hand.HAND_MASS,
-        "finger_friction": hand.FINGER_FRICTION,
-        "finger_spinning_friction": hand.FINGER_SPINNING_FRICTION,
-        "finger_force": hand.FINGER_FORCE,
-        "gear_force": hand.GEAR_FORCE,
-        "tool_force": hand.TOOL_FORCE,
-        "close_seconds": hand.CLOSE_SECONDS,
-        "collision_depth": hand.COLLISION_DEPTH,
-        "pregrasp_distance": hand.PREGRASP_DISTANCE,
-        "retreat_distance": hand.RETREAT_DISTANCE,
-        "side_grasp_angle": hand.SIDE_GRASP_ANGLE,
-        "step_length": hand.STEP_LENGTH,
-        "min_opening": hand.MIN_OPENING,
-        "min_points": trial.MIN_POINTS,
-    }
+    return {name: getattr(module, name.upper()) for module, names in CONSTANTS for name in names}
 
 
 def available_cores() -> int:
@@ -254,8 +233,8 @@ class RoundRunner:
     def close(self) -> None:
         """Release what simulation and planner hold."""
         self.simulation.close()
-        if isinstance(self.planner, Closes):
-            self.planner.close()
+        if close := getattr(self.planner, "close", None):
+            close()
 
 
 def _run_here(
@@ -270,42 +249,34 @@ def _run_here(
         runner.close()
 
 
-def _run_pools(
+def _run_in_processes(
     config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
 ) -> Iterator[Round]:
     """Run rounds in processes; if one dies, the pool breaks and a new one takes its place."""
     missing, crashes = list(tasks), 0
     while missing:
-        finished = 0
+        # Forked children would share the parent's physics servers.
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(
+            workers, context, initializer=_start_worker, initargs=(config, make_planner)
+        )
         try:
-            for done in _run_pool(config, make_planner, missing, workers):
-                finished += 1
+            with _one_thread_each():
+                futures = [pool.submit(_run_in_worker, task) for task in missing]
+            for future in as_completed(futures):
+                done = future.result()
+                crashes = 0
                 missing.remove((done.seed, done.index))
                 yield done
         except BrokenProcessPool:
-            crashes = 1 if finished else crashes + 1
+            crashes += 1
             if crashes >= MAX_CRASHES:
                 raise RuntimeError(
                     f"worker processes died {crashes} times in a row with {len(missing)} rounds "
                     "left; run with one worker to see why"
                 ) from None
-
-
-def _run_pool(
-    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
-) -> Iterator[Round]:
-    # Forked children would share the parent's physics servers.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(
-        workers, context, initializer=_start_worker, initargs=(config, make_planner)
-    )
-    try:
-        with _one_thread_each():
-            futures = [pool.submit(_run_in_worker, task) for task in tasks]
-        for future in as_completed(futures):
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 _worker: RoundRunner | None = None  # of a worker process, made by its initialiser
@@ -366,48 +337,29 @@ def _run_on_ray(
         raise RuntimeError("ray is not installed: pip install 'edgegrasp[ray]'") from None
     if not tasks:
         return
-    _connect_ray(ray, address, workers)
+    own: dict[str, Any] = {}
+    if address == LOCAL_RAY:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
+        own = {"num_cpus": workers, "include_dashboard": False}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
     try:
         workers = max(1, min(workers, int(ray.cluster_resources().get("CPU", 1))))
         actor: Any = ray.remote(
             num_cpus=1, max_restarts=MAX_CRASHES * len(tasks), max_task_retries=MAX_CRASHES
         )(RoundRunner)
         digest = config.object_set().digest
-        idle = [actor.remote(config, make_planner, digest=digest) for _ in range(workers)]
-        waiting = list(reversed(tasks))
-        running: dict[Any, Any] = {}
-        while waiting or running:
-            while idle and waiting:
-                runner = idle.pop()
-                running[runner.run.remote(waiting.pop())] = runner
-            (done,), _ = ray.wait(list(running))
-            idle.append(running.pop(done))
-            yield _ray_result(ray, done)
-    finally:
-        ray.shutdown()
-
-
-def _connect_ray(ray: Any, address: str, workers: int) -> None:
-    quiet = {"log_to_driver": False, "logging_level": "ERROR"}
-    try:
-        if address == LOCAL_RAY:
-            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
-            ray.init(address=LOCAL_RAY, num_cpus=workers, include_dashboard=False, **quiet)
-        else:
-            ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
-
-
-def _ray_result(ray: Any, done: Any) -> Round:
-    """A finished round; raises the errors that a worker process would have raised."""
-    try:
-        result: Round = ray.get(done)
+        runners = [actor.remote(config, make_planner, digest=digest) for _ in range(workers)]
+        pool = ray.util.ActorPool(runners)
+        yield from pool.map_unordered(lambda runner, task: runner.run.remote(task), tasks)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None
     except ray.exceptions.RayActorError as error:
         raise RuntimeError(f"a Ray actor died again and again: {error}") from error
-    return result
+    finally:
+        ray.shutdown()
 
 
 def _version(distribution: str) -> str | None:

@@ -38,8 +38,6 @@ class Observation:
 
     Attributes:
         cloud: (N, 3) float32, world frame, metres; order of the pixels, one image after another.
-        T_world_camera: (4, 4) pose of the first camera (z along the line of sight, y down).
-        camera_position: (3,) float32, that of the first camera, world frame, metres.
         workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for.
         table_height: metres; not to be used where `table` is `ransac`.
         camera_positions: (V, 3) float32, every camera, world frame, metres.
@@ -51,14 +49,18 @@ class Observation:
     """
 
     cloud: NDArray[np.float32]
-    T_world_camera: Matrix
-    camera_position: NDArray[np.float32]
     workspace: NDArray[np.float32]
     table_height: float
     camera_positions: NDArray[np.float32]
     view_ids: NDArray[np.int32]
     table: TableView = "known"
     failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
+
+    @property
+    def camera_position(self) -> NDArray[np.float32]:
+        """The first camera, world frame, metres: (3,)."""
+        first: NDArray[np.float32] = self.camera_positions[0]
+        return first
 
 
 @dataclass(frozen=True, slots=True)

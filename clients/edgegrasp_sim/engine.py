@@ -13,7 +13,7 @@ import pybullet
 import pybullet_data
 from numpy.typing import NDArray
 
-from edgegrasp_sim.poses import Matrix, quaternion_xyzw
+from edgegrasp_sim.poses import Matrix
 
 TIME_STEP = 1.0 / 80.0  # seconds
 SOLVER_ITERATIONS = 100
@@ -296,12 +296,15 @@ class Body:
     @property
     def position(self) -> Matrix:
         """Centre of mass of the base, world frame, metres: (3,)."""
-        return np.asarray(self._pose()[0], dtype=np.float64)
+        pose = pybullet.getBasePositionAndOrientation(self.uid, physicsClientId=self.client)
+        return np.asarray(pose[0], dtype=np.float64)
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
         """Orientation of the base in the world."""
-        return self._pose()[1]
+        pose = pybullet.getBasePositionAndOrientation(self.uid, physicsClientId=self.client)
+        x, y, z, w = pose[1]
+        return x, y, z, w
 
     def set_pose(
         self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
@@ -310,10 +313,6 @@ class Body:
         pybullet.resetBasePositionAndOrientation(
             self.uid, position, quaternion_xyzw, physicsClientId=self.client
         )
-
-    def set_transform(self, T_world_com: Matrix) -> None:
-        """Put the base's centre-of-mass frame there, at rest."""
-        self.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     @property
     def speed(self) -> float:
@@ -331,16 +330,6 @@ class Body:
         """The contact points found by the last step or collision detection."""
         points = pybullet.getContactPoints(self.uid, physicsClientId=self.client)
         return [Contact(other_uid=point[2], distance=point[8]) for point in points]
-
-    def joint(self, index: int) -> "Joint":
-        """The joint that carries link `index`."""
-        return Joint(self, index)
-
-    def _pose(self) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-        position, quaternion = pybullet.getBasePositionAndOrientation(
-            self.uid, physicsClientId=self.client
-        )
-        return position, quaternion
 
 
 class Joint:

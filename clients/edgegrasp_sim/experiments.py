@@ -1,7 +1,7 @@
 """Experiments: benchmarks that differ in one thing each, and their table and figure."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any, TypeAlias
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from edgegrasp_sim.objects import FAMILIES, SceneKind, write_family
 from edgegrasp_sim.protocol import Protocol, load_protocol
-from edgegrasp_sim.results import planner_title
+from edgegrasp_sim.results import RATE_LABELS, percent, planner_title
 
 NOISE_MILLIMETRES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
 VOXEL_MILLIMETRES = (3.0, 4.0, 5.0, 6.0, 8.0)
@@ -20,7 +20,6 @@ FLIPPED_PERCENT = (0.0, 5.0, 10.0, 25.0, 50.0)
 # Approach points and candidates, named as in the paper's table.
 SAMPLES = {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
 BASELINES = ("edge-sample", "oracle", "oracle-own")
-RATES = (("grasp_success_rate", "GSR"), ("declutter_rate", "DR"))
 COLOURS = {"packed": "#2f6db3", "pile": "#e08a1e"}
 STYLES = ("-", "--", ":", "-.")  # of the models
 
@@ -54,111 +53,100 @@ class Case:
         return re.sub(r"[^\w.]+", "-", "-".join(part for part in parts if part))
 
 
-# From a protocol, the scenes, the models and the experiment's folder to its cases.
-Plan: TypeAlias = Callable[[Protocol, Sequence[SceneKind], Sequence[str], "Path"], list[Case]]
+# What varies: group, value, protocol, fields of the planner, folder of the objects.
+Variant: TypeAlias = tuple[str, float | str, Protocol, dict[str, Any], Path | None]
 
 
-def robustness(
-    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
+def cases_of(
+    name: str,
+    protocol: Protocol,
+    scenes: Sequence[SceneKind],
+    models: Sequence[str],
+    folder: Path,
 ) -> list[Case]:
-    """Success against noise, voxel size, height of the camera, flipped normals, and view."""
-    del folder
+    """The benchmarks of an experiment.
+
+    Args:
+        name: one of `EXPERIMENTS`.
+        protocol: what is varied.
+        scenes: kinds of scenes.
+        models: names or files of weights.
+        folder: of the experiment, for objects that it makes.
+
+    Raises:
+        ValueError: no such experiment, or `labels` with a model that is not a file in a folder
+            named by a number.
+    """
+    if name not in EXPERIMENTS:
+        raise ValueError(f"name is {name!r}; choose one of {', '.join(EXPERIMENTS)}")
     cases = []
     for scene in scenes:
-        for model in models:
-            named = {"model": model}
-            for value in NOISE_MILLIMETRES:
-                noise = replace(protocol.noise, point_std=value / 1000)
-                changed = replace(protocol, name=f"{protocol.name}, noise", noise=noise)
-                cases.append(Case("noise (mm)", value, scene, changed, named))
-            for value in VOXEL_MILLIMETRES:
-                planner = named | {"voxel_size": value / 1000}
-                cases.append(Case("voxel size (mm)", value, scene, protocol, planner))
-            for value in POLAR_DEGREES:
-                camera = replace(protocol.camera, polar_degrees=(value, value))
-                changed = replace(protocol, name=f"{protocol.name}, polar angle", camera=camera)
-                cases.append(Case("camera's polar angle (degrees)", value, scene, changed, named))
-            for value in FLIPPED_PERCENT:
-                planner = named | {"flipped_normals": value / 100}
-                cases.append(Case("normals flipped (%)", value, scene, protocol, planner))
-            cases += [Case("view", v.name, scene, v, named) for v in _views(protocol)]
+        for model in [None] if name == "baselines" else models:
+            named = {} if model is None else {"model": model}
+            for variant in EXPERIMENTS[name](protocol, model or "", folder):
+                group, value, rules, planner, objects = variant
+                cases.append(Case(group, value, scene, rules, named | planner, objects))
     return cases
 
 
-def samples(
-    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
-) -> list[Case]:
+def robustness(protocol: Protocol, model: str, folder: Path) -> Iterator[Variant]:
+    """Success against noise, voxel size, height of the camera, flipped normals, and view."""
+    for value in NOISE_MILLIMETRES:
+        noise = replace(protocol.noise, point_std=value / 1000)
+        changed = replace(protocol, name=f"{protocol.name}, noise", noise=noise)
+        yield "noise (mm)", value, changed, {}, None
+    for value in VOXEL_MILLIMETRES:
+        yield "voxel size (mm)", value, protocol, {"voxel_size": value / 1000}, None
+    for value in POLAR_DEGREES:
+        camera = replace(protocol.camera, polar_degrees=(value, value))
+        changed = replace(protocol, name=f"{protocol.name}, polar angle", camera=camera)
+        yield "camera's polar angle (degrees)", value, changed, {}, None
+    for value in FLIPPED_PERCENT:
+        yield "normals flipped (%)", value, protocol, {"flipped_normals": value / 100}, None
+    giga = load_protocol("giga")
+    moved = replace(protocol, name=f"{protocol.name}, giga's camera", camera=giga.camera)
+    for view in (protocol, moved, giga):
+        yield "view", view.name, view, {}, None
+
+
+def samples(protocol: Protocol, model: str, folder: Path) -> Iterator[Variant]:
     """Success against the number of approach points and candidates (the paper's table)."""
-    del folder
-    return [
-        Case(
-            "samples",
-            name,
-            scene,
-            protocol,
-            {"model": model, "num_approach_points": points, "num_candidates": candidates},
+    for name, (points, candidates) in SAMPLES.items():
+        numbers = {"num_approach_points": points, "num_candidates": candidates}
+        yield "samples", name, protocol, numbers, None
+
+
+def labels(protocol: Protocol, model: str, folder: Path) -> Iterator[Variant]:
+    """Success against the number of training labels, which names the folder of a weights file."""
+    number = PurePath(model).parent.name
+    if not number.isdecimal():
+        raise ValueError(
+            f"model is {model!r}; name files in folders named by their number of labels, "
+            "such as runs/3000/edgegrasp-plus.safetensors"
         )
-        for scene in scenes
-        for model in models
-        for name, (points, candidates) in SAMPLES.items()
-    ]
+    yield "labels", float(number), protocol, {}, None
 
 
-def labels(
-    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
-) -> list[Case]:
-    """Success against the number of training labels, which names the folder of each weights file.
-
-    Raises:
-        ValueError: a model is not a file in a folder named by a number.
-    """
-    del folder
-    numbers = {model: PurePath(model).parent.name for model in models}
-    for model, number in numbers.items():
-        if not number.isdecimal():
-            raise ValueError(
-                f"model is {model!r}; name files in folders named by their number of labels, "
-                "such as runs/3000/edgegrasp-plus.safetensors"
-            )
-    return [
-        Case("labels", float(number), scene, protocol, {"model": model})
-        for scene in scenes
-        for model, number in numbers.items()
-    ]
-
-
-def families(
-    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
-) -> list[Case]:
+def families(protocol: Protocol, model: str, folder: Path) -> Iterator[Variant]:
     """Success on thin, flat and large objects, written into the experiment's folder."""
     whole = replace(protocol.scene, packed_scale=(1.0, 1.0), pile_scale=(1.0, 1.0))
     changed = replace(protocol, name=f"{protocol.name}, families", scene=whole)
-    folders = {name: write_family(name, folder / "objects" / name) for name in FAMILIES}
-    return [
-        Case("family", name, scene, changed, {"model": model}, folders[name])
-        for scene in scenes
-        for model in models
-        for name in FAMILIES
-    ]
+    for name in FAMILIES:
+        yield "family", name, changed, {}, write_family(name, folder / "objects" / name)
 
 
-def baselines(
-    protocol: Protocol, scenes: Sequence[SceneKind], models: Sequence[str], folder: Path
-) -> list[Case]:
-    """Success of random candidates, and of the best choice among them."""
-    del models, folder
+def baselines(protocol: Protocol, model: str, folder: Path) -> Iterator[Variant]:
+    """Success of random candidates, and of the best choice among them; models do not matter."""
+    rules = protocol.planning
     numbers = {
-        "num_approach_points": protocol.planning.num_approach_points,
-        "num_candidates": protocol.planning.num_candidates,
+        "num_approach_points": rules.num_approach_points,
+        "num_candidates": rules.num_candidates,
     }
-    return [
-        Case("planner", name, scene, protocol, {"name": name} | numbers)
-        for scene in scenes
-        for name in BASELINES
-    ]
+    for name in BASELINES:
+        yield "planner", name, protocol, {"name": name} | numbers, None
 
 
-EXPERIMENTS: dict[str, Plan] = {
+EXPERIMENTS: dict[str, Callable[[Protocol, str, Path], Iterator[Variant]]] = {
     "robustness": robustness,
     "samples": samples,
     "labels": labels,
@@ -174,43 +162,32 @@ def experiment_table(results: dict[str, Any]) -> str:
         results: as in `experiment.json`.
     """
     parts = []
-    for group in _unique(case["group"] for case in results["cases"]):
-        cases = [case for case in results["cases"] if case["group"] == group]
-        columns = _unique((c["scene"], planner_title(c["planner"])) for c in cases)
-        if group == "planner":  # the rows name the planner
-            columns = _unique((c["scene"], "") for c in cases)
-        heads = [f"{scene}, {model}" if model else scene for scene, model in columns]
+    for group, cases in _by(_group, results["cases"]).items():
+        columns = _by(_line, cases)
         lines = [
-            f"| {group} | " + " | ".join(f"{head}: GSR | DR" for head in heads) + " |",
+            f"| {group} | " + " | ".join(f"{head}: GSR | DR" for head in columns) + " |",
             "| --- |" + " --- | --- |" * len(columns),
         ]
-        for value in _unique(case["value"] for case in cases):
-            cells = []
-            for scene, model in columns:
-                found = [
-                    case
-                    for case in cases
-                    if (case["value"], case["scene"]) == (value, scene)
-                    and model in ("", planner_title(case["planner"]))
-                ]
-                cells += [percent(found[0][name]) if found else "" for name, _ in RATES]
-            lines.append(f"| {value_text(value)} | " + " | ".join(cells) + " |")
+        for value, row in _by(lambda case: case["value"], cases).items():
+            found = {_line(case): case for case in row}
+            cells = [
+                percent(found[head][name]) if head in found else ""
+                for head in columns
+                for name in RATE_LABELS
+            ]
+            text = value if isinstance(value, str) else f"{value:g}"
+            lines.append(f"| {text} | " + " | ".join(cells) + " |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
 
 
 def experiment_figure(results: dict[str, Any]) -> Figure:
     """GSR and DR of an experiment with 95 % intervals: a row of axes for each group."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    groups = _unique(case["group"] for case in results["cases"])
+    groups = _by(_group, results["cases"])
     figure = Figure(figsize=(9.6, 3.0 * len(groups)), dpi=90, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes: Any = figure.subplots(len(groups), len(RATES), squeeze=False, sharey=True)
-    for row, group in zip(axes, groups, strict=True):
-        cases = [case for case in results["cases"] if case["group"] == group]
-        for place, (name, label) in zip(row, RATES, strict=True):
+    axes: Any = figure.subplots(len(groups), len(RATE_LABELS), squeeze=False, sharey=True)
+    for row, (group, cases) in zip(axes, groups.items(), strict=True):
+        for place, (name, label) in zip(row, RATE_LABELS.items(), strict=True):
             _draw(place, cases, name)
             place.set(xlabel=group, ylabel=f"{label} (%)", ylim=(0, 102))
             place.grid(alpha=0.25)
@@ -221,62 +198,46 @@ def experiment_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def percent(rate: dict[str, Any]) -> str:
-    """A rate with its 95 % interval, in per cent."""
-    if rate["value"] is None:
-        return "none"
-    low, high = rate["wilson_95"]
-    return f"{100 * rate['value']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def value_text(value: float | str) -> str:
-    """A case's value as text."""
-    return value if isinstance(value, str) else f"{value:g}"
-
-
-def _views(protocol: Protocol) -> list[Protocol]:
-    """A protocol, the same with the camera of `giga`, and `giga` with its noise."""
-    giga = load_protocol("giga")
-    return [
-        protocol,
-        replace(protocol, name=f"{protocol.name}, giga's camera", camera=giga.camera),
-        giga,
-    ]
-
-
 def _draw(axes: Any, cases: list[dict[str, Any]], name: str) -> None:
-    values = _unique(case["value"] for case in cases)
+    """One rate against the values, a line for each scene and model; side by side if named."""
+    values = list(_by(lambda case: case["value"], cases))
     numbers = all(not isinstance(value, str) for value in values)
-    baselines = cases[0]["group"] == "planner"
-    lines = _unique((c["scene"], "" if baselines else planner_title(c["planner"])) for c in cases)
-    models = _unique(model for _, model in lines)
-    for number, (scene, model) in enumerate(lines):
-        told = [
-            case
-            for case in cases
-            if case["scene"] == scene
-            and model in ("", planner_title(case["planner"]))
-            and case[name]["value"] is not None
-        ]
-        rates = np.array([[case[name]["value"], *case[name]["wilson_95"]] for case in told])
-        if len(rates) == 0:
+    lines = _by(_line, cases)
+    models = list(_by(lambda case: planner_title(case["planner"]), cases))
+    for number, (label, line) in enumerate(lines.items()):
+        known = [case for case in line if case[name]["value"] is not None]
+        if not known:
             continue
-        at = np.array(
-            [case["value"] if numbers else values.index(case["value"]) for case in told], float
-        )
-        if not numbers:
-            at += 0.12 * (number - (len(lines) - 1) / 2)  # side by side
-        middle, low, high = 100 * rates.T
+        at = [case["value"] if numbers else values.index(case["value"]) for case in known]
+        aside = 0.0 if numbers else 0.12 * (number - (len(lines) - 1) / 2)
+        rates = [[case[name]["value"], *case[name]["wilson_95"]] for case in known]
+        middle, low, high = 100 * np.array(rates).T
         spread = np.maximum(np.stack((middle - low, high - middle)), 0.0)
+        style = STYLES[models.index(planner_title(known[0]["planner"])) % len(STYLES)]
         axes.errorbar(
-            at, middle, spread, capsize=3, marker="o", markersize=4, color=COLOURS[scene],
-            linestyle=STYLES[models.index(model) % len(STYLES)] if numbers else "none",
-            label=f"{scene}, {model}" if model else scene,
+            np.array(at, float) + aside, middle, spread, capsize=3, marker="o", markersize=4,
+            color=COLOURS[known[0]["scene"]], linestyle=style if numbers else "none", label=label,
         )  # fmt: skip
     if not numbers:
         axes.set_xticks(range(len(values)), values)
         axes.set_xlim(-0.5, len(values) - 0.5)
 
 
-def _unique(items: Iterable[Any]) -> list[Any]:
-    return list(dict.fromkeys(items))
+def _group(case: dict[str, Any]) -> str:
+    return str(case["group"])
+
+
+def _line(case: dict[str, Any]) -> str:
+    """Scene and model of a case; the scene alone where planners are what varies."""
+    named = "" if case["group"] == "planner" else f", {planner_title(case['planner'])}"
+    return f"{case['scene']}{named}"
+
+
+def _by(
+    key: Callable[[dict[str, Any]], Any], cases: Iterable[dict[str, Any]]
+) -> dict[Any, list[dict[str, Any]]]:
+    """Cases by a key, in the order of their first."""
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for case in cases:
+        found.setdefault(key(case), []).append(case)
+    return found

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from edgegrasp_sim.engine import ASSETS, TIME_STEP, World, WorldAnchor, couple_joints
+from edgegrasp_sim.engine import ASSETS, TIME_STEP, Body, Joint, World, WorldAnchor, couple_joints
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
@@ -127,18 +127,12 @@ def run_grasp(
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
     if start_contact and start_contact_fails:
-        return GraspResult(
-            GraspOutcome.PREGRASP,
-            gripper.opening,
-            start_contact,
-            None,
-            target,
-            FailureCause.START_COLLISION,
-        )
+        outcome, cause = GraspOutcome.PREGRASP, FailureCause.START_COLLISION
+        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
 
     collided = False
     for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
-        collided = collided or gripper.penetrates()
+        collided = collided or any(c.distance < -COLLISION_DEPTH for c in gripper.body.contacts())
     _close(gripper, objects, to_the_end=to_the_end)
     missed = gripper.opening <= MIN_OPENING
     caught = _touched(gripper, objects)
@@ -147,14 +141,8 @@ def run_grasp(
         if held is not None and gripper.opening > MIN_OPENING:
             opening = gripper.opening
             still = _holds_when_shaken(gripper, T_world_hand, held, objects) if shake else None
-            return GraspResult(
-                GraspOutcome.SUCCESS,
-                opening,
-                start_contact,
-                held,
-                target,
-                held_after_shaking=still,
-            )
+            success = GraspOutcome.SUCCESS
+            return GraspResult(success, opening, start_contact, held, target, None, still)
     applies = {
         FailureCause.START_COLLISION: start_contact,
         FailureCause.APPROACH_COLLISION: collided,
@@ -193,7 +181,7 @@ class Gripper:
             position=_PARKED[:3, 3].tolist(),
         )
         self.body.set_dynamics(mass=HAND_MASS, friction=HAND_FRICTION)
-        self.fingers = (self.body.joint(0), self.body.joint(1))
+        self.fingers = (Joint(self.body, 0), Joint(self.body, 1))
         for finger in self.fingers:
             self.body.set_finger(
                 finger.index,
@@ -219,8 +207,9 @@ class Gripper:
     def place(self, T_world_hand: Matrix) -> None:
         """Put the open hand there at once, at rest."""
         T_world_com = T_world_hand @ T_HAND_HANDCOM
-        self.body.set_transform(T_world_com)
-        self._anchor.move(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
+        pose = T_world_com[:3, 3], quaternion_xyzw(T_world_com)
+        self.body.set_pose(*pose)
+        self._anchor.move(*pose)
         for finger in self.fingers:
             finger.reset(0.5 * MAX_OPENING)
             finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
@@ -248,23 +237,18 @@ class Gripper:
         for _ in self.steps_to(T_world_hand, step_length=step_length):
             pass
 
-    def penetrates(self) -> bool:
-        """Whether the hand overlaps something by more than `COLLISION_DEPTH`."""
-        return any(contact.distance < -COLLISION_DEPTH for contact in self.body.contacts())
-
-    def closing_steps(self) -> Iterator[None]:
-        """Close the fingers with full force for half a second; yields after every time step."""
+    def close(self) -> None:
+        """Drive the fingers together with full force."""
         for finger in self.fingers:
             finger.drive_to(0.0, FINGER_FORCE)
-        for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
-            self.world.step()
-            yield
 
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
     """Close the fingers; unless `to_the_end`, only until they are shut or hold firmly."""
     opening, still_steps = gripper.opening, 0
-    for _ in gripper.closing_steps():
+    gripper.close()
+    for _ in range(round(CLOSE_SECONDS / TIME_STEP)):
+        gripper.world.step()
         before, opening = opening, gripper.opening
         still_steps = still_steps + 1 if abs(opening - before) < STILL else 0
         shut = opening <= MIN_OPENING
@@ -308,16 +292,15 @@ class _Watch:
         self._empty_steps = 0 if touched else self._empty_steps + 1
         if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
             return True
-        held = len(touched) == 1 and self._hangs(touched[0]) and self._keeps_still(touched[0])
+        held = len(touched) == 1 and self._hangs_still(touched[0].body)
         self._held_steps = self._held_steps + 1 if held else 0
         return self._held_steps >= HELD_STEPS
 
-    def _hangs(self, held: SceneObject) -> bool:
-        hand = self._gripper.body.uid
-        return all(contact.other_uid == hand for contact in held.body.contacts())
-
-    def _keeps_still(self, held: SceneObject) -> bool:
-        before, self._offset = self._offset, held.body.position - self._gripper.body.position
+    def _hangs_still(self, held: Body) -> bool:
+        hand = self._gripper.body
+        if any(contact.other_uid != hand.uid for contact in held.contacts()):
+            return False
+        before, self._offset = self._offset, held.position - hand.position
         return before is None or bool(np.linalg.norm(self._offset - before) < SLIP)
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Never
 from xml.etree import ElementTree
 
 import numpy as np
@@ -43,6 +43,10 @@ class SceneKind(StrEnum):
 
     PACKED = "packed"
     PILE = "pile"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Never:
+        raise ValueError(f"scene is {value!r}; choose one of {', '.join(cls)}")
 
 
 @dataclass(frozen=True, slots=True)

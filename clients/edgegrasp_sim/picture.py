@@ -13,6 +13,7 @@ Points = NDArray[np.float64]
 PALM_Z = 0.0658  # metres along the hand's z: the palm's surface
 TIP_Z = 0.1122  # metres along the hand's z: the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
+TICKS = 0.05  # metres between the ticks of an axis
 MARGIN = 0.02  # metres around everything drawn
 MAX_CLOUD_POINTS = 12_000  # more would only hide each other
 LABELLED = 5  # grasps that carry their rank
@@ -43,25 +44,26 @@ def draw_grasps(
     camera_position: ArrayLike,
     title: str,
 ) -> None:
-    """Write a PNG: the cloud and a fork for every gripper, seen by the camera and from above.
+    """Write a picture: the cloud and a fork for every gripper, seen by the camera and from above.
 
     A fork is a gripper's outline at the grasp: a stem where the hand comes from, the palm's
     surface, and the inner faces of the fingers at the opening they start from.
 
     Args:
-        path: file to write; its folder must exist.
+        path: `.png` or `.jpg` file to write; its folder must exist.
         cloud: (N, 3) metres.
         grasps: best first; coloured by score, the best one edged in red.
         camera_position: (3,) metres, cloud frame; the first view looks from there.
         title: one line above the picture.
     """
     from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    points = _thin(np.asarray(cloud, dtype=np.float64))
+    points = np.asarray(cloud, dtype=np.float64)
+    if len(points) > MAX_CLOUD_POINTS:
+        points = points[np.linspace(0, len(points) - 1, MAX_CLOUD_POINTS).astype(int)]
     camera = np.asarray(camera_position, dtype=np.float64)
     forks = [fork(grasp.T_cloud_hand, grasp.width) for grasp in grasps]
     scores = np.array([grasp.score for grasp in grasps] or [0.0])
@@ -72,7 +74,6 @@ def draw_grasps(
     high = np.max([points.max(0), *(f.max((0, 1)) for f in forks)], axis=0) + MARGIN
 
     figure = Figure(figsize=(17, 8.4), dpi=110)
-    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=16)
     perspective: Any = figure.add_axes((0.01, 0.07, 0.52, 0.82), projection="3d")
     above: Any = figure.add_axes((0.56, 0.10, 0.35, 0.76))
@@ -114,13 +115,6 @@ def fork(T_cloud_hand: ArrayLike, width: float) -> Points:
     return in_cloud
 
 
-def _thin(points: Points) -> Points:
-    if len(points) <= MAX_CLOUD_POINTS:
-        return points
-    thinned: Points = points[np.linspace(0, len(points) - 1, MAX_CLOUD_POINTS).astype(int)]
-    return thinned
-
-
 def _greys(points: Points) -> Points:
     """Grey by height, lighter above, none so dark or light that a fork gets lost: (N, 3)."""
     z = points[:, 2]
@@ -130,6 +124,8 @@ def _greys(points: Points) -> Points:
 
 
 def _draw_perspective(axes: Any, points: Points, camera: Points, low: Points, high: Points) -> None:
+    from matplotlib.ticker import MultipleLocator
+
     centre = (low + high) / 2
     x, y, z = camera - centre
     axes.set_proj_type("persp")
@@ -145,19 +141,21 @@ def _draw_perspective(axes: Any, points: Points, camera: Points, low: Points, hi
     )
     for name in "xyz":
         getattr(axes, f"set_{name}label")(f"{name} (m)", fontsize=12, labelpad=8)
-        getattr(axes, f"{name}axis").set_major_locator(_ticks())
+        getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(TICKS))
     axes.tick_params(labelsize=10)
 
 
 def _draw_above(axes: Any, points: Points, low: Points, high: Points) -> None:
+    from matplotlib.ticker import MultipleLocator
+
     upward = points[np.argsort(points[:, 2])]
     axes.scatter(*upward[:, :2].T, c=_greys(upward), s=7)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.set_title("from above, looking along -z", fontsize=13)
     axes.set_xlabel("x (m)", fontsize=12)
     axes.set_ylabel("y (m)", fontsize=12)
-    axes.xaxis.set_major_locator(_ticks())
-    axes.yaxis.set_major_locator(_ticks())
+    axes.xaxis.set_major_locator(MultipleLocator(TICKS))
+    axes.yaxis.set_major_locator(MultipleLocator(TICKS))
     axes.tick_params(labelsize=11)
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
@@ -183,9 +181,3 @@ def _draw_fork(axes: Any, lines: Points, colour: Any, rank: int, *, labelled: bo
             zorder=2000,
             bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
         )
-
-
-def _ticks() -> Any:
-    from matplotlib.ticker import MultipleLocator
-
-    return MultipleLocator(0.05)

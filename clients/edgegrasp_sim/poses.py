@@ -30,11 +30,6 @@ def translation(x: float, y: float, z: float) -> Matrix:
     return T
 
 
-def yaw_quaternion_xyzw(angle: float) -> list[float]:
-    """A turn about world z by `angle` radians, as a quaternion `xyzw`."""
-    return [0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2))]
-
-
 def require_pose(T: ArrayLike, field: str) -> Matrix:
     """Check that `T` is a finite rigid transform.
 

@@ -6,13 +6,13 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.trial import Attempt, Round, RoundEnd
@@ -25,6 +25,7 @@ CSV_COLUMNS = (
     "T_world_hand",
 )
 PAIRED = ("scene", "protocol", "objects", "constants")  # of the manifest, equal in paired runs
+COUNTS = ("successes", "attempts", "objects")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
 GATED = ("scene", "protocol", "protocol_version")
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
@@ -118,57 +119,17 @@ class ResultFolder:
         return self.path / "rounds" / f"{seed}-{index}.json"
 
 
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """The counts that GSR and DR are ratios of."""
-
-    successes: int
-    attempts: int
-    objects: int
-
-    @classmethod
-    def of(cls, rounds: Iterable[Round]) -> "Counts":
-        """Count over rounds."""
-        rounds = tuple(rounds)
-        return cls(
-            sum(item.successes for item in rounds),
-            sum(len(item.attempts) for item in rounds),
-            sum(len(item.objects) for item in rounds),
-        )
-
-    @property
-    def grasp_success_rate(self) -> float | None:
-        """GSR: successes / attempts; None without attempts."""
-        return self.successes / self.attempts if self.attempts else None
-
-    @property
-    def declutter_rate(self) -> float | None:
-        """DR: successes / objects present after the resets; None without objects."""
-        return self.successes / self.objects if self.objects else None
-
-
 def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
     """The figures of a benchmark, ready for JSON; shares are 0 to 1."""
-    counts = Counts.of(rounds)
-    seeds = sorted({item.seed for item in rounds})
-    by_seed = {seed: Counts.of(r for r in rounds if r.seed == seed) for seed in seeds}
     attempts = [attempt for item in rounds for attempt in item.attempts]
     planning = sorted(attempt.planning_seconds for attempt in attempts)
+    seeds = np.array([item.seed for item in rounds])
+    counts = dict(zip(COUNTS, count(rounds), strict=True))
     return {
         "rounds": len(rounds),
-        "successes": counts.successes,
-        "attempts": counts.attempts,
-        "objects": counts.objects,
-        "grasp_success_rate": _rate(
-            counts.successes,
-            counts.attempts,
-            {seed: c.grasp_success_rate for seed, c in by_seed.items()},
-        ),
-        "declutter_rate": _rate(
-            counts.successes,
-            counts.objects,
-            {seed: c.declutter_rate for seed, c in by_seed.items()},
-        ),
+        **{name: int(numbers.sum()) for name, numbers in counts.items()},
+        "grasp_success_rate": _rate(counts["successes"], counts["attempts"], seeds),
+        "declutter_rate": _rate(counts["successes"], counts["objects"], seeds),
         "failures": {
             **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
             "no candidate": sum(item.no_grasp for item in rounds),
@@ -188,6 +149,12 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         "objects_by_name": by_object(rounds),
         "attempts_digest": attempts_digest(rounds),
     }
+
+
+def count(rounds: Iterable[Round]) -> NDArray[np.int64]:
+    """Successes, attempts and objects of each round (`COUNTS`), of which rates are made: (3, R)."""
+    rows = [(item.successes, len(item.attempts), len(item.objects)) for item in rounds]
+    return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
 
 
 def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
@@ -210,36 +177,32 @@ def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
 
 def attempts_digest(rounds: Sequence[Round]) -> str:
     """SHA-256 of everything but wall-clock times; equal for equal attempts."""
-    plain = [_without_times(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+    tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
+    for table in tables:
+        del table["retries"], table["waited_seconds"]
+        for attempt in table["attempts"]:
+            del attempt["planning_seconds"]
+    return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
 
 
 def round_from_json(table: dict[str, Any]) -> Round:
     """Rebuild a round from the JSON of its dataclass."""
-    attempts = tuple(
-        Attempt(
-            **item
-            | {
-                "outcome": GraspOutcome(item["outcome"]),
-                "cause": FailureCause(item["cause"]) if item["cause"] is not None else None,
-            }
+    attempts = []
+    for item in table["attempts"]:
+        cause = None if item["cause"] is None else FailureCause(item["cause"])
+        attempts.append(
+            Attempt(**item | {"outcome": GraspOutcome(item["outcome"]), "cause": cause})
         )
-        for item in table["attempts"]
-    )
-    changed = {
-        "objects": tuple(table["objects"]),
-        "attempts": attempts,
-        "end": RoundEnd(table["end"]),
-    }
-    return Round(**table | changed)
+    end, objects = RoundEnd(table["end"]), tuple(table["objects"])
+    return Round(**table | {"objects": objects, "attempts": tuple(attempts), "end": end})
 
 
 def record_of(folder: ResultFolder) -> dict[str, Any]:
     """Conditions and figures of a finished benchmark, small enough to commit; ready for JSON."""
     manifest = folder.manifest()
     summary = json.loads((folder.path / "summary.json").read_text())
-    run = manifest["run"]
-    times = summary["planning_seconds"]
+    run, times = manifest["run"], summary["planning_seconds"]
+    names = ("attempts", "successes", *RATE_LABELS, "failures", "attempts_digest")
     return {
         "scene": run["scene"],
         "protocol": {name: run["protocol"][name] for name in ("name", "version")},
@@ -247,14 +210,9 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
         "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
         "rounds": manifest["rounds"],
         "seeds": manifest["seeds"],
-        "attempts": summary["attempts"],
-        "successes": summary["successes"],
         "objects_present": summary["objects"],
-        "grasp_success_rate": summary["grasp_success_rate"],
-        "declutter_rate": summary["declutter_rate"],
-        "failures": summary["failures"],
         "planning_seconds_median": times["median"] if times else None,
-        "attempts_digest": summary["attempts_digest"],
+        **{name: summary[name] for name in names},
     }
 
 
@@ -263,13 +221,12 @@ def planner_title(planner: dict[str, Any]) -> str:
     return str(planner.get("model") or planner["name"])
 
 
-def compare(first: ResultFolder, second: ResultFolder, seed: int = 0) -> dict[str, Any]:
+def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     """Differences of GSR and DR over the scenes that two benchmarks share.
 
     Args:
         first: the reference.
         second: compared with it.
-        seed: of the bootstrap.
 
     Returns:
         Figures ready for JSON: for `grasp_success_rate` and `declutter_rate` the value and
@@ -289,8 +246,9 @@ def compare(first: ResultFolder, second: ResultFolder, seed: int = 0) -> dict[st
     shared = sorted(rounds[0].keys() & rounds[1].keys())
     if not shared:
         raise ValueError(f"{first.path} and {second.path} share no round; use the same seeds")
-    counts = [[Counts.of([run[key]]) for key in shared] for run in rounds]
-    successes = np.array([[c.successes for c in run] for run in counts])
+    successes, attempts, objects = np.stack(
+        [count([run[key] for key in shared]) for run in rounds], axis=1
+    )  # (2, S) each
     figures: dict[str, Any] = {
         "first": runs[0]["planner"],
         "second": runs[1]["planner"],
@@ -298,9 +256,8 @@ def compare(first: ResultFolder, second: ResultFolder, seed: int = 0) -> dict[st
         "second_better": int((successes[1] > successes[0]).sum()),
         "second_worse": int((successes[1] < successes[0]).sum()),
     }
-    for name, below in (("grasp_success_rate", "attempts"), ("declutter_rate", "objects")):
-        trials = np.array([[getattr(c, below) for c in run] for run in counts])
-        found = paired_difference(successes, trials, np.random.default_rng(seed))
+    for name, trials in (("grasp_success_rate", attempts), ("declutter_rate", objects)):
+        found = paired_difference(successes, trials, np.random.default_rng(0))
         figures[name] = {
             "first": _share(successes[0], trials[0]),
             "second": _share(successes[1], trials[1]),
@@ -382,24 +339,34 @@ def paired_difference(
     return second - first, (low, high)
 
 
-def _rate(successes: int, trials: int, by_seed: dict[int, float | None]) -> dict[str, Any]:
+def percent(rate: dict[str, Any]) -> str:
+    """A rate with its 95 % interval, in per cent."""
+    if rate["value"] is None:
+        return "none"
+    low, high = rate["wilson_95"]
+    return f"{100 * rate['value']:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def over_seeds(rate: dict[str, Any]) -> str:
+    """Mean of the seeds' rates, and standard deviation where there are several, in per cent."""
+    numbers = (rate["mean_over_seeds"], rate["std_over_seeds"])
+    return " ± ".join(f"{100 * number:.1f}" for number in numbers if number is not None)
+
+
+def _rate(
+    successes: NDArray[np.int64], trials: NDArray[np.int64], seeds: NDArray[np.int64]
+) -> dict[str, Any]:
+    """A rate over all rounds, and of the rounds of each seed."""
+    by_seed = {
+        str(seed): _share(successes[seeds == seed], trials[seeds == seed])["value"]
+        for seed in np.unique(seeds)
+    }
     values = [value for value in by_seed.values() if value is not None]
-    return {
-        "value": successes / trials if trials else None,
-        "wilson_95": wilson(successes, trials),
+    return _share(successes, trials) | {
         "mean_over_seeds": fmean(values) if values else None,
         "std_over_seeds": stdev(values) if len(values) > 1 else None,
-        "by_seed": {str(seed): value for seed, value in by_seed.items()},
+        "by_seed": by_seed,
     }
-
-
-def _without_times(item: Round) -> dict[str, Any]:
-    plain = asdict(item)
-    for name in ("retries", "waited_seconds"):
-        del plain[name]
-    for attempt in plain["attempts"]:
-        del attempt["planning_seconds"]
-    return plain
 
 
 def _share(successes: Any, trials: Any) -> dict[str, Any]:

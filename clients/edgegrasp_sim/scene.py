@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
-from edgegrasp_sim.poses import yaw_quaternion_xyzw
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
@@ -83,7 +82,8 @@ def make_packed(
         state = world.save_state()
         model = objects.sample(rng)
         x, y = rng.uniform(*PACKED_RANGE, size=2)
-        quaternion = yaw_quaternion_xyzw(rng.uniform(0.0, 2.0 * np.pi))
+        half_turn = rng.uniform(0.0, 2.0 * np.pi) / 2
+        quaternion = [0.0, 0.0, float(np.sin(half_turn)), float(np.cos(half_turn))]
         scale = float(rng.uniform(*scales))
         new = load_object(world, model, (x, y, 1.0), quaternion, scale)
         x, y, z = new.body.position

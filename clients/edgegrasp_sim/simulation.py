@@ -1,10 +1,9 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Self, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,6 +58,24 @@ class ObjectPlacement:
     quaternion_xyzw: tuple[float, float, float, float]
 
 
+class Seeing(TypedDict, total=False):
+    """How the camera sees.
+
+    Attributes:
+        noise_std: standard deviation of the noise in each coordinate of each point, metres; by
+            default `NOISE_STD`.
+        depth_noise: noise of the images.
+        table: what the cloud holds of the table, see `Observation`; by default `known`.
+        surface_voxel: metres between the points of a surface, at whatever slant it is seen; 0, the
+            default: one point for each pixel.
+    """
+
+    noise_std: float
+    depth_noise: DepthNoise
+    table: TableView
+    surface_voxel: float
+
+
 class ClutterSimulation:
     """A table with objects, a depth camera and a floating hand.
 
@@ -111,11 +128,6 @@ class ClutterSimulation:
         return len(self._objects)
 
     @property
-    def object_names(self) -> list[str]:
-        """Names of the objects that are left."""
-        return [item.model.name for item in self._objects]
-
-    @property
     def object_models(self) -> list[ObjectModel]:
         """Models of the objects that are left."""
         return [item.model for item in self._objects]
@@ -155,7 +167,7 @@ class ClutterSimulation:
         Raises:
             ValueError: unknown scene, no object set for it, or `num_objects` below 1.
         """
-        kind = _scene_kind(scene)
+        kind = SceneKind(scene)
         if num_objects < 1:
             raise ValueError(f"num_objects is {num_objects}; ask for at least 1")
         objects = self.object_sets.get(kind)
@@ -166,7 +178,7 @@ class ClutterSimulation:
             (make_packed, PACKED_SCALE) if kind is SceneKind.PACKED else (make_pile, PILE_SCALE)
         )
         self._objects = make(self.world, objects, rng, num_objects, scales or own_scales)
-        self._add_gripper()
+        self._gripper = Gripper(self.world)
         return self.num_objects
 
     def reset_from_poses(self, placements: Sequence[ObjectPlacement]) -> None:
@@ -184,7 +196,7 @@ class ClutterSimulation:
             )
             item.body.set_pose(placement.position, placement.quaternion_xyzw)
             self._objects.append(item)
-        self._add_gripper()
+        self._gripper = Gripper(self.world)
 
     def observe(
         self,
@@ -193,10 +205,7 @@ class ClutterSimulation:
         *,
         views: ViewRange = EVALUATION_VIEWS,
         num_views: int = 1,
-        noise_std: float = NOISE_STD,
-        depth_noise: DepthNoise | None = None,
-        table: TableView = "known",
-        surface_voxel: float = 0.0,
+        **seen: Unpack[Seeing],
     ) -> Observation:
         """Look at the scene from a random viewpoint, or several around it.
 
@@ -205,41 +214,25 @@ class ClutterSimulation:
             rng_noise: stream of the noise.
             views: where the camera may stand.
             num_views: images, spread evenly over a full turn from the random one.
-            noise_std: standard deviation of the noise in each coordinate of each point, metres.
-            depth_noise: noise of the images.
-            table: what the cloud holds of the table; see `Observation`.
-            surface_voxel: see `observe_from`.
+            **seen: see `Seeing`.
         """
-        return self.observe_from(
-            views.sample(rng_camera, num_views),
-            rng_noise,
-            noise_std=noise_std,
-            depth_noise=depth_noise,
-            table=table,
-            surface_voxel=surface_voxel,
-        )
+        return self.observe_from(views.sample(rng_camera, num_views), rng_noise, **seen)
 
     def observe_from(
         self,
         T_world_cameras: Sequence[Matrix],
         rng_noise: np.random.Generator,
-        *,
-        noise_std: float = NOISE_STD,
-        depth_noise: DepthNoise | None = None,
-        table: TableView = "known",
-        surface_voxel: float = 0.0,
+        **seen: Unpack[Seeing],
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each.
 
         Args:
             T_world_cameras: one for each image.
             rng_noise: stream of the noise.
-            noise_std: see `observe`, as for what follows.
-            depth_noise: of the images.
-            table: see `observe`.
-            surface_voxel: metres between the points of a surface, at whatever slant it is seen;
-                0: one point for each pixel.
+            **seen: see `Seeing`.
         """
+        table, voxel = seen.get("table", "known"), seen.get("surface_voxel", 0.0)
+        depth_noise = seen.get("depth_noise")
         box = CLOUD_BOX[table]
         clouds = []
         for T_world_camera in T_world_cameras:
@@ -247,16 +240,15 @@ class ClutterSimulation:
             if depth_noise is not None:
                 depth = depth_noise.apply(depth, rng_noise)
             points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
-            if surface_voxel > 0 and len(points) > 0:
+            if voxel > 0 and len(points) > 0:
                 around = np.stack((points.min(axis=0), points.max(axis=0)))
-                points = resample_surfaces(depth, T_world_camera, CAMERA, around, surface_voxel)
-            points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
+                points = resample_surfaces(depth, T_world_camera, CAMERA, around, voxel)
+            std = seen.get("noise_std", NOISE_STD)
+            points = points + rng_noise.normal(0.0, std, size=points.shape)
             clouds.append(crop(points, box, 0.0).astype(np.float32))
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
-            T_world_camera=T_world_cameras[0],
-            camera_position=positions[0],
             workspace=WORKSPACE_BOX[table].astype(np.float32),
             table_height=TABLE_HEIGHT,
             camera_positions=positions,
@@ -373,16 +365,7 @@ class ClutterSimulation:
         self._rest_state = None
         add_table(self.world)
 
-    def _add_gripper(self) -> None:
-        self._gripper = Gripper(self.world)
-
     def _forget_rest_state(self) -> None:
         if self._rest_state is not None:
             self.world.remove_state(self._rest_state)
             self._rest_state = None
-
-
-def _scene_kind(scene: SceneKind | str) -> SceneKind:
-    with suppress(ValueError):
-        return SceneKind(scene)
-    raise ValueError(f"scene is {scene!r}; choose one of {', '.join(SceneKind)}")

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum, StrEnum
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
+from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
@@ -39,28 +39,13 @@ class PlannedGrasp:
 
 
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if
-# there is none.
+# there is none. A planner may have a method `use_trial`, which gets a function that tries
+# `T_world_hand` (4, 4) in a copy of the present scene, and `close`, called after the last round.
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
 class PlannerUnavailableError(Exception):
     """Raised by planners when asking again may help, as when a server restarts."""
-
-
-@runtime_checkable
-class TriesGrasps(Protocol):
-    """A planner that tries grasps in a copy of the scene before it decides."""
-
-    def use_trial(self, try_grasp: Callable[[ArrayLike], GraspResult]) -> None:
-        """Take a function that tries `T_world_hand`, (4, 4), in a copy of the present scene."""
-
-
-@runtime_checkable
-class Closes(Protocol):
-    """A planner that holds resources."""
-
-    def close(self) -> None:
-        """Release them; called once, after the last round."""
 
 
 class RoundEnd(StrEnum):
@@ -111,6 +96,11 @@ class Attempt:
         """Whether an object was removed."""
         return self.outcome is GraspOutcome.SUCCESS
 
+    @property
+    def T_cloud_hand(self) -> NDArray[np.float32]:  # noqa: N802
+        """The pose as `draw_grasps` takes it: clouds are in the world's frame.  # (4, 4)."""
+        return np.asarray(self.T_world_hand, np.float32)
+
 
 @dataclass(frozen=True, slots=True)
 class Round:
@@ -158,8 +148,8 @@ def run_round(
 
     See `RoundDriver` for the other arguments, and errors.
     """
-    if isinstance(planner, TriesGrasps):
-        planner.use_trial(simulation.try_in_copy)
+    if use_trial := getattr(planner, "use_trial", None):
+        use_trial(simulation.try_in_copy)
     driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
     while driver.end is None:
         observation = driver.look()
@@ -218,7 +208,7 @@ class RoundDriver:
         self._seen: Observation | None = None
         self._failures = 0
         self._planning_seconds = 0.0
-        names = tuple(simulation.object_names)
+        names = tuple(model.name for model in simulation.object_models)
         self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED)
         self._update_end()
 

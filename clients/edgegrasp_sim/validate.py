@@ -7,7 +7,6 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,52 +16,27 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 
 
-@dataclass(frozen=True, slots=True)
-class Agreement:
-    """How many grasps came out as in the reference.
-
-    Attributes:
-        kind: of the scenes.
-        agreed: for each scene, how many grasps had the reference's success or failure.
-        tried: for each scene, how many grasps there were.
-        seconds: processor time of the grasps.
-    """
-
-    kind: SceneKind
-    agreed: tuple[int, ...]
-    tried: tuple[int, ...]
-    seconds: float
-
-    @property
-    def share(self) -> float:
-        """Agreement over all scenes, 0 to 1."""
-        return sum(self.agreed) / sum(self.tried)
-
-
 def measure_agreement(
-    shared: Path,
-    kind: SceneKind,
-    *,
-    grasps_per_scene: int | None = None,
-    to_the_end: bool = False,
-) -> Agreement:
+    shared: Path, kind: SceneKind, *, most: int | None = None, to_the_end: bool = False
+) -> list[tuple[int, int]]:
     """Repeat the grasps of `<shared>/reference/grasp_outcomes/<kind>.json`.
 
     Args:
         shared: folder with `objects` and `reference`.
         kind: of the scenes.
-        grasps_per_scene: only the first so many; all by default.
+        most: only the first so many grasps of each scene.
         to_the_end: see `ClutterSimulation.try_grasp`.
+
+    Returns:
+        For each scene how many grasps succeeded or failed as in the reference, and were tried.
 
     Raises:
         FileNotFoundError: the outcomes or an object are missing.
     """
     path = shared / "reference" / "grasp_outcomes" / f"{kind}.json"
-    scenes = json.loads(path.read_text())["scenes"]
-    agreed, tried = [], []
-    started = time.process_time()
+    counts = []
     with ClutterSimulation() as simulation:
-        for scene in scenes:
+        for scene in json.loads(path.read_text())["scenes"]:
             simulation.reset_from_poses(
                 [
                     ObjectPlacement(
@@ -74,19 +48,11 @@ def measure_agreement(
                     for item in scene["objects"]
                 ]
             )
-            poses = np.asarray(scene["T_world_handcom"])[:grasps_per_scene]
-            results = [
-                simulation.try_grasp(pose @ T_HANDCOM_HAND, to_the_end=to_the_end) for pose in poses
-            ]
-            agreed.append(
-                sum(
-                    result.success == bool(success)
-                    for result, success in zip(results, scene["success"], strict=False)
-                )
-            )
-            tried.append(len(results))
-    seconds = time.process_time() - started
-    return Agreement(kind, tuple(agreed), tuple(tried), seconds)
+            poses = np.asarray(scene["T_world_handcom"])[:most] @ T_HANDCOM_HAND
+            held = [simulation.try_grasp(pose, to_the_end=to_the_end).success for pose in poses]
+            agreed = np.array(held) == np.array(scene["success"][:most], bool)
+            counts.append((int(agreed.sum()), len(agreed)))
+    return counts
 
 
 def main() -> None:
@@ -98,21 +64,16 @@ def main() -> None:
         action="store_true",
         help="simulate every step of every grasp, even once its outcome is clear",
     )
-    arguments = parser.parse_args()
+    given = parser.parse_args()
     for kind in SceneKind:
-        agreement = measure_agreement(
-            arguments.shared,
-            kind,
-            to_the_end=arguments.to_the_end,
-        )
-        scenes = ", ".join(
-            f"{agreed}/{tried}"
-            for agreed, tried in zip(agreement.agreed, agreement.tried, strict=True)
-        )
-        grasps = sum(agreement.tried)
+        started = time.process_time()
+        counts = measure_agreement(given.shared, kind, to_the_end=given.to_the_end)
+        seconds = time.process_time() - started
+        agreed, tried = np.sum(counts, axis=0)
+        scenes = ", ".join(f"{same}/{all_}" for same, all_ in counts)
         sys.stdout.write(
-            f"{kind}: {agreement.share:.1%} of {grasps} grasps agree ({scenes}); "
-            f"{grasps / agreement.seconds:.0f} grasps per processor second\n"
+            f"{kind}: {agreed / tried:.1%} of {tried} grasps agree ({scenes}); "
+            f"{tried / seconds:.0f} grasps per processor second\n"
         )
 
 

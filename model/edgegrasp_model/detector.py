@@ -18,8 +18,6 @@ from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
     Scorer,
-    check_edges,
-    check_hand_poses,
     evaluate,
     from_edges,
     from_hand_poses,
@@ -32,7 +30,12 @@ from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
-from edgegrasp_model.scene.cloud import CheckedCloud, check_cloud
+from edgegrasp_model.scene.cloud import (
+    CheckedCloud,
+    check_cloud,
+    check_edges,
+    check_hand_poses,
+)
 from edgegrasp_model.scene.scene import MAX_VOXELS, Scene, build_scene
 
 Float32 = NDArray[np.float32]

@@ -25,19 +25,33 @@ from pydantic import (
 
 from edgegrasp_model.errors import InvalidRequest, brief
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
+
+
+def _no_text_or_truth(value: object) -> object:
+    """Refuse what Python would convert to a number, such as true and "3"."""
+    if isinstance(value, bool | str | bytes):
+        raise ValueError("must be a number")
+    return value
+
+
+# Stands last in an annotation: pydantic writes wrong schemas for bounds that come after it.
+numeric = BeforeValidator(_no_text_or_truth)
+Integer = Annotated[int, numeric]
+Number = Annotated[float, numeric]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST, le=FARTHEST), numeric]
 Vector = Annotated[tuple[Finite, Finite, Finite], Field(description="x, y, z in the cloud's frame")]
 Row = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 MAX_SHAPES = 64
 MAX_ROWS = 5_000_000
-Length = Annotated[float, Field(gt=0.0, le=1000.0)]
-HandLength = Annotated[float, Field(gt=0.0, le=1.0)]  # metres
+Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
+HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
 SAME = 1e-6  # metres below which two lengths of a gripper are the same
 Corner = Annotated[
     tuple[
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
-        Annotated[float, Field(ge=-1.0, le=1.0)],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
+        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
     ],
     Field(description="x, y, z in the hand frame, metres"),
 ]
@@ -182,7 +196,7 @@ class Cone(Strict):
     direction: Direction = Field(
         description="the way the hand moves toward the object, +z of the hand; any length but zero"
     )
-    max_angle: Annotated[float, Field(ge=0.0, le=math.pi)] = Field(
+    max_angle: Annotated[float, Field(ge=0.0, le=math.pi), numeric] = Field(
         description="radians between it and the hand's way"
     )
 
@@ -213,7 +227,7 @@ class SupportPlane(Strict):
     kind: Literal["plane"] = "plane"
     normal: UnitVector = Field(description="unit normal, away from the table")
     offset: Finite = Field(description="normal . x of its points, metres")
-    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3)] = Field(
+    max_depth_error: Annotated[float, Field(ge=0.0, le=0.3), numeric] = Field(
         default=0.0,
         description="share by which a camera's depths may be wrong: each view is scaled about its "
         "viewpoint by up to this until the plane that it sees lies in place; 0: not at all",
@@ -233,13 +247,13 @@ class RansacPlane(Strict):
     """
 
     kind: Literal["ransac"] = "ransac"
-    distance: Annotated[float, Field(gt=0.0, le=0.1)] = Field(
+    distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
         default=0.005, description="metres from the plane within which points belong to it"
     )
-    max_tilt: Annotated[float, Field(ge=0.0, le=1.6)] = Field(
+    max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
         default=0.35, description="radians between its normal and up; a quarter turn: any plane"
     )
-    min_share: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+    min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
         default=0.1, description="share of the seen surface it must hold"
     )
 
@@ -260,7 +274,7 @@ class Linkage(Strict):
     """A linkage that carries each finger along an arc: its tips come forward as it closes."""
 
     radius: HandLength = Field(description="length of the link that carries a finger, metres")
-    reach: float = Field(
+    reach: Number = Field(
         ge=-1.0, le=1.0, description="outward part (y) of that link in the open gripper, metres"
     )
 
@@ -274,7 +288,7 @@ class GripperGeometry(Strict):
     contact_z: HandLength = Field(
         description="where contacts are put, metres along z; between palm and fingertips"
     )
-    tcp_z: float = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
+    tcp_z: Number = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
     finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
     swing: Linkage | None = Field(
@@ -341,8 +355,8 @@ class Workspace(Strict):
 class Suppression(Strict):
     """Drop a grasp near a better one: nearer than both distances."""
 
-    translation: float = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
-    rotation: float = Field(
+    translation: Number = Field(default=0.01, ge=0.0, le=1.0, description="metres between TCPs")
+    rotation: Number = Field(
         default=0.5,
         ge=0.0,
         le=3.2,
@@ -358,20 +372,20 @@ class Collision(Strict):
         description="grasps whose hand collides: left out, their scores worth half in the "
         "ranking, or not looked for",
     )
-    margin: float = Field(
+    margin: Number = Field(
         default=0.0,
         ge=0.0,
         le=0.1,
         description="metres kept free around the hand: its boxes are grown by this on every side",
     )
-    opening: Annotated[float, Field(gt=0.0, le=1.0)] | None = Field(
+    opening: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
         default=None,
         description="metres between the fingers on the way in; null: the gripper's maximum",
     )
-    approach_length: float = Field(
+    approach_length: Number = Field(
         default=0.05, ge=0.0, le=1.0, description="metres of straight way in along the approach"
     )
-    retreat_length: float = Field(
+    retreat_length: Number = Field(
         default=0.0, ge=0.0, le=1.0, description="metres of straight way out"
     )
     retreat_direction: Literal["back", "up"] = Field(
@@ -424,16 +438,16 @@ class DetectOptions(Strict):
         default=None,
         description="name of a gripper, or a gripper; null: the one the weights were trained for",
     )
-    num_approach_points: int = Field(
+    num_approach_points: Integer = Field(
         default=32, ge=1, le=MAX_APPROACH_POINTS, description="approach points sampled"
     )
-    num_candidates: int = Field(
+    num_candidates: Integer = Field(
         default=2000, ge=1, le=MAX_CANDIDATES, description="candidates scored at most"
     )
     sampling: Literal["farthest", "uniform"] = Field(
         default="farthest", description="how approach points are sampled"
     )
-    seed: int = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
+    seed: Integer = Field(default=0, ge=0, lt=2**63, description="seed of every random choice")
     viewpoint: (
         Annotated[
             Annotated[Vector, Tag("one")]
@@ -475,8 +489,10 @@ class DetectOptions(Strict):
         Collision,
         BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
     ] = Field(default=Collision(), description="what the hand must not meet; a bare mode will do")
-    min_score: float = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
-    top_k: int = Field(default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most")
+    min_score: Number = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
+    top_k: Integer = Field(
+        default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
+    )
     suppression: Suppression | None = Field(
         default=Suppression(), description="non-maximum suppression; null: none"
     )
@@ -485,7 +501,7 @@ class DetectOptions(Strict):
         description="what comes first: the score; the highest TCP along up among scores of 0.9 "
         "and more, then the others by score; or the clearance",
     )
-    debug: bool = Field(
+    debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"
     )
 

@@ -14,6 +14,7 @@ from scipy.stats import rankdata
 
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_training.views import table
 
 FloatArray = NDArray[np.floating]
 CURVE_ROWS = 20  # of the learning curve in the card, about
@@ -93,15 +94,8 @@ def reliability(
     """Mean predicted probability, observed success rate and count of each occupied bin."""
     probability = expit(logit)
     which = np.minimum((probability * bins).astype(int), bins - 1)
-    return [
-        (
-            float(probability[which == b].mean()),
-            float(label[which == b].mean()),
-            int((which == b).sum()),
-        )
-        for b in range(bins)
-        if (which == b).any()
-    ]
+    inside = [which == number for number in range(bins) if (which == number).any()]
+    return [(float(probability[b].mean()), float(label[b].mean()), int(b.sum())) for b in inside]
 
 
 def write_model_card(
@@ -137,17 +131,16 @@ def write_model_card(
         ("validation average precision", f"{evaluation.average_precision:.4f}"),
         ("temperature", f"{metadata.temperature:.3f}"),
     ]
-    lines = [f"# {metadata.name}", "", "| | |", "| --- | --- |"]
-    lines += [f"| {name} | {_cell(value)} |" for name, value in rows]
-    lines += ["", "Trained by:", "", "```", command, "```", ""]
-    lines += ["Reliability of the score on the validation views:", ""]
-    lines += ["| score | held | grasps |", "| --- | --- | --- |"]
     calibrated = evaluation.logit / metadata.temperature
-    lines += [
-        f"| {predicted:.3f} | {observed:.3f} | {count} |"
+    bins = [
+        (f"{predicted:.3f}", f"{observed:.3f}", count)
         for predicted, observed, count in reliability(calibrated, evaluation.label)
     ]
-    lines += ["", "During training:", "", *_curve(log)]
+    plain = [(n, ", ".join(map(str, v)) if isinstance(v, tuple | list) else v) for n, v in rows]
+    lines = [f"# {metadata.name}", "", *table(("", ""), plain)]
+    lines += ["", "Trained by:", "", "```", command, "```", ""]
+    lines += ["Reliability of the score on the validation views:", ""]
+    lines += [*table(("score", "held", "grasps"), bins), "", "During training:", "", *_curve(log)]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -172,8 +165,4 @@ def _curve(log: Path) -> list[str]:
     head, body = [name.replace("_", " ") for name in rows[0]], rows[1:]
     every = max(1, len(body) // CURVE_ROWS)
     some = body[(len(body) - 1) % every :: every]
-    return [f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *some]]
-
-
-def _cell(value: object) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+    return table(head, some)

@@ -74,12 +74,6 @@ class SoftLabels:
     depth: NDArray[np.float16]  # (E,) metres
     chance: NDArray[np.float16]  # (E,) probability that it holds, by the teacher
 
-    @staticmethod
-    def none() -> "SoftLabels":
-        """No candidate."""
-        rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
-        return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
-
     def save(self, path: Path) -> None:
         """Write them; readers and concurrent writers only ever see a whole file."""
         partial = path.with_suffix(f".{os.getpid()}.partial")
@@ -215,10 +209,7 @@ def pack_hands(
         rng: Picks each hand's points at random; without it, they are spread evenly.
     """
     seen = grasps.seen
-    if seen is None:
-        raise ValueError(
-            "grasps: got none with inputs of the hand network. Build them for this one."
-        )
+    assert seen is not None
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
     points, count = seen.points[rows], seen.point_count[rows]
     limit, slot = config.hand_points, np.arange(seen.points.shape[1])

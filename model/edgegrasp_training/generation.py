@@ -18,7 +18,7 @@ from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.scene import Scene, build_scene
+from edgegrasp_model.scene.scene import build_scene
 from edgegrasp_sim.camera import TRAINING_VIEWS, Observation
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
@@ -123,55 +123,47 @@ def generate_scene(
     """Generate all views of one scene; returns how many grasps were tried and how many held."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
     kind = options.kind_of(index)
-    source, scales = _variety(kind, streams[SCENE_STREAM])
+    # Some scenes are made of the other kind's objects.
+    other = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
+    source = other if streams[SCENE_STREAM].random() < OTHER_OBJECTS else kind
     tried = held = 0
     with TemporaryDirectory() as shapes:
         drawn = None
         if objects is not None:
-            drawn = _drawn_objects(objects, source, Path(shapes), streams[SHAPE_STREAM])
+            drawn = ObjectSet.from_folder(objects, source, "train")
+            if streams[SHAPE_STREAM].random() < VARIED_SHARE:
+                drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
         with ClutterSimulation(None if drawn is None else {kind: drawn}) as simulation:
-            hard = _make_scene(simulation, kind, scales, options, streams)
-            for number, view in enumerate(_views(simulation, hard, options, streams)):
+            hard = _make_scene(simulation, kind, options, streams)
+            models = [model.origin or model for model in simulation.object_models]
+            names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
+            for number in range(options.views_per_scene):
+                query = hard if hard and number == 0 else _ask(simulation, streams)
+                choice = streams[CHOICE_STREAM]
+                view = label(simulation, query, options, choice, hard=hard is not None)
+                view = replace(view, objects=names, object_digests=digests)
                 view.save(view_path(folder, index, number, options))
                 tried += len(view.tried())
                 held += int((view.success == 1).sum())
     return tried, held
 
 
-def _variety(kind: SceneKind, rng: np.random.Generator) -> tuple[SceneKind, tuple[float, float]]:
-    """Which kind's objects a scene is made of, and the range of their scales."""
-    source = kind
-    if rng.random() < OTHER_OBJECTS:
-        source = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
-    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
-    return source, (low * WIDER_SCALES[0], high * WIDER_SCALES[1])
-
-
-def _drawn_objects(
-    objects: Path, source: SceneKind, folder: Path, rng: np.random.Generator
-) -> ObjectSet:
-    """The objects of a scene: plain ones, or varied ones whose files go into `folder`."""
-    plain = ObjectSet.from_folder(objects, source, "train")
-    if rng.random() >= VARIED_SHARE:
-        return plain
-    return varied_objects(plain, folder, rng)
-
-
 def _make_scene(
     simulation: ClutterSimulation,
     kind: SceneKind,
-    scales: tuple[float, float],
     options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Query | None:
     """Make a scene; with weights mostly one that they find hard, and return the hard view."""
     rng = streams[SCENE_STREAM]
+    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
+    scales = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
     for _ in range(1 if guide is None else HARD_TRIES):
         simulation.reset(kind, rng, 1 + int(rng.poisson(MEAN_FURTHER_OBJECTS)), scales)
-        hard = None if guide is None else _hard_view(simulation, guide, options, streams)
+        hard = None if guide is None else _hard_view(simulation, guide, streams)
         if hard is not None:
             return hard
     return None
@@ -180,7 +172,6 @@ def _make_scene(
 def _hard_view(
     simulation: ClutterSimulation,
     guide: GraspDetector,
-    options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Query | None:
     """The first view in which the network is unsure of its best grasp, or sure and wrong.
@@ -188,7 +179,7 @@ def _hard_view(
     Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
     for _ in range(simulation.num_objects):
-        query = _ask(simulation, options, streams)
+        query = _ask(simulation, streams)
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
@@ -202,15 +193,12 @@ def _hard_view(
     return None
 
 
-def _ask(
-    simulation: ClutterSimulation, options: GenerationOptions, streams: list[np.random.Generator]
-) -> Query:
+def _ask(simulation: ClutterSimulation, streams: list[np.random.Generator]) -> Query:
     """Look at the scene, and request grasps as a benchmark does, around fewer points."""
+    noise = streams[NOISE_STREAM]
+    std = noise.uniform(0.0, MAX_NOISE) if noise.random() < OTHER_NOISE else NOISE_STD
     observation = simulation.observe(
-        streams[CAMERA_STREAM],
-        streams[NOISE_STREAM],
-        views=TRAINING_VIEWS,
-        noise_std=_noise_std(streams[NOISE_STREAM]),
+        streams[CAMERA_STREAM], noise, views=TRAINING_VIEWS, noise_std=std
     )
     low, high = observation.workspace.tolist()
     request = DetectOptions(
@@ -222,29 +210,6 @@ def _ask(
         collision=Collision(mode="penalise"),
     )
     return Query(observation, request)
-
-
-def _noise_std(rng: np.random.Generator) -> float:
-    """Noise of a view in metres, mostly the benchmark's."""
-    return rng.uniform(0.0, MAX_NOISE) if rng.random() < OTHER_NOISE else NOISE_STD
-
-
-def _views(
-    simulation: ClutterSimulation,
-    hard: Query | None,
-    options: GenerationOptions,
-    streams: list[np.random.Generator],
-) -> Iterator[LabelledView]:
-    """Labelled views of the scene that stands in the simulation, the hard one first."""
-    models = [model.origin or model for model in simulation.object_models]
-    names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
-    for number in range(options.views_per_scene):
-        query = hard if hard and number == 0 else _ask(simulation, options, streams)
-        yield replace(
-            label(simulation, query, options, streams[CHOICE_STREAM], hard=hard is not None),
-            objects=names,
-            object_digests=digests,
-        )
 
 
 def label(
@@ -268,8 +233,11 @@ def label(
     if len(observation.cloud) == 0:
         return _empty(observation)
     guide = None if options.weights is None else detector(options.weights)
+    sample = score = None
     if guide is None:
-        scene, sample, score = *_sampled(observation, request), None
+        scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
+        if scene is not None:
+            sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
     else:
         prepared = guide.prepare(observation.cloud, request)
         scene, sample = prepared.scene, prepared.sample
@@ -295,16 +263,6 @@ def label(
 def detector(weights: Path) -> GraspDetector:
     """The detector with these weights, loaded once in a process."""
     return GraspDetector.load(weights)
-
-
-def _sampled(
-    observation: Observation, request: DetectOptions
-) -> tuple[Scene | None, Sample | None]:
-    """The scene and its candidates, as the detector makes them, without a network."""
-    scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
-    if scene is None:
-        return None, None
-    return scene, sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
 
 
 def _chosen(
@@ -345,14 +303,6 @@ def _chosen(
 
 
 def _empty(observation: Observation) -> LabelledView:
-    nothing = np.empty((0, 3), dtype=np.float32)
-    rows = np.empty(0, dtype=np.int64)
-    return LabelledView(
-        nothing,
-        nothing,
-        observation.camera_position,
-        rows,
-        rows,
-        None,
-        rows.astype(np.int8),
-    )
+    nothing, rows = np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int64)
+    camera, success = observation.camera_position, rows.astype(np.int8)
+    return LabelledView(nothing, nothing, camera, rows, rows, None, success)

@@ -72,12 +72,11 @@ class Teacher:
         others = np.setdiff1d(np.arange(len(view.points)), own)
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
-        if len(balls) == 0:
-            return SoftLabels.none()
         cloud = Cloud(view.points, view.normals)
-        candidates = self._candidates(cloud, balls, rng)
-        if len(candidates) == 0:
-            return SoftLabels.none()
+        candidates = self._candidates(cloud, balls, rng) if len(balls) else None
+        if candidates is None or len(candidates) == 0:
+            rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
+            return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
         hands = hand_batch(cloud, candidates, self.gripper, view.camera_position, max_points)
         with torch.inference_mode():

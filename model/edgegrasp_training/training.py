@@ -14,13 +14,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch, HandNet
+from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_training.evaluation import Evaluation, evaluate_scores, write_model_card
 from edgegrasp_training.examples import (
     Packed,
@@ -100,7 +100,8 @@ class Trainer:
         self.train_paths, self.validation_paths = train_paths, validation_paths
         self.gripper = load_gripper(metadata.gripper)
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
-        self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._score)
+        if teacher is not None:
+            self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(teacher.soft_labels)
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
@@ -185,22 +186,18 @@ class Trainer:
         write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
 
-    def _training_logits(self, batch: BallBatch | HandBatch) -> Tensor:
-        logit: Tensor
-        if isinstance(self.network, HandNet):
-            draws = np.random.SeedSequence([self.options.seed, self.step, DROPOUT_STREAM])
-            left_out = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
-            logit = self.network(batch, left_out)
-        else:
-            logit = self.network(batch)
-        return logit
-
     def _train_step(self) -> float:
         self.network.train()
         packed = self._training_batch(np.random.default_rng([self.options.seed, self.step]))
         kind, mixed = torch.device(self.device).type, self.options.mixed_precision
         with torch.autocast(kind, torch.bfloat16, enabled=mixed):
-            logit = self._training_logits(packed.batch.to(self.device)).float()
+            batch = packed.batch.to(self.device)
+            if isinstance(self.network, HandNet):
+                draws = np.random.SeedSequence([self.options.seed, self.step, DROPOUT_STREAM])
+                left_out = torch.Generator().manual_seed(int(draws.generate_state(1)[0]))
+                logit = self.network(batch, left_out).float()
+            else:
+                logit = self.network(batch).float()
         label, weight = packed.label.to(self.device), packed.weight.to(self.device)
         loss = F.binary_cross_entropy_with_logits(logit, label, weight, reduction="sum")
         loss = loss / weight.sum()
@@ -237,7 +234,14 @@ class Trainer:
             chosen = rng.choice(balls, min(self.options.balls_per_view, len(balls)), replace=False)
             packed = self._pack(grasps, np.sort(chosen), rng, soft_labels)
             if self.metadata.network.architecture == "edgegrasp":
-                packed = self._turned(packed, rng, bool(camera_known))
+                # This network, unlike Vector Neurons, is not equivariant. Without a camera the
+                # detector's frame is upright, but may be turned any way about up.
+                rotations = self.options.rotations
+                if not camera_known and rotations != "any":
+                    rotations = "upright"
+                assert isinstance(packed.batch, BallBatch)
+                turn = random_turn(rotations, rng)
+                packed = packed._replace(batch=turned(packed.batch, turn))
             parts.append(packed)
         batches, labels, weights = zip(*parts, strict=True)
         join: Any = type(batches[0]).concatenate
@@ -256,22 +260,10 @@ class Trainer:
             return pack_hands(grasps, balls, network, rng)
         return pack_balls(grasps, balls, network, soft_labels)
 
-    def _turned(self, packed: Packed, rng: np.random.Generator, camera_known: bool) -> Packed:
-        """Rotate balls at random: this network, unlike Vector Neurons, is not equivariant."""
-        # Without a camera the detector's frame is upright, but may be turned any way about up.
-        known = camera_known or self.options.rotations == "any"
-        rotations = self.options.rotations if known else "upright"
-        assert isinstance(packed.batch, BallBatch)
-        return packed._replace(batch=turned(packed.batch, random_turn(rotations, rng)))
-
     def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
         view = load_view(path)
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
-
-    def _score(self, path: Path) -> SoftLabels:
-        assert self.teacher is not None
-        return self.teacher.soft_labels(path)
 
     def _standardise(self) -> None:
         """Fit the mean and spread of the hand descriptions to the training views."""
@@ -301,7 +293,6 @@ class Trainer:
         save_checkpoint(path, in_metres(self.average), metadata)
 
     def _log(self, evaluation: Evaluation, train_loss: float) -> None:
-        path = self.folder / LOG_FILE
         row = {
             "step": self.step,
             "learning_rate": float(f"{self.optimizer.param_groups[0]['lr']:.4g}"),
@@ -310,10 +301,9 @@ class Trainer:
             "accuracy": round(evaluation.accuracy, 5),
             "auroc": round(evaluation.auroc, 5),
         }
-        new = not path.exists()
-        with path.open("a", newline="") as file:
+        with (self.folder / LOG_FILE).open("a", newline="") as file:
             writer = csv.DictWriter(file, row)
-            if new:
+            if file.tell() == 0:
                 writer.writeheader()
             writer.writerow(row)
 

@@ -2,6 +2,7 @@
 
 import zlib
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,8 @@ def load_view(path: Path) -> LabelledView:
             T_world_hand=arrays.get("T_world_hand"),
             success=arrays["success"].astype(np.int8),
             firm=arrays.get("firm"),
-            objects=_texts(arrays.get("objects")),
-            object_digests=_texts(arrays.get("object_digests")),
+            objects=tuple(map(str, arrays.get("objects", ()))),
+            object_digests=tuple(map(str, arrays.get("object_digests", ()))),
         )
 
 
@@ -139,15 +140,11 @@ def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
         command: The one that made them.
     """
     views = {path: load_view(path) for path in paths}
-    kinds = sorted({_kind(path) for path in paths})
-    columns = [_facts({p: v for p, v in views.items() if _kind(p) == kind}) for kind in kinds]
-    columns.append(_facts(views))
-    names = [*kinds, "all"]
-    rule = "| --- " * (len(names) + 1) + "|"
-    lines = ["# Labelled views", "", f"| | {' | '.join(names)} |", rule]
-    lines += [
-        f"| {fact} | {' | '.join(column[fact] for column in columns)} |" for fact in columns[0]
-    ]
+    columns = {}
+    for kind in (*sorted({_kind(path) for path in paths}), "all"):
+        columns[kind] = _facts({p: v for p, v in views.items() if kind in (_kind(p), "all")})
+    rows = [(fact, *(column[fact] for column in columns.values())) for fact in columns["all"]]
+    lines = ["# Labelled views", "", *table(("", *columns), rows)]
     objects = Counter(
         known
         for view in views.values()
@@ -161,8 +158,10 @@ def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
     return path
 
 
-def _texts(array: NDArray[np.str_] | None) -> tuple[str, ...]:
-    return () if array is None else tuple(str(text) for text in array)
+def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]:
+    """The lines of a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return ["|" + "".join(f" {cell} |" if cell != "" else " |" for cell in line) for line in lines]
 
 
 def _kind(path: Path) -> str:

@@ -1,96 +1,65 @@
-"""One request on its way through the server: who asked, by when, and whether anyone waits."""
+"""One request on its way through the server: who asks, until when, and what became of it."""
 
 import re
 import time
 import uuid
-from collections.abc import Callable
-from typing import Literal
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 
-from edgegrasp_service.errors import Cancelled, DeadlineExceeded
+from edgegrasp_service.errors import Problem
+from edgegrasp_service.worker.job import Facts, Transport
 
-Transport = Literal["grpc", "http"]
+REQUEST_ID_HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC metadata of both
 
-_REQUEST_ID = re.compile(r"[\w.:+/=@-]{1,128}", re.ASCII)
+_USABLE_ID = re.compile(r"[\w.:+/=@-]{1,128}", re.ASCII)
 
 
+@dataclass
 class Call:
-    """What every stage knows of the request it works on. Safe to use from any thread.
+    """One request, or one stream of them."""
 
-    Attributes:
-        transport: The way it came.
-        method: The gRPC method's name, e.g. "DetectGrasps", for either transport.
-        request_id: The caller's own where it is usable, or else a new one.
-    """
+    transport: Transport
+    method: str  # the gRPC method's name, for either transport
+    request_id: str = ""  # the caller's own where it is usable, or else a new one
+    peer: str = ""  # address without port
+    token: str = ""  # name of the token it came with
+    is_admin: bool = False
+    traceparent: str = ""  # W3C trace context, as sent
+    long: bool = False  # a stream, whose duration says nothing
+    in_stream: bool = False  # one request of a stream
+    start: float = field(default_factory=time.monotonic)  # as the event loop's clock
+    deadline: float = float("inf")
+    bytes_in: int = 0
+    bytes_out: int = 0
+    code: str = ""  # it ended with: a gRPC code or an HTTP status
+    problem: Problem | None = None
+    facts: Facts = field(default_factory=Facts)
+    stages: dict[str, float] = field(default_factory=dict)  # seconds of each, in order
+    seconds: float = 0.0  # from its start to its end
 
-    def __init__(
-        self,
-        transport: Transport,
-        method: str,
-        *,
-        request_id: str = "",
-        timeout: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """Start a call.
-
-        Args:
-            transport: The way it came.
-            method: The gRPC method's name.
-            request_id: What the caller calls it; anything.
-            timeout: Seconds the caller waits; None: as long as it takes.
-            clock: Seconds that only go forward; the wall clock may jump.
-        """
-        self.transport = transport
-        self.method = method
-        usable = _REQUEST_ID.fullmatch(request_id) is not None
-        self.request_id = request_id if usable else uuid.uuid4().hex
-        self._clock = clock
-        self._start = clock()
-        self._deadline = None if timeout is None else self._start + timeout
-        self._cancelled = False
+    def __post_init__(self) -> None:
+        if not _USABLE_ID.fullmatch(self.request_id):
+            self.request_id = uuid.uuid4().hex
 
     @property
-    def seconds(self) -> float:
-        """Time since it came in."""
-        return self._clock() - self._start
-
-    @property
-    def remaining(self) -> float | None:
-        """Seconds until its deadline, below zero after it; None: it has none."""
-        return None if self._deadline is None else self._deadline - self._clock()
-
-    @property
-    def cancelled(self) -> bool:
-        """Whether nobody waits for the answer any more."""
-        return self._cancelled
-
-    @property
-    def over(self) -> bool:
-        """Whether an answer would come in vain: cancelled, or after the deadline."""
-        return self._cancelled or (self._deadline is not None and self._deadline <= self._clock())
+    def client(self) -> str:
+        """Whom its requests count for."""
+        return self.token or self.peer
 
     def limit(self, timeout: float) -> None:
-        """Bring the deadline forward to `timeout` seconds after it came in, if it is later."""
-        deadline = self._start + timeout
-        self._deadline = deadline if self._deadline is None else min(self._deadline, deadline)
+        """Bring the deadline forward to `timeout` seconds after the start, if it is later."""
+        self.deadline = min(self.deadline, self.start + timeout)
 
-    def cancel(self) -> None:
-        """Say that nobody waits any more; work on it ends at the next stage."""
-        self._cancelled = True
-
-    def check(self) -> None:
-        """Pass where the answer is still wanted; called before every stage.
-
-        Raises:
-            Cancelled: The caller is gone.
-            DeadlineExceeded: The deadline is over.
-        """
-        if self.cancelled:
-            raise Cancelled("The caller cancelled the request.")
-        if self.over:
-            raise deadline_exceeded()
+    def end_stage(self, name: str) -> None:
+        """Note that a stage ended now, which began where the one before it ended."""
+        self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
 
 
-def deadline_exceeded() -> DeadlineExceeded:
-    """The error for an answer that comes too late."""
-    return DeadlineExceeded("The deadline passed before there was an answer.")
+CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task
+
+
+def current_call() -> Call:
+    """The call that the running task works on."""
+    call = CALL.get()
+    assert call is not None, "outside of the middleware"
+    return call

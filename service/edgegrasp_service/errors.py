@@ -11,9 +11,10 @@ EdgeGraspError                (edgegrasp_model.errors)
       + ReloadFailed          new weights cannot be used; the old ones still serve
       + NotReady              weights are still loading, or the server is stopping
       + Overloaded            as many requests as the server takes are in it already
+      + RequestTimeout        a body that arrives too slowly
       + DeadlineExceeded      the caller's deadline passed before there was an answer
       + Cancelled             the caller is gone; nobody reads this
-      + WorkerLost            the network's thread died or ran out of memory, and was replaced
+      + WorkerLost            the process that worked on the request died, and is replaced
       + DetectorFailed        the detector failed on a good request
       + InvalidSettings       start-up: a setting is wrong
       + AddressInUse          start-up: a port cannot be bound
@@ -21,8 +22,6 @@ EdgeGraspError                (edgegrasp_model.errors)
 
 import re
 from dataclasses import dataclass
-
-import grpc
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
 
@@ -86,6 +85,10 @@ class Overloaded(ServiceError):  # noqa: N818
         self.retry_after = retry_after
 
 
+class RequestTimeout(_FieldError):  # noqa: N818
+    """A body arrives too slowly."""
+
+
 class DeadlineExceeded(ServiceError):  # noqa: N818
     """The caller's deadline passed before there was an answer."""
 
@@ -95,7 +98,7 @@ class Cancelled(ServiceError):  # noqa: N818
 
 
 class WorkerLost(ServiceError):  # noqa: N818
-    """The network's thread died or ran out of memory, and was replaced."""
+    """The process that worked on the request died or ran out of memory, and is replaced."""
 
 
 class DetectorFailed(ServiceError):  # noqa: N818
@@ -110,40 +113,42 @@ class AddressInUse(ServiceError):  # noqa: N818
     """A port cannot be bound."""
 
 
-STATUS: dict[type[Exception], tuple[grpc.StatusCode, int]] = {
-    InvalidRequest: (grpc.StatusCode.INVALID_ARGUMENT, 400),
-    UnknownModel: (grpc.StatusCode.NOT_FOUND, 404),
-    PayloadTooLarge: (grpc.StatusCode.RESOURCE_EXHAUSTED, 413),
-    UnsupportedMediaType: (grpc.StatusCode.INVALID_ARGUMENT, 415),
-    DecoderMissing: (grpc.StatusCode.UNIMPLEMENTED, 501),
-    Unauthenticated: (grpc.StatusCode.UNAUTHENTICATED, 401),
-    PermissionDenied: (grpc.StatusCode.PERMISSION_DENIED, 403),
-    HeadersTooLarge: (grpc.StatusCode.RESOURCE_EXHAUSTED, 431),
-    ReloadFailed: (grpc.StatusCode.FAILED_PRECONDITION, 409),
-    NotReady: (grpc.StatusCode.UNAVAILABLE, 503),
-    Overloaded: (grpc.StatusCode.RESOURCE_EXHAUSTED, 429),
-    DeadlineExceeded: (grpc.StatusCode.DEADLINE_EXCEEDED, 504),
-    Cancelled: (grpc.StatusCode.CANCELLED, 499),  # 499: as nginx logs it
-    WorkerLost: (grpc.StatusCode.UNAVAILABLE, 503),
-    DetectorFailed: (grpc.StatusCode.INTERNAL, 500),
+# Names of gRPC codes, and HTTP statuses.
+STATUS: dict[type[Exception], tuple[str, int]] = {
+    InvalidRequest: ("INVALID_ARGUMENT", 400),
+    UnknownModel: ("NOT_FOUND", 404),
+    PayloadTooLarge: ("RESOURCE_EXHAUSTED", 413),
+    UnsupportedMediaType: ("INVALID_ARGUMENT", 415),
+    DecoderMissing: ("UNIMPLEMENTED", 501),
+    Unauthenticated: ("UNAUTHENTICATED", 401),
+    PermissionDenied: ("PERMISSION_DENIED", 403),
+    HeadersTooLarge: ("RESOURCE_EXHAUSTED", 431),
+    ReloadFailed: ("FAILED_PRECONDITION", 409),
+    NotReady: ("UNAVAILABLE", 503),
+    Overloaded: ("RESOURCE_EXHAUSTED", 429),
+    RequestTimeout: ("DEADLINE_EXCEEDED", 408),
+    DeadlineExceeded: ("DEADLINE_EXCEEDED", 504),
+    Cancelled: ("CANCELLED", 499),  # 499: as nginx logs it
+    WorkerLost: ("UNAVAILABLE", 503),
+    DetectorFailed: ("INTERNAL", 500),
 }
 
 
 @dataclass(frozen=True)
-class ErrorReport:
-    """An error as both transports tell it."""
+class Problem:
+    """An error as both transports tell it; plain values, for it crosses between processes."""
 
     kind: str  # the class's name in kebab case, e.g. "invalid-request"
     detail: str
     field: str
     value: str
     fix: str
-    code: grpc.StatusCode
-    status: int
+    code: str  # name of the gRPC code, e.g. "INVALID_ARGUMENT"
+    status: int  # of HTTP
     retry_after: float | None = None  # seconds
 
 
-def report(error: Exception) -> ErrorReport:
+def report(error: Exception) -> Problem:
     """Describe an error for the caller; one the table does not know tells nothing of itself."""
     if type(error) not in STATUS:
         error = DetectorFailed("The server failed; its log says why.")
@@ -158,7 +163,7 @@ def report(error: Exception) -> ErrorReport:
     detail = f"{field}: got {value}. {fix}" if field else str(error)
     retry_after = error.retry_after if isinstance(error, Overloaded) else None
     kind = kind_of(type(error))
-    return ErrorReport(kind, detail, field, value, fix, code, status, retry_after)
+    return Problem(kind, detail, field, value, fix, code, status, retry_after)
 
 
 def _sendable(text: str) -> str:

@@ -1,4 +1,4 @@
-"""One process, one event loop: HTTP and gRPC over the same core."""
+"""The process that accepts: HTTP and gRPC in one event loop, in front of the workers."""
 
 import asyncio
 import contextlib
@@ -7,79 +7,95 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
 
 import uvicorn
 
-from edgegrasp_service import grpc_edge, http_edge
-from edgegrasp_service.allocator import keep_freed_memory
-from edgegrasp_service.backend import load_backend
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.edge import Edge
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.grpc_edge import GrpcEdge
-from edgegrasp_service.grpc_server import GrpcServer
-from edgegrasp_service.http_app import create_app
-from edgegrasp_service.http_edge import HttpEdge
-from edgegrasp_service.http_protocol import HttpProtocol
-from edgegrasp_service.logs import LogWriter, start_logging, write_line
-from edgegrasp_service.metrics import Metrics
-from edgegrasp_service.observer import Observer
-from edgegrasp_service.observers import Observers
-from edgegrasp_service.reload import Reloader
+from edgegrasp_service.front.grpc import METHODS as GRPC_METHODS
+from edgegrasp_service.front.grpc import GrpcServer
+from edgegrasp_service.front.http import METHODS as HTTP_METHODS
+from edgegrasp_service.front.http import HttpMiddleware, create_app
+from edgegrasp_service.front.http_protocol import HttpProtocol
+from edgegrasp_service.front.service import GraspService, Observer, Reloader
+from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
+from edgegrasp_service.recording import Recorder
+from edgegrasp_service.security import load_tls, load_tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.tls import load_tls
-from edgegrasp_service.tokens import load_tokens
+from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
 logger = logging.getLogger(__name__)
-
-METHODS = {*http_edge.METHODS.values(), *grpc_edge.METHODS.values()}
 
 NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
 KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
+BACKLOG = 128  # connections that wait to be accepted
+REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble with sockets
 
 
 class Server:
-    """Both transports of one service.
+    """Both transports of one service. Must be made in the running event loop.
+
+    Args:
+        settings: What an operator set.
+        observers: Told of every call, besides the metrics and the log.
+        nursery: The command that starts the process which workers fork from.
+
+    Raises:
+        InvalidSettings: A certificate or a token cannot be used.
 
     Attributes:
         metrics: What /metrics shows.
+        service: The front without a transport.
+        pool: The workers.
         http_url: e.g. "http://127.0.0.1:8000", once ports are open.
         grpc_address: e.g. "127.0.0.1:50051", once ports are open.
-        reloader: Swaps weights, tokens and certificates, once ports are open.
+        reloader: Swaps weights, tokens and certificates.
     """
 
     def __init__(
         self,
         settings: Settings,
-        service: GraspService | None = None,
-        observers: tuple[Observer, ...] = (),
+        observers: Sequence[Observer] = (),
+        nursery: Sequence[str] = NURSERY,
     ) -> None:
-        """Read certificates and tokens.
-
-        Args:
-            settings: What an operator set.
-            service: The core; None: one with the weights of the settings, observed.
-            observers: Further ones, besides the metrics.
-
-        Raises:
-            InvalidSettings: A certificate or a token cannot be used.
-        """
         self._settings = settings
         self._tls = load_tls(settings)
-        self.metrics = Metrics(sorted(METHODS))
-        self._edge = Edge(load_tokens(settings), self.metrics, settings.max_header_bytes)
-        self._service = service or GraspService(
-            lambda: load_backend(settings), settings, Observers((self.metrics, *observers))
+        self.metrics = Metrics(sorted({*GRPC_METHODS.values(), *HTTP_METHODS.values()}))
+        self.pool = WorkerPool(settings, nursery, self.metrics.worker_replaced)
+        self._recorder: Recorder | None = None
+        if settings.record_folder is not None:
+            self._recorder = Recorder(settings.record_folder, settings.record_bytes)
+        self.service = GraspService(
+            settings,
+            self.pool,
+            load_tokens(settings),
+            (self.metrics.count_call, log_call, *observers),
+            None if self._recorder is None else self._recorder.record,
         )
-        self.metrics.describe_models(self._service.models)
-        self.metrics.watch("ready", "1: requests are answered", lambda: self._service.ready)
         self.reloader = Reloader(
-            self._service, self._edge, lambda: load_tokens(settings), self._tls
+            self.service, lambda: load_tokens(settings), self._tls, self.metrics.reloaded
         )
+        self._watch()
         self.http_url = ""
         self.grpc_address = ""
+
+    def _watch(self) -> None:
+        service, admission, watch = self.service, self.service.admission, self.metrics.watch
+        self.metrics.describe_models(lambda: self.pool.models)
+        watch("ready", "1: requests are answered", lambda: service.ready)
+        watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
+        watch("requests_active", "requests that workers have", lambda: self.pool.busy)
+        watch(
+            "queue_depth",
+            "requests let in that no worker has",
+            lambda: max(0, admission.tickets - self.pool.busy),
+        )
+        watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
+        watch("workers", "worker processes", lambda: len(self.pool.pids))
+        watch("workers_resident_bytes", "memory of workers", lambda: self.pool.resident_bytes)
 
     async def serve(
         self,
@@ -99,8 +115,10 @@ class Server:
             EdgeGraspError: Weights cannot be used.
         """
         settings = self._settings
+        asyncio.get_running_loop().set_exception_handler(_LoopErrors())
         with _listen(settings.host, settings.http_port) as http_socket:
-            grpc_server = self._grpc_server()
+            credentials = None if self._tls is None else self._tls.grpc
+            grpc_server = GrpcServer(self.service, self.reloader, credentials)
             http_server = self._http_server()
             scheme = "http" if self._tls is None else "https"
             self.http_url = f"{scheme}://{_host_and_port(http_socket)}"
@@ -116,54 +134,42 @@ class Server:
                     load_task.result()
                 await stopped
             finally:
+                load_task.cancel()
                 await self._drain(grpc_server)
                 http_server.should_exit = True
                 await asyncio.gather(http_task, grpc_server.stop(CLOSE_SECONDS))
-                for task in (stopped, load_task):
-                    task.cancel()
+                stopped.cancel()
+                self.pool.close()
+                if self._recorder is not None:
+                    self._recorder.close()
 
     async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
-        await self._service.start()
-        await grpc_server.set_serving(True)
-        ready()
+        await self.pool.start()
+        if not self.service.stopping.is_set():
+            await grpc_server.set_serving(True)
+            ready()
 
     async def _drain(self, grpc_server: GrpcServer) -> None:
         """Refuse new requests, and wait until those accepted are answered, or grace is over."""
         clock = asyncio.get_running_loop().time
         end = clock() + self._settings.grace_seconds
-        self._edge.draining = True
-        self._service.stop_accepting()
+        self.service.stopping.set()
         await grpc_server.stop_serving()
         await asyncio.sleep(min(NOTICE_SECONDS, self._settings.grace_seconds))
-        in_time = await self._service.drain(end - clock())
-        if not in_time:
+        if not await self.service.drain(end - clock()):
             logger.warning("grace is over: requests in flight are given up")
-            self._edge.give_up()
-        self._service.close()
-        end = max(end, clock() + CLOSE_SECONDS)
-        while self._edge.unanswered and clock() < end:
-            await asyncio.sleep(0.01)
-
-    def _grpc_server(self) -> GrpcServer:
-        return GrpcServer(
-            self._service,
-            self._settings.host,
-            self._settings.grpc_port,
-            interceptors=[GrpcEdge(self._edge, self._settings.max_body_bytes)],
-            credentials=None if self._tls is None else self._tls.grpc,
-            reloader=self.reloader,
-        )
 
     def _http_server(self) -> "_HttpServer":
         tls = self._tls
+        app = create_app(self.service, self.metrics, self.reloader)
         config = uvicorn.Config(
-            HttpEdge(create_app(self._service, self.reloader), self._edge),
+            HttpMiddleware(app, self.service),
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=HttpProtocol,  # whatever else is installed: its bounds are the ones set here
-            h11_max_incomplete_event_size=self._settings.max_header_bytes,
+            http=partial(HttpProtocol, self._settings),  # type: ignore[arg-type]  # made alike
             ws="none",
+            backlog=BACKLOG,
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
@@ -181,6 +187,23 @@ class _HttpServer(uvicorn.Server):
         yield
 
 
+class _LoopErrors:
+    """Logs what the event loop complains of; trouble with sockets once in a while, in one line.
+
+    Without file descriptors left, every connection that waits would have its traceback.
+    """
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if not isinstance(context.get("exception"), OSError):
+            loop.default_exception_handler(context)
+        elif loop.time() >= self._next:
+            self._next = loop.time() + REPEAT_SECONDS
+            logger.error("%s (%s)", context["message"], context["exception"])
+
+
 def run(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT; prints one line with both addresses when ready.
 
@@ -188,25 +211,24 @@ def run(settings: Settings) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
-    keep_freed_memory()
     with contextlib.ExitStack() as ends:
         log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
         observers: list[Observer] = []
         if settings.otlp_endpoint:
-            from edgegrasp_service.tracing import Tracer, otlp_provider
+            from edgegrasp_service.observability import Tracer, otlp_provider
 
             provider = otlp_provider(settings.otlp_endpoint)
             ends.callback(provider.shutdown)
-            observers.append(Tracer(provider))
-        warn_of_strangers(settings)
-        asyncio.run(_serve_until_signalled(settings, tuple(observers), log))
+            observers.append(Tracer(provider).trace_call)
+        warn(settings)
+        asyncio.run(_serve_until_signalled(settings, observers, log))
 
 
 async def _serve_until_signalled(
-    settings: Settings, observers: tuple[Observer, ...], log: LogWriter
+    settings: Settings, observers: Sequence[Observer], log: LogQueue
 ) -> None:
     stop = asyncio.Event()
-    server = Server(settings, observers=observers)
+    server = Server(settings, observers)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -235,8 +257,8 @@ def _at_a_terminal() -> bool:
     return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
-def warn_of_strangers(settings: Settings) -> None:
-    """Say what is open to whoever can reach this machine."""
+def warn(settings: Settings) -> None:
+    """Say what an operator may not have meant."""
     try:
         local = ipaddress.ip_address(settings.host).is_loopback
     except ValueError:
@@ -245,12 +267,15 @@ def warn_of_strangers(settings: Settings) -> None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
     if not local and not (load_tokens(settings).required or settings.tls_client_ca):
         logger.warning("%s: others can reach this server, and it asks nobody who", settings.host)
+    for folder in settings.weights:
+        if folder.is_dir() and not any(folder.glob("*.safetensors")):
+            logger.warning("weights: %s holds no weights (*.safetensors)", folder)
 
 
 def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        listening = socket.create_server((host, port), family=family, backlog=2048)
+        listening = socket.create_server((host, port), family=family, backlog=BACKLOG)
     except OSError as error:
         raise AddressInUse(f"HTTP: cannot listen on {host}:{port} ({error.strerror})") from None
     # Connections inherit it; asyncio sets it on its own sockets only. Without, answers wait 40 ms.

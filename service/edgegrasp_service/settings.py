@@ -1,6 +1,7 @@
 """Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
 import difflib
+import json
 import os
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -16,6 +17,8 @@ from pydantic_settings import (
     SettingsError,
     TomlConfigSettingsSource,
 )
+
+from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
 PREFIX = "EDGEGRASP_"
@@ -64,21 +67,43 @@ class Settings(BaseSettings):
     max_points: int = Field(
         default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
     )
-    # Bounds and batching.
-    max_balls: int = Field(
+    # Bounds.
+    max_voxels: int = Field(
+        default=300_000, ge=1, description="most points in a cloud, after downsampling"
+    )
+    max_approach_points: int = Field(
         default=256, ge=1, le=256, description="most approach points a request may ask for"
     )
     max_candidates: int = Field(
         default=16_000, ge=1, le=16_000, description="most candidates a request may ask for"
     )
-    max_concurrent_requests: int = Field(
-        default=8, ge=1, le=1024, description="most requests worked on at a time"
+    workers: int = Field(
+        default=0,
+        ge=0,
+        le=1024,
+        description="processes that detect, each with one thread; 0: one a core",
+    )
+    max_worker_bytes: int = Field(
+        default=3 * 1024 * MIB,
+        ge=64 * MIB,
+        description="memory a worker may take for its request; one that needs more is replaced",
     )
     max_queue_length: int = Field(
-        default=32, ge=0, le=65536, description="most requests that wait to be worked on"
+        default=32, ge=0, le=65536, description="most requests in the server beside those at work"
+    )
+    max_held_bytes: int = Field(
+        default=512 * MIB,
+        ge=MIB,
+        description="most bytes of bodies held at a time; who comes then waits to be read",
+    )
+    max_streams: int = Field(
+        default=16, ge=1, le=1024, description="most gRPC streams open at a time"
     )
     max_stream_requests: int = Field(
         default=4, ge=1, le=1024, description="most requests of one stream read ahead"
+    )
+    max_connections: int = Field(
+        default=512, ge=1, le=65536, description="most HTTP connections open at a time"
     )
     max_request_seconds: float = Field(
         default=120.0,
@@ -86,23 +111,26 @@ class Settings(BaseSettings):
         le=86400.0,
         description="longest a request may take, where the caller sets no shorter deadline",
     )
-    prepare_threads: int = Field(
-        default=2, ge=1, le=256, description="threads that prepare clouds beside the network"
+    read_seconds: float = Field(
+        default=10.0,
+        gt=0.0,
+        le=3600.0,
+        description="time for a gRPC message, or for an HTTP body at min_bytes_per_second and more",
     )
-    batching: bool = Field(
-        default=False, description="whether requests share a forward pass of the network"
+    write_seconds: float = Field(
+        default=10.0,
+        gt=0.0,
+        le=3600.0,
+        description="time for an answer to be taken, and more at min_bytes_per_second",
     )
-    max_batch_balls: int = Field(
-        default=256, ge=1, le=65536, description="most balls in one forward pass"
+    min_bytes_per_second: int = Field(
+        default=50_000, ge=1, description="slowest that bodies and answers may be sent"
     )
-    max_batch_points: int = Field(
-        default=200_000, ge=1, description="most points of balls in one forward pass"
+    record_folder: Path | None = Field(
+        default=None, description="folder that requests and answers are recorded in; none: not"
     )
-    max_batch_wait_microseconds: int = Field(
-        default=0, ge=0, le=10_000_000, description="longest that a batch waits to be joined"
-    )
-    preferred_batch_balls: tuple[int, ...] = Field(
-        default=(), description="sizes in balls that are not made to wait, e.g. [64, 128]"
+    record_bytes: int = Field(
+        default=1024 * MIB, ge=MIB, description="most bytes recorded; the oldest are deleted"
     )
     max_header_bytes: int = Field(
         default=32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
@@ -180,8 +208,6 @@ def load_settings_and_origins(
     config: Path | None = None, **given: object
 ) -> tuple[Settings, Origins]:
     """As `load_settings`, and where each setting came from; raises as it does."""
-    from edgegrasp_service.errors import InvalidSettings  # it imports gRPC, `--help` should not
-
     origins = dict.fromkeys(Settings.model_fields, "default")
     try:
         path = config or _config_of_environment()
@@ -196,12 +222,6 @@ def load_settings_and_origins(
         raise InvalidSettings(_sentence(error, origins)) from None
     except SettingsError as error:
         raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
-    except _BadSource as error:
-        raise InvalidSettings(str(error)) from None
-
-
-class _BadSource(Exception):  # noqa: N818
-    """A file that cannot be read, or a name in a source that is no setting."""
 
 
 def _config_of_environment() -> Path | None:
@@ -212,11 +232,11 @@ def _config_of_environment() -> Path | None:
 def _read_file(path: Path) -> dict[str, Any]:
     """The settings in a file; its paths are relative to its own folder."""
     if not path.is_file():
-        raise _BadSource(f"config: got {str(path)!r}. There is no such file.")
+        raise InvalidSettings(f"config: got {str(path)!r}. There is no such file.")
     try:
         fields = TomlConfigSettingsSource(Settings, path).toml_data
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise _BadSource(f"config: {path}: {error}.") from None
+        raise InvalidSettings(f"config: {path}: {error}.") from None
     _refuse_unknown(fields, Settings.model_fields, lambda name: f"{path}: {name}")
     return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
 
@@ -250,7 +270,9 @@ def _refuse_unknown(
         if name not in choices:
             nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
             shown = label(nearest).rpartition(": ")[2]
-            raise _BadSource(f"{one_line(label(name))}: no such setting. Did you mean {shown}?")
+            raise InvalidSettings(
+                f"{one_line(label(name))}: no such setting. Did you mean {shown}?"
+            )
 
 
 def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
@@ -269,3 +291,28 @@ def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
 def one_line(text: str) -> str:
     """A text from outside as it may stand in a message."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def config_text(settings: Settings, origins: Origins) -> str:
+    """Settings as a TOML file that gives the same ones, secrets left out."""
+    lines = ["# EdgeGrasp settings in effect, and where each comes from; secrets are left out."]
+    for name in Settings.model_fields:
+        value = getattr(settings, name)
+        if name in SECRETS:
+            lines.append(f"# {name}: {len(value) or 'none'}{', hidden' * bool(value)}")
+        elif value is None:
+            lines.append(f"# {name}: none")
+        else:
+            lines.append(f"{name} = {_toml(value)}")
+        lines[-1] += f"  # {one_line(origins[name])}"
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return f"[{', '.join(_toml(part) for part in value)}]"
+    if isinstance(value, int | float):
+        return repr(value)
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

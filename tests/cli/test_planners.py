@@ -13,7 +13,6 @@ from edgegrasp_cli.planners.baselines import (
 )
 from edgegrasp_cli.planners.choice import PlannerChoice, named_planner, open_planner
 from edgegrasp_cli.planners.detection import request_options, select_grasp
-from edgegrasp_cli.planners.validate import reference_successes
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_sim.camera import Observation
@@ -202,19 +201,3 @@ def test_another_package_may_name_its_planner(tmp_path, monkeypatch) -> None:
 def test_a_wrong_planner_is_told(name: str) -> None:
     with pytest.raises(ValueError, match=f"planner .*{name}"):
         named_planner(name)
-
-
-def test_every_candidate_of_a_labelled_view_counts_alike(tmp_path: Path) -> None:
-    (tmp_path / "bootstrap_dataset").mkdir()
-    # Two of eight are the teacher's best: both held; of the six others two were tried, one held.
-    for name, held in (("packed_1_0", 1), ("packed_1_1", 0)):
-        np.savez(
-            tmp_path / "bootstrap_dataset" / f"{name}.npz",
-            teacher_logit=np.arange(8, dtype=np.float16),
-            success=np.array([0, held, -1, -1, -1, -1, 1, 1], dtype=np.int8),
-        )
-    share = reference_successes(tmp_path, SceneKind.PACKED)
-    assert share.mean == pytest.approx((0.25 + 0.75 / 2 + 0.25) / 2)
-    assert share.views == 2
-    with pytest.raises(FileNotFoundError, match=r"pile_\*\.npz"):
-        reference_successes(tmp_path, SceneKind.PILE)

@@ -1,28 +1,21 @@
 """Whatever comes in, a decoder gives arrays or a 4xx, within memory that the bytes explain."""
 
+import json
 from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_service.grpc_messages import request_from_message, score_request_from_message
-from edgegrasp_service.options_text import options_from_query
-from edgegrasp_service.sent_arrays import PER_POINT, ListArray, NpyArray, PackedArray
-from edgegrasp_service.sent_cloud import (
-    DepthCloud,
-    FileCloud,
-    ListCloud,
-    PackedCloud,
-    RosCloud,
-    SentCloud,
-    decode_cloud,
-)
+from edgegrasp_service.schemas import GIVEN, PER_POINT
+from edgegrasp_service.worker.answer import Answerer
+from edgegrasp_service.worker.dummy import DummyCatalogue
+from edgegrasp_service.worker.job import Job, Limits
+from edgegrasp_service.worker.request_cloud import File, decode_cloud
 
 from .conftest import (
     DEPTH_IMAGE,
@@ -32,10 +25,12 @@ from .conftest import (
     POINT_CLOUD2,
     POINTS,
     VALUES,
+    base64_of,
     changed,
     decodes_or_refuses,
     files,
     mutated,
+    npy,
 )
 
 MAX_POINTS = 5000
@@ -47,9 +42,9 @@ def open3d_is_loaded() -> None:
     pytest.importorskip("open3d")
 
 
-def decode(source: Any, size: int, **beside: Any) -> None:
+def decode(size: int, **fields: Any) -> None:
     def work() -> None:
-        cloud, _ = decode_cloud(SentCloud(source, beside), DetectOptions(), MAX_POINTS)
+        cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         check_cloud(cloud, 32)
 
     decodes_or_refuses(work, size, MAX_POINTS)
@@ -59,44 +54,43 @@ def decode(source: Any, size: int, **beside: Any) -> None:
 @given(st.data())
 def test_files(file_format: str, data: st.DataObject) -> None:
     content = data.draw(files(file_format))
-    decode(FileCloud(file_format, content), len(content))
+    decode(len(content), cloud=File(file_format, content))
 
 
 @pytest.mark.parametrize("file_format", FILES)
 def test_the_files_that_are_mutated_are_good(file_format: str) -> None:
     for content in FILES[file_format]:
-        cloud, _ = decode_cloud(
-            SentCloud(FileCloud(file_format, content)), DetectOptions(), MAX_POINTS
-        )
+        fields = {"cloud": File(file_format, content)}
+        cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)
         assert cloud.points is not None
 
 
 @given(st.binary(max_size=100), st.sampled_from(sorted(PER_POINT)), st.binary(max_size=600))
 def test_packed(points: bytes, name: str, beside: bytes) -> None:
-    decode(PackedCloud(points), len(points))
-    decode(PackedCloud(POINTS.tobytes()), len(beside), **{name: PackedArray(beside)})
+    decode(len(points), points=points)
+    decode(len(beside), points=POINTS.tobytes(), **{name: beside})
 
 
 @given(LISTS, st.sampled_from(sorted(PER_POINT)))
 def test_lists(values: object, name: str) -> None:
     size = len(repr(values))
-    decode(ListCloud(values), size)
-    decode(PackedCloud(POINTS.tobytes()), size, **{name: ListArray(values)})
+    decode(size, points=values)
+    decode(size, points=POINTS.tobytes(), **{name: values})
 
 
 @given(mutated(FILES["npy"]), st.sampled_from(sorted(PER_POINT)))
 def test_npy_beside(content: bytes, name: str) -> None:
-    decode(PackedCloud(POINTS.tobytes()), len(content), **{name: NpyArray(content)})
+    decode(len(content), points=POINTS.tobytes(), **{name: File("npy", content)})
 
 
 @given(changed(POINT_CLOUD2) | VALUES)
 def test_point_cloud2(fields: object) -> None:
-    decode(RosCloud(fields), len(repr(fields)))
+    decode(len(repr(fields)), point_cloud2=fields)
 
 
 @given(st.lists(changed(DEPTH_IMAGE) | changed(DEPTH_ROWS), min_size=1, max_size=2) | VALUES)
 def test_depth_images(images: object) -> None:
-    decode(DepthCloud(images), len(repr(images)))
+    decode(len(repr(images)), depth_images=images)
 
 
 MESSAGES = [
@@ -118,26 +112,6 @@ MESSAGES = [
 ]
 
 
-@given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
-def test_messages(content: bytes, scores: bool) -> None:
-    def work() -> None:
-        try:
-            if scores:
-                request: Any = score_request_from_message(
-                    grasp_pb2.ScoreGraspsRequest.FromString(content)
-                )
-                request.given.check()
-            else:
-                request = request_from_message(grasp_pb2.DetectGraspsRequest.FromString(content))
-        except DecodeError:
-            return
-        options = parse_options(dict(request.options))
-        cloud, _ = decode_cloud(request.cloud, options, MAX_POINTS)
-        check_cloud(cloud, options.num_approach_points)
-
-    decodes_or_refuses(work, len(content), MAX_POINTS)
-
-
 OPTIONS = {
     "seed": 1, "up": [0.0, 0.0, 1.0], "viewpoint": [[0, 0, 1], [1, 0, 1]], "gripper": "panda",
     "workspace": {"min": [-1, -1, -1], "max": [1, 1, 1]}, "collision": {"margin": 0.01},
@@ -153,16 +127,112 @@ def test_options(options: dict[str, object]) -> None:
     decodes_or_refuses(lambda: parse_options(options), len(repr(options)), MAX_POINTS)
 
 
+FORM = b"".join(
+    b'--b\r\nContent-Disposition: form-data; name="%s"%s\r\n\r\n%s\r\n' % part
+    for part in [
+        (b"cloud", b'; filename="c.npy"\r\nContent-Type: application/x-npy', FILES["npy"][0]),
+        (b"options", b"\r\nContent-Type: application/json", b'{"seed": 3}'),
+        (b"segment_ids", b"", b"[%s0]" % (b"0, " * 39)),
+    ]
+) + (b"--b--\r\n")
+
+
+# Whole requests
+
+ANSWERER = Answerer(DummyCatalogue(), Limits(max_points=MAX_POINTS))
+DOCUMENTS = {
+    "points": POINTS.tolist(),
+    "point_cloud2": POINT_CLOUD2 | {"data": base64_of(POINT_CLOUD2["data"])},
+    "depth_images": [
+        DEPTH_IMAGE
+        | {"depth": DEPTH_IMAGE["depth"] | {"data": base64_of(DEPTH_IMAGE["depth"]["data"])}}
+    ],
+}
+BESIDE = {"edges": [[0, 1], [2, 3]], "hand_poses": [np.eye(4).tolist()], "options": OPTIONS}
+
+
+def ask(transport: Any, body: bytes, scores: bool, media_type: str = "", query: str = "") -> None:
+    """Ask; anything but an answer or an error of the caller's fails."""
+    method: Any = "ScoreGrasps" if scores else "DetectGrasps"
+    job = Job(method, transport, body, 60.0, media_type, query)
+
+    def work() -> None:
+        answer = ANSWERER.answer(job)
+        if answer.error is not None:
+            assert 400 <= answer.error.status < 500, answer.facts.traceback
+            answer.error.detail.encode()  # what cannot be encoded cannot be answered
+            assert len(answer.error.detail) < 2000
+
+    decodes_or_refuses(work, len(body) + len(query), MAX_POINTS)
+
+
+@given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
+def test_messages(content: bytes, scores: bool) -> None:
+    ask("grpc", content, scores)
+
+
 @given(
-    st.lists(
-        st.tuples(
-            st.sampled_from([*DetectOptions.model_fields, "x"]),
-            st.text(max_size=12)
-            | st.sampled_from(["[" * 5000, "1,,2", "{", "1e999,0,0", "\ud800"]),
-        ),
-        max_size=3,
+    st.sampled_from(sorted(DOCUMENTS)).flatmap(
+        lambda name: changed({name: DOCUMENTS[name]} | BESIDE)
     )
+    | st.fixed_dictionaries({"points": LISTS, "options": VALUES, "normals": LISTS, "edges": LISTS})
+    | VALUES,
+    st.booleans(),
 )
-def test_options_in_a_query(items: list[tuple[str, str]]) -> None:
-    size = len(repr(items))
-    decodes_or_refuses(lambda: parse_options(options_from_query(items)), size, MAX_POINTS)
+def test_json(document: Any, scores: bool) -> None:
+    if isinstance(document, dict) and not scores:
+        document = {name: document[name] for name in document if name not in GIVEN}
+    content = json.dumps(document, default=lambda data: data.decode("latin-1"))
+    ask("http", content.encode(), scores, "application/json")
+
+
+@given(st.binary(max_size=300) | mutated([json.dumps({"points": [[0, 0, 0]] * 40}).encode()]))
+def test_broken_json(content: bytes) -> None:
+    ask("http", content, False, "application/json")
+
+
+@given(
+    mutated([FORM]),
+    st.sampled_from(["b", '"b"', "b; x=y", "x", '"', "b'\ud800"]),
+    st.booleans(),
+)
+def test_forms(content: bytes, boundary: str, scores: bool) -> None:
+    ask("http", content, scores, f"multipart/form-data; boundary={boundary}")
+
+
+@pytest.mark.parametrize("file_format", FILES)
+@given(data=st.data())
+def test_arrays_to_score(file_format: str, data: st.DataObject) -> None:
+    part = b'--b\r\nContent-Disposition: form-data; name="%s"; filename="a.%s"\r\n\r\n%s\r\n'
+    cloud = part % (b"cloud", file_format.encode(), FILES[file_format][0])
+    arrays = [*FILES["npy"], npy(np.array(3)), npy(np.array([[0, 1]])), npy(np.eye(4)[None])]
+    given_grasps = part % (
+        data.draw(st.sampled_from([b"edges", b"hand_poses"])),
+        b"npy",
+        data.draw(mutated(arrays) | st.sampled_from(arrays)),
+    )
+    ask("http", cloud + given_grasps + b"--b--\r\n", True, "multipart/form-data; boundary=b")
+
+
+WORDS = st.text(max_size=12) | st.sampled_from(["[" * 5000, "1,,2", "{", "1e999,0,0", "%F0"])
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([*DetectOptions.model_fields, "x"]), WORDS), max_size=3),
+    st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=40),
+)
+def test_queries_and_media_types(items: list[tuple[str, str]], media_type: str) -> None:
+    query = "&".join(f"{name}={text}" for name, text in items)
+    for kind in ("application/x-npy", media_type):
+        ask("http", FILES["npy"][0], False, kind, query)
+
+
+def test_the_requests_that_are_mutated_are_good() -> None:
+    good = [("multipart/form-data; boundary=b", FORM)]
+    good += [
+        ("application/json", json.dumps({name: value}).encode())
+        for name, value in DOCUMENTS.items()
+    ]
+    for media_type, content in good:
+        answer = ANSWERER.answer(Job("DetectGrasps", "http", content, 60.0, media_type))
+        assert answer.error is None

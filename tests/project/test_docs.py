@@ -33,4 +33,4 @@ def test_the_example_of_conversions_names_what_there_is() -> None:
     frames = (DOCS / "frames.md").read_text()
     imported = re.search(r"conversions import \(\n(.*?)\n\)", frames, flags=re.DOTALL)
     assert imported is not None
-    assert set(re.findall(r"\w+", imported[1])) <= set(conversions.__all__)
+    assert all(hasattr(conversions, name) for name in re.findall(r"\w+", imported[1]))

@@ -1,17 +1,27 @@
+"""Servers and clients: raw ones of one shared server, and controlled ones of servers in a test."""
+
 import asyncio
-import contextlib
-from collections.abc import AsyncIterator, Callable, Iterator
+import dataclasses
+import sys
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import grpc
 import httpx
+import numpy as np
 import pytest
+from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_service.core import GraspService
+from edgegrasp_service.call import Call
+from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.server import Server
-from edgegrasp_service.settings import load_settings
+from edgegrasp_service.settings import Settings
+
+PATIENCE = 20  # seconds; longer than anything takes
 
 
 @dataclass
@@ -103,25 +113,240 @@ def raw(request: pytest.FixtureRequest) -> RawGrpc | RawRest:
     return found
 
 
-@contextlib.asynccontextmanager
-async def a_server(service: GraspService | None = None, **given: Any) -> AsyncIterator[Server]:
-    """A server in this event loop, on free ports, of dummies unless told otherwise."""
-    defaults = {"backend": "dummy", "http_port": 0, "grpc_port": 0, "grace_seconds": 5.0}
-    server = Server(load_settings(**(defaults | given)), service)
-    ready, stop = asyncio.Event(), asyncio.Event()
-    serving = asyncio.create_task(server.serve(stop, ready=ready.set))
-    waiting = asyncio.create_task(ready.wait())
-    await asyncio.wait([serving, waiting], return_when=asyncio.FIRST_COMPLETED)
-    try:
-        if serving.done():
-            serving.result()
-        yield server
-    finally:
-        waiting.cancel()
-        stop.set()
-        await asyncio.wait([serving])
+@dataclass
+class Reply:
+    code: str  # gRPC status name, or HTTP status
+    kind: str = ""
+    field: str = ""
+    retry_after: float | None = None
+    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+    scores: list[float] = dataclasses.field(default_factory=list)
+
+    @property
+    def fine(self) -> bool:
+        return self.code in ("OK", "200")
+
+
+class Grpc:
+    name = "grpc"
+
+    def __init__(self, server: Server) -> None:
+        options = (("grpc.max_send_message_length", -1),)
+        self.channel = aio.insecure_channel(server.grpc_address, options)
+        self.stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
+
+    async def detect(
+        self, points: np.ndarray, timeout: float | None = None, **options: Any
+    ) -> Reply:
+        message = grasp_pb2.DetectGraspsRequest(
+            points=points.tobytes(), options=grasp_pb2.DetectOptions(**options)
+        )
+        return await self._answer(self.stub.DetectGrasps, message, timeout)
+
+    async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
+        edges = [grasp_pb2.Edge(approach_index=0, contact_index=1)] * 3
+        message = grasp_pb2.ScoreGraspsRequest(points=points.tobytes(), edges=edges)
+        return await self._answer(self.stub.ScoreGrasps, message, timeout)
+
+    async def _answer(self, method: Any, message: Any, timeout: float | None) -> Reply:
+        try:
+            body = await method(message, timeout=timeout)
+        except aio.AioRpcError as error:
+            trailers = dict(error.trailing_metadata() or ())
+            detail = grasp_pb2.ErrorDetail.FromString(trailers.get("edgegrasp-error-bin", b""))
+            retry_after = detail.retry_after if detail.HasField("retry_after") else None
+            return Reply(error.code().name, detail.kind, detail.field, retry_after)
+        scores = [grasp.score for grasp in getattr(body, "grasps", [])]
+        return Reply("OK", counts=dict(body.counts), scores=scores)
+
+    async def close(self) -> None:
+        await self.channel.close(None)
+
+
+class Rest:
+    name = "rest"
+
+    def __init__(self, server: Server) -> None:
+        self.url = server.http_url
+        limits = httpx.Limits(max_connections=None)
+        self.http = httpx.AsyncClient(base_url=self.url, timeout=PATIENCE, limits=limits)
+
+    async def detect(
+        self, points: np.ndarray, timeout: float | None = None, **options: Any
+    ) -> Reply:
+        return await self._answer("/v1/grasps", points, timeout, {"options": options})
+
+    async def score(self, points: np.ndarray, timeout: float | None = None) -> Reply:
+        return await self._answer("/v1/grasps:score", points, timeout, {"edges": [[0, 1]] * 3})
+
+    async def _answer(
+        self, path: str, points: np.ndarray, timeout: float | None, fields: dict[str, Any]
+    ) -> Reply:
+        headers = {} if timeout is None else {"X-Request-Timeout": str(timeout)}
+        body = {"points": points.tolist()} | fields
+        response = await self.http.post(path, json=body, headers=headers)
+        found = response.json()
+        if response.is_success:
+            scores = [grasp["score"] for grasp in found.get("grasps", [])]
+            return Reply("200", counts=found["counts"], scores=scores)
+        kind = found["type"].removeprefix("urn:edgegrasp:error:")
+        retry_after = found["retry_after"]
+        if retry_after is not None:
+            assert response.headers["retry-after"] == str(int(retry_after))
+        return Reply(str(response.status_code), kind, found["field"], retry_after)
+
+    async def close(self) -> None:
+        await self.http.aclose()
+
+
+class Stages:
+    """Tells the dummies of one server when to wait and fail; see nursery.py."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "begun").touch()
+
+    @property
+    def begun(self) -> Counter[str]:
+        return Counter((self.folder / "begun").read_text().split())
+
+    def shut(self, stage: str) -> None:
+        """Let a stage begin, and hold it there."""
+        (self.folder / f"shut-{stage}").touch()
+
+    def open(self, stage: str) -> None:
+        (self.folder / f"shut-{stage}").unlink()
+
+    def fail(self, stage: str, kind: str) -> None:
+        """Let a stage fail, once; `weights` cannot be loaded until `mend`."""
+        new = self.folder / f"new-{stage}"
+        new.write_text(kind)
+        new.replace(self.folder / f"fault-{stage}")
+
+    def mend(self, stage: str) -> None:
+        (self.folder / f"fault-{stage}").unlink()
+
+
+@dataclass
+class Running:
+    server: Server
+    stages: Stages
+    calls: list[Call]  # that have ended, and had to do with grasps
+    stop: asyncio.Event
+    serving: "asyncio.Task[None]"
+
+    @property
+    def ended(self) -> list[str]:
+        """The kind of each call's problem, or ""."""
+        return ["" if call.problem is None else call.problem.kind for call in self.calls]
+
+    @property
+    def waiting(self) -> int:
+        """Requests let in that no worker has."""
+        return self.server.service.admission.tickets - self.server.pool.busy
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Return once something is so."""
+        async with asyncio.timeout(PATIENCE):
+            while not condition():
+                await asyncio.sleep(0.002)
+
+    async def until_idle(self) -> None:
+        """Return once no request is in the server, and no worker has a job."""
+        admission, pool = self.server.service.admission, self.server.pool
+        await self.until(lambda: not admission.tickets and not pool.busy)
+
+    def connect(self, transport: str) -> "Grpc | Rest":
+        return Grpc(self.server) if transport == "grpc" else Rest(self.server)
+
+    def address(self, transport: str) -> str:
+        return self.server.grpc_address if transport == "grpc" else self.server.http_url
+
+    def metrics(self) -> str:
+        return self.server.metrics.page("")[0].decode()
+
+
+Serve = Callable[..., Awaitable[Running]]
 
 
 @pytest.fixture
-def serving() -> Callable[..., contextlib.AbstractAsyncContextManager[Server]]:
-    return a_server
+async def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Serve]:
+    """Begins servers of controlled dummies in this event loop, on free ports."""
+    monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
+    running: list[Running] = []
+
+    async def start(
+        prepare: Callable[[Stages], None] = lambda stages: None, **given: Any
+    ) -> tuple[Running, asyncio.Event]:
+        folder = tmp_path / f"stages-{len(running)}"
+        folder.mkdir()
+        stages, calls = Stages(folder), []
+        prepare(stages)
+        ours = {"http_port": 0, "grpc_port": 0, "grace_seconds": PATIENCE, "workers": 1}
+
+        def note(call: Call) -> None:
+            if call.method in ("DetectGrasps", "ScoreGrasps") or call.in_stream:
+                calls.append(call)
+
+        nursery = (sys.executable, str(Path(__file__).parent / "nursery.py"), str(folder))
+        server = Server(Settings(**(ours | given)), [note], nursery)
+        opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
+        serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))
+        running.append(Running(server, stages, calls, stop, serving))
+        first = asyncio.create_task(opened.wait())
+        await asyncio.wait({first, serving}, return_when=asyncio.FIRST_COMPLETED)
+        return running[-1], ready
+
+    yield start
+    for each in running:
+        each.stop.set()
+        await asyncio.wait([each.serving])
+
+
+@pytest.fixture
+def serve(begin: Serve) -> Serve:
+    """As `begin`, and they are ready."""
+
+    async def start(**given: Any) -> Running:
+        running, ready = await begin(**given)
+        waiting = asyncio.create_task(ready.wait())
+        await asyncio.wait({waiting, running.serving}, return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if running.serving.done():
+            running.serving.result()
+        return running
+
+    return start
+
+
+@pytest.fixture(params=["grpc", "rest"])
+def transport(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name
+
+
+@pytest.fixture
+async def connect(transport: str) -> AsyncIterator[Callable[[Running], Grpc | Rest]]:
+    """A client of the transport that the test runs over."""
+    made: list[Grpc | Rest] = []
+
+    def make(running: Running) -> Grpc | Rest:
+        made.append(running.connect(transport))
+        return made[-1]
+
+    yield make
+    for each in made:
+        await each.close()
+
+
+@pytest.fixture
+def is_error() -> Callable[[Reply, str], bool]:
+    """Whether an answer is the error of a kind, on whichever transport."""
+
+    def check(answer: Reply, kind: str) -> bool:
+        code, status = next(STATUS[error] for error in STATUS if kind_of(error) == kind)
+        # A gRPC client whose deadline passed does not wait to hear of it.
+        kinds = (kind, "") if kind == "deadline-exceeded" else (kind,)
+        return answer.code in (code, str(status)) and answer.kind in kinds
+
+    return check

@@ -12,7 +12,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.http_bodies import DetectionBody, ModelsBody, ScoringBody
+from edgegrasp_service.schemas import DetectionBody, ModelsBody, ScoringBody
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 

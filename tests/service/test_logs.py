@@ -1,5 +1,6 @@
 """Logs name requests, on both transports, and hold up none when no one can write or read them."""
 
+import asyncio
 import io
 import json
 import logging
@@ -20,10 +21,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_service.logs import JsonFormatter, LogWriter, TextFormatter
-from edgegrasp_service.request_id import REQUEST_ID, usable_request_id
+from edgegrasp_client import AsyncGraspClient
+from edgegrasp_service.call import CALL, Call
+from edgegrasp_service.observability import JsonFormatter, LogQueue, TextFormatter
 
-REFUSED = ["", "two words", "a" * 129, "line\nbreak", "ü", "a;b", "{}"]
+TOKEN = "a-token-of-enough-letters"
 
 
 async def told(server: Any, transport: str, request_id: str, cloud: np.ndarray) -> str:
@@ -44,38 +46,32 @@ async def told(server: Any, transport: str, request_id: str, cloud: np.ndarray) 
         return dict(await call.trailing_metadata())["x-request-id"]
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
-async def test_request_ids_come_back(serving, transport: str, cloud: np.ndarray) -> None:
-    async with serving() as server:
-        for usable in ("robot-1/42", "a" * 128, "0af7651916cd43dd8448eb211c80319c"):
-            assert await told(server, transport, usable, cloud) == usable
-        made = {await told(server, transport, bad, cloud) for bad in ("", "two words", "a" * 129)}
-        assert len(made) == 3
-        assert all(len(request_id) == 32 and request_id.isalnum() for request_id in made)
-
-
-@pytest.mark.parametrize("bad", REFUSED)
-def test_unusable_request_ids_are_replaced(bad: str) -> None:
-    assert len(usable_request_id(bad)) == 32
+async def test_request_ids_come_back(dummy_server, transport: str, cloud: np.ndarray) -> None:
+    server = dummy_server
+    for usable in ("robot-1/42", "a" * 128, "0af7651916cd43dd8448eb211c80319c"):
+        assert await told(server, transport, usable, cloud) == usable
+    made = {await told(server, transport, bad, cloud) for bad in ("", "two words", "a" * 129)}
+    assert len(made) == 3
+    assert all(len(request_id) == 32 and request_id.isalnum() for request_id in made)
 
 
 @pytest.mark.parametrize("path", ["/none", "/v1/grasps"])
-async def test_errors_carry_the_request_id(serving, path: str) -> None:
-    async with serving(max_body_bytes=1024) as server:
-        async with httpx.AsyncClient(base_url=server.http_url) as http:
-            answer = await http.post(path, content=bytes(9000), headers={"x-request-id": "mine"})
-        assert answer.status_code in (404, 415, 413)
-        assert answer.headers["x-request-id"] == "mine"
-        async with aio.insecure_channel(server.grpc_address) as channel:
-            call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(
-                grasp_pb2.DetectGraspsRequest(points=b"1"), metadata=(("x-request-id", "mine"),)
-            )
-            assert await call.code() == grpc.StatusCode.INVALID_ARGUMENT
-            assert dict(await call.trailing_metadata())["x-request-id"] == "mine"
+async def test_errors_carry_the_request_id(serve, path: str) -> None:
+    server = (await serve(max_body_bytes=1024)).server
+    async with httpx.AsyncClient(base_url=server.http_url) as http:
+        answer = await http.post(path, content=bytes(9000), headers={"x-request-id": "mine"})
+    assert answer.status_code in (404, 413)
+    assert answer.headers["x-request-id"] == "mine"
+    async with aio.insecure_channel(server.grpc_address) as channel:
+        call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(
+            grasp_pb2.DetectGraspsRequest(points=b"1"), metadata=(("x-request-id", "mine"),)
+        )
+        assert await call.code() == grpc.StatusCode.INVALID_ARGUMENT
+        assert dict(await call.trailing_metadata())["x-request-id"] == "mine"
 
 
-async def test_a_stream_is_named_before_its_first_answer(serving) -> None:
-    async with serving() as server, aio.insecure_channel(server.grpc_address) as channel:
+async def test_a_stream_is_named_before_its_first_answer(dummy_server) -> None:
+    async with aio.insecure_channel(dummy_server.grpc_address) as channel:
         stub = grasp_pb2_grpc.GraspServiceStub(channel)
         call = stub.DetectGraspsStream(metadata=(("x-request-id", "mine"),))
         assert dict(await call.initial_metadata())["x-request-id"] == "mine"
@@ -152,6 +148,13 @@ def test_json_lines_name_requests(tmp_path: Path, cloud: np.ndarray) -> None:
         assert line["level"] == "info"
         assert line["time"].endswith("+00:00")
         assert line["seconds"] > 0.0
+        assert (line["peer"], line["model"], line["points"]) == ("127.0.0.1", "dummy", 500)
+        assert (line["grasps"], line["bytes_in"] > 5000, line["bytes_out"] > 500) == (
+            10,
+            True,
+            True,
+        )
+        assert {"admission", "read", "wait", "prepare", "network"} <= set(line["milliseconds"])
     assert not any(line.get("method") in ("Ready", "Live") for line in lines)  # probes
 
 
@@ -195,7 +198,7 @@ class Broken(io.TextIOBase):
 
 @pytest.mark.parametrize("stream", [Broken(), None])
 def test_lines_not_written_are_counted(stream: TextIO | None) -> None:
-    writer = LogWriter(stream, TextFormatter())
+    writer = LogQueue(stream, TextFormatter())
     for _ in range(3):
         writer.handle(logging.makeLogRecord({"msg": "lost"}))
     writer.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
@@ -212,14 +215,30 @@ def test_one_record_is_one_line(message: str, value: str) -> None:
     assert len(TextFormatter().format(record).splitlines()) == 1
 
 
+async def test_a_token_is_named_and_not_told(serve, cloud, tmp_path: Path, caplog) -> None:
+    caplog.set_level(logging.INFO)
+    (tmp_path / "tokens").write_text(f"arm-1:{TOKEN}")
+    server = (await serve(token_file=tmp_path / "tokens")).server
+    async with AsyncGraspClient(server.grpc_address, token=TOKEN) as client:
+        await client.detect(cloud)
+        for record in caplog.records:
+            assert TOKEN not in str(vars(record))
+    async with asyncio.timeout(20):
+        while not (told := [vars(record).get("fields", {}) for record in caplog.records]):
+            await asyncio.sleep(0.01)
+    assert "arm-1" in [fields.get("token") for fields in told]
+
+
 def test_a_fault_is_logged_with_its_traceback_and_request() -> None:
-    REQUEST_ID.set("mine")
+    queue = LogQueue(None, JsonFormatter())
+    CALL.set(Call("http", "DetectGrasps", "mine"))
     try:
         raise ValueError("why")
     except ValueError:
         record = logging.makeLogRecord({"msg": "failed", "exc_info": sys.exc_info()})
-    line = json.loads(JsonFormatter().format(record))
+    line = json.loads(queue.prepare(record))
     assert line["request_id"] == "mine"
     assert "ValueError: why" in line["exception"]
     assert "ValueError: why" in TextFormatter().format(record).splitlines()[-1]
-    REQUEST_ID.set("")
+    CALL.set(None)
+    queue.close()

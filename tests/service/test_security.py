@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import ssl
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +23,19 @@ from edgegrasp_client import (
     ServerUnavailableError,
     Tls,
 )
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.dummy import DummyCatalogue
+from edgegrasp_service.call import Call
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready
-from edgegrasp_service.server import Server, warn_of_strangers
+from edgegrasp_service.security import load_tls
+from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.tls import load_tls
 
 USER = "user-token-0123456789"
 SECOND = "second-token-0123456789"
 ADMIN = "admin-token-0123456789"
 WRONG = "wrong-token-0123456789"
 HOST = "127.0.0.1"
+ADMINISTRATOR = Call("grpc", "ReloadModels", is_admin=True)
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +62,6 @@ def server_tls(pem: dict[str, Path]) -> dict[str, Path]:
     return {"tls_certificate": pem["server"], "tls_key": pem["server_key"]}
 
 
-@pytest.fixture(params=["grpc", "rest"])
-def transport(request: pytest.FixtureRequest) -> str:
-    name: str = request.param
-    return name
-
-
 def address_of(server: Any, transport: str) -> str:
     address: str = server.grpc_address if transport == "grpc" else server.http_url
     return address
@@ -81,44 +74,44 @@ async def refused(address: str, **security: Any) -> Exception:
     return caught.value
 
 
-async def test_tls(serving, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
-    async with serving(**server_tls) as server:
-        assert server.http_url.startswith("https://")
-        address = address_of(server, transport)
-        async with AsyncGraspClient(address, tls=Tls(ca=pem["ca"])) as client:
-            assert await client.ready()
-            assert len((await client.detect(cloud)).grasps) == 10
-        by_other = await refused(address, tls=Tls(ca=pem["other_ca"]))
-        plain = await refused(address.replace("https", "http"))
-        assert {type(by_other), type(plain)} == {ServerUnavailableError}
+async def test_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
+    server = (await serve(**server_tls)).server
+    assert server.http_url.startswith("https://")
+    address = address_of(server, transport)
+    async with AsyncGraspClient(address, tls=Tls(ca=pem["ca"])) as client:
+        assert await client.ready()
+        assert len((await client.detect(cloud)).grasps) == 10
+    by_other = await refused(address, tls=Tls(ca=pem["other_ca"]))
+    plain = await refused(address.replace("https", "http"))
+    assert {type(by_other), type(plain)} == {ServerUnavailableError}
 
 
 async def test_the_synchronous_client_over_tls(
-    serving, server_tls, pem, transport: str, cloud: np.ndarray
+    serve, server_tls, pem, transport: str, cloud: np.ndarray
 ) -> None:
-    async with serving(**server_tls, tokens=[USER]) as server:
-        address = address_of(server, transport)
+    server = (await serve(**server_tls, tokens=[USER])).server
+    address = address_of(server, transport)
 
-        def detect() -> int:
-            with GraspClient(address, tls=Tls(ca=pem["ca"]), token=USER) as client:
-                return len(client.detect(cloud).grasps)
+    def detect() -> int:
+        with GraspClient(address, tls=Tls(ca=pem["ca"]), token=USER) as client:
+            return len(client.detect(cloud).grasps)
 
-        assert await asyncio.to_thread(detect) == 10
+    assert await asyncio.to_thread(detect) == 10
 
 
-async def test_mutual_tls(serving, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
-    async with serving(**server_tls, tls_client_ca=pem["ca"]) as server:
-        address = address_of(server, transport)
-        own = Tls(pem["ca"], pem["client"], pem["client_key"])
-        async with AsyncGraspClient(address, tls=own) as client:
-            assert len((await client.detect(cloud)).grasps) == 10
-        stranger = Tls(pem["ca"], pem["other_client"], pem["other_client_key"])
-        for tls in (Tls(ca=pem["ca"]), stranger):
-            assert isinstance(await refused(address, tls=tls), ServerUnavailableError)
+async def test_mutual_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
+    server = (await serve(**server_tls, tls_client_ca=pem["ca"])).server
+    address = address_of(server, transport)
+    own = Tls(pem["ca"], pem["client"], pem["client_key"])
+    async with AsyncGraspClient(address, tls=own) as client:
+        assert len((await client.detect(cloud)).grasps) == 10
+    stranger = Tls(pem["ca"], pem["other_client"], pem["other_client_key"])
+    for tls in (Tls(ca=pem["ca"]), stranger):
+        assert isinstance(await refused(address, tls=tls), ServerUnavailableError)
 
 
 async def test_certificates_are_read_anew(
-    serving, pem, transport: str, cloud: np.ndarray, tmp_path: Path
+    serve, pem, transport: str, cloud: np.ndarray, tmp_path: Path
 ) -> None:
     """Server's and clients' alike; connections that are open stay, and bad files change nothing."""
     files = {name: tmp_path / f"{name}.pem" for name in ("server", "server_key", "ca")}
@@ -132,30 +125,30 @@ async def test_certificates_are_read_anew(
 
     put("")
     given = {"tls_certificate": files["server"], "tls_key": files["server_key"]}
-    async with serving(**given, tls_client_ca=files["ca"]) as server:
-        address = address_of(server, transport)
-        async with AsyncGraspClient(address, tls=tls("", "")) as before:
-            assert await before.models()
-            put("other_")
-            await server.reloader.reload()
-            async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
-                assert len((await after.detect(cloud)).grasps) == 10
-            assert len((await before.detect(cloud)).grasps) == 10
-        for stranger in (tls("", ""), tls("other_", "")):
-            assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
-        files["server_key"].write_text("half a k")
-        with pytest.raises(ReloadFailed, match="They are no certificate with its key"):
-            await server.reloader.reload()
-        async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
-            assert await still.models()
+    server = (await serve(**given, tls_client_ca=files["ca"])).server
+    address = address_of(server, transport)
+    async with AsyncGraspClient(address, tls=tls("", "")) as before:
+        assert await before.models()
+        put("other_")
+        await server.reloader.reload(ADMINISTRATOR)
+        async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
+            assert len((await after.detect(cloud)).grasps) == 10
+        assert len((await before.detect(cloud)).grasps) == 10
+    for stranger in (tls("", ""), tls("other_", "")):
+        assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
+    files["server_key"].write_text("half a k")
+    with pytest.raises(ReloadFailed, match="They are no certificate with its key"):
+        await server.reloader.reload(ADMINISTRATOR)
+    async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
+        assert await still.models()
 
 
-async def test_no_tls_older_than_1_2(serving, server_tls, pem) -> None:
-    async with serving(**server_tls) as server:
-        context = ssl.create_default_context(cafile=pem["ca"])
-        context.maximum_version = ssl.TLSVersion.TLSv1_2
-        async with httpx.AsyncClient(verify=context) as http:
-            assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
+async def test_no_tls_older_than_1_2(serve, server_tls, pem) -> None:
+    server = (await serve(**server_tls)).server
+    context = ssl.create_default_context(cafile=pem["ca"])
+    context.maximum_version = ssl.TLSVersion.TLSv1_2
+    async with httpx.AsyncClient(verify=context) as http:
+        assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
     loaded = load_tls(Settings(**server_tls))
     assert loaded is not None
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
@@ -197,82 +190,81 @@ def encrypted(pem: dict[str, Path], folder: Path) -> Path:
     return path
 
 
-async def test_tokens(serving, transport: str, cloud: np.ndarray, tmp_path: Path) -> None:
+async def test_tokens(serve, transport: str, cloud: np.ndarray, tmp_path: Path) -> None:
     file = tmp_path / "tokens"
     file.write_text(f"# of the cell\n\n  {SECOND}\n")
-    async with serving(tokens=[USER], token_file=file, admin_tokens=[ADMIN]) as server:
-        address = address_of(server, transport)
-        for token in (USER, SECOND, ADMIN):
-            async with AsyncGraspClient(address, token=token) as client:
-                assert len((await client.detect(cloud)).grasps) == 10
-        for token in (None, WRONG, USER[:-1], USER + "x"):
-            error = await refused(address, token=token)
-            assert isinstance(error, AccessDeniedError)
-            assert "authorization: got" in str(error)
-            assert token is None or token not in str(error)
+    server = (await serve(tokens=[USER], token_file=file, admin_tokens=[ADMIN])).server
+    address = address_of(server, transport)
+    for token in (USER, SECOND, ADMIN):
+        async with AsyncGraspClient(address, token=token) as client:
+            assert len((await client.detect(cloud)).grasps) == 10
+    for token in (None, WRONG, USER[:-1], USER + "x"):
+        error = await refused(address, token=token)
+        assert isinstance(error, AccessDeniedError)
+        assert "authorization: got" in str(error)
+        assert token is None or token not in str(error)
 
 
 PROTECTED = [
     *("/v1/models", "/v1/grasps", "/v1/grasps:score", "/v1/models:reload"),
-    *("/metrics", "/docs", "/openapi.json", "/none", "//health/live", "/health/live/"),
+    *("/metrics", "/none", "//health/live", "/health/live/", "/docs/", "//docs", "/docs/none"),
 ]
 
 
-async def test_only_probes_are_open(serving) -> None:
-    async with serving(tokens=[USER], admin_tokens=[ADMIN]) as server:
-        async with httpx.AsyncClient(base_url=server.http_url) as http:
-            for path in ("/health/live", "/health/ready"):
-                assert (await http.get(path)).status_code == 200
-            for path in PROTECTED:
-                answer = await http.get(server.http_url + path)
-                assert answer.status_code == 401, path
-                assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
-                assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
-            basic = await http.get("/v1/models", auth=("user", USER))
-            assert basic.json()["value"] == "another scheme than Bearer"
-        async with aio.insecure_channel(server.grpc_address) as channel:
-            health = health_pb2_grpc.HealthStub(channel)
-            status = (await health.Check(health_pb2.HealthCheckRequest())).status
-            assert status == health_pb2.HealthCheckResponse.SERVING
-            reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
-            request = reflection_pb2.ServerReflectionRequest(list_services="")
-            unknown = channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)
-            for call in (reflection.ServerReflectionInfo(iter([request])), unknown(b"")):
-                assert await call.code() == StatusCode.UNAUTHENTICATED
-
-
-async def test_a_refused_request_is_not_read(serving) -> None:
-    """Without a token, a body over the limit is refused for the token, not for its size."""
-    async with serving(tokens=[USER], max_body_bytes=1024) as server:
-        stub_request = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))
-        async with aio.insecure_channel(server.grpc_address) as channel:
-            call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(stub_request)
+async def test_only_probes_are_open(serve) -> None:
+    server = (await serve(tokens=[USER], admin_tokens=[ADMIN])).server
+    async with httpx.AsyncClient(base_url=server.http_url) as http:
+        for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
+            assert (await http.get(path)).status_code == 200
+        for path in PROTECTED:
+            answer = await http.get(server.http_url + path)
+            assert answer.status_code == 401, path
+            assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
+            assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
+        basic = await http.get("/v1/models", auth=("user", USER))
+        assert basic.json()["value"] == "another scheme than Bearer"
+    async with aio.insecure_channel(server.grpc_address) as channel:
+        health = health_pb2_grpc.HealthStub(channel)
+        status = (await health.Check(health_pb2.HealthCheckRequest())).status
+        assert status == health_pb2.HealthCheckResponse.SERVING
+        reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
+        request = reflection_pb2.ServerReflectionRequest(list_services="")
+        unknown = channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)
+        for call in (reflection.ServerReflectionInfo(iter([request])), unknown(b"")):
             assert await call.code() == StatusCode.UNAUTHENTICATED
-            detail = dict(await call.trailing_metadata())["edgegrasp-error-bin"]
-            assert grasp_pb2.ErrorDetail.FromString(detail).kind == "unauthenticated"
 
 
-async def test_no_token_reaches_a_log_or_an_answer(
-    serving, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_refused_request_is_not_read(serve) -> None:
+    """Without a token, a body over the limit is refused for the token, not for its size."""
+    server = (await serve(tokens=[USER], max_body_bytes=1024)).server
+    stub_request = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))
+    async with aio.insecure_channel(server.grpc_address) as channel:
+        call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(stub_request)
+        assert await call.code() == StatusCode.UNAUTHENTICATED
+        detail = dict(await call.trailing_metadata())["edgegrasp-error-bin"]
+        assert grasp_pb2.ErrorDetail.FromString(detail).kind == "unauthenticated"
+
+
+async def test_no_token_reaches_a_log_or_an_answer(serve, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
-    async with serving(tokens=[USER], admin_tokens=[ADMIN]) as server:
-        for token in (USER, ADMIN, WRONG):
-            headers = {"authorization": f"Bearer {token}"}
-            async with httpx.AsyncClient(base_url=server.http_url, headers=headers) as http:
-                for path in ("/v1/models", "/metrics", "/none"):
-                    answer = await http.get(path)
-                    assert token not in answer.text + str(answer.headers)
-            async with AsyncGraspClient(server.grpc_address, token=token) as client:
-                await asyncio.gather(client.models(), return_exceptions=True)
+    server = (await serve(tokens=[USER], admin_tokens=[ADMIN])).server
+    for token in (USER, ADMIN, WRONG):
+        headers = {"authorization": f"Bearer {token}"}
+        async with httpx.AsyncClient(base_url=server.http_url, headers=headers) as http:
+            for path in ("/v1/models", "/metrics", "/none"):
+                answer = await http.get(path)
+                assert token not in answer.text + str(answer.headers)
+        async with AsyncGraspClient(server.grpc_address, token=token) as client:
+            await asyncio.gather(client.models(), return_exceptions=True)
     ours = [record for record in caplog.records if record.name.startswith("edgegrasp")]
     assert len(ours) > 6
     assert not any(token in str(vars(record)) for record in ours for token in (USER, ADMIN, WRONG))
     assert USER not in repr(Settings(tokens=[USER])) + str(Settings(tokens=[USER]))
 
 
-async def test_no_other_origin_is_let_in(serving) -> None:
-    async with serving() as server, httpx.AsyncClient(base_url=server.http_url) as http:
+async def test_no_other_origin_is_let_in(serve) -> None:
+    server = (await serve()).server
+    async with httpx.AsyncClient(base_url=server.http_url) as http:
         headers = {"origin": "http://evil.example", "access-control-request-method": "POST"}
         for answer in (
             await http.options("/v1/grasps", headers=headers),
@@ -281,10 +273,10 @@ async def test_no_other_origin_is_let_in(serving) -> None:
             assert not [name for name in answer.headers if name.startswith("access-control")]
 
 
-async def test_only_this_machine_by_default(serving) -> None:
-    async with serving() as server:
-        assert server.grpc_address.startswith("127.0.0.1:")
-        assert server.http_url.startswith("http://127.0.0.1:")
+async def test_only_this_machine_by_default(serve) -> None:
+    server = (await serve()).server
+    assert server.grpc_address.startswith("127.0.0.1:")
+    assert server.http_url.startswith("http://127.0.0.1:")
 
 
 def test_the_client_refuses_what_cannot_be() -> None:
@@ -303,36 +295,23 @@ def test_the_client_refuses_what_cannot_be() -> None:
 
 
 @pytest.mark.parametrize("secure", ["plain", "tls", "client certificates"])
-async def test_the_containers_health_check(serving, server_tls, pem, secure: str) -> None:
+async def test_the_containers_health_check(serve, server_tls, pem, secure: str) -> None:
     given: dict[str, Any] = {} if secure == "plain" else dict(server_tls)
     if secure == "client certificates":
         given["tls_client_ca"] = pem["ca"]
-    async with serving(**given, tokens=[USER]) as server:
-        port = int(server.http_url.rpartition(":")[2])
-        settings = Settings(**given, http_port=port)
-        assert await asyncio.to_thread(is_ready, settings)
-    assert not is_ready(settings)
-
-
-async def test_the_health_check_waits_for_weights() -> None:
-    may_load = threading.Event()
-
-    def load() -> DummyCatalogue:
-        assert may_load.wait(20)
-        return DummyCatalogue()
-
-    settings = Settings(http_port=0, grpc_port=0, grace_seconds=1.0)
-    server = Server(settings, GraspService(load, settings))
-    opened, ready, stop = (asyncio.Event() for _ in range(3))
-    running = asyncio.create_task(server.serve(stop, opened.set, ready.set))
-    await opened.wait()
+    server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
+    settings = Settings(**given, http_port=port)
+    assert await asyncio.to_thread(is_ready, settings)
+
+
+async def test_the_health_check_waits_for_weights(begin) -> None:
+    running, ready = await begin(lambda stages: stages.shut("load"))
+    port = int(running.server.http_url.rpartition(":")[2])
     assert not await asyncio.to_thread(is_ready, Settings(http_port=port))
-    may_load.set()
+    running.stages.open("load")
     await ready.wait()
     assert await asyncio.to_thread(is_ready, Settings(http_port=port, host="0.0.0.0"))
-    stop.set()
-    await running
 
 
 @pytest.mark.parametrize(
@@ -348,6 +327,11 @@ async def test_the_health_check_waits_for_weights() -> None:
 def test_a_server_that_others_can_reach_warns(
     given: dict[str, Any], warned: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    warn_of_strangers(Settings(**given))
+    warn(Settings(**given))
     assert len(caplog.messages) == len(warned)
     assert all(said in message for said, message in zip(warned, caplog.messages, strict=True))
+
+
+def test_a_folder_without_weights_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    warn(Settings(weights=[tmp_path]))
+    assert str(tmp_path) in caplog.text

@@ -11,8 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp_service.errors import InvalidSettings
-from edgegrasp_service.settings import SECRETS, Settings, load_settings, load_settings_and_origins
-from edgegrasp_service.settings_text import config_text
+from edgegrasp_service.settings import (
+    SECRETS,
+    Settings,
+    config_text,
+    load_settings,
+    load_settings_and_origins,
+)
 
 TOKEN = "a-token-of-enough-letters"
 

@@ -1,19 +1,13 @@
 """One span for each request and one for each of its stages, over both transports."""
 
 import httpx
-import numpy as np
 import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_service.call import Call
-from edgegrasp_service.core import GraspService
-from edgegrasp_service.dummy import DummyCatalogue
 from edgegrasp_service.errors import DetectorFailed, InvalidSettings, report
-from edgegrasp_service.observer import Observer
-from edgegrasp_service.observers import Observers
-from edgegrasp_service.settings import Settings
-from edgegrasp_service.tracing import Tracer, otlp_provider
+from edgegrasp_service.observability import Tracer, otlp_provider
 
 pytest.importorskip("opentelemetry.sdk", reason="the extra `otel` is not installed")
 
@@ -40,22 +34,20 @@ def tracer(exporter: InMemorySpanExporter) -> Tracer:
     return Tracer(provider)
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
-async def test_a_span_for_each_stage(
-    serving, exporter, tracer: Tracer, transport: str, cloud: np.ndarray
-) -> None:
-    service = GraspService(DummyCatalogue, Settings(), tracer)
-    async with serving(service) as server:
-        if transport == "rest":
-            async with httpx.AsyncClient(base_url=server.http_url) as http:
-                body = {"points": cloud.tolist()}
-                answer = await http.post("/v1/grasps", json=body, headers=HEADERS)
-            assert answer.status_code == 200
-        else:
-            async with aio.insecure_channel(server.grpc_address) as channel:
-                request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
-                stub = grasp_pb2_grpc.GraspServiceStub(channel)
-                await stub.DetectGrasps(request, metadata=tuple(HEADERS.items()))
+async def test_a_span_for_each_stage(serve, exporter, tracer, transport: str, cloud) -> None:
+    running = await serve()
+    if transport == "rest":
+        async with httpx.AsyncClient(base_url=running.server.http_url) as http:
+            body = {"points": cloud.tolist()}
+            answer = await http.post("/v1/grasps", json=body, headers=HEADERS)
+        assert answer.status_code == 200
+    else:
+        async with aio.insecure_channel(running.server.grpc_address) as channel:
+            request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+            stub = grasp_pb2_grpc.GraspServiceStub(channel)
+            await stub.DetectGrasps(request, metadata=tuple(HEADERS.items()))
+    await running.until(lambda: len(running.calls) == 1)
+    tracer.trace_call(running.calls[0])
     spans = {span.name: span for span in exporter.get_finished_spans()}
     root = spans.pop("DetectGrasps")
     assert {"admission", "decode", "prepare", "finish"} <= set(spans)
@@ -72,55 +64,24 @@ async def test_a_span_for_each_stage(
 
 
 def test_a_fault_marks_the_span(exporter, tracer: Tracer) -> None:
-    call = Call("grpc", "DetectGrasps")
-    tracer.started(call)
-    tracer.finished(call, report(DetectorFailed("why")))
-    tracer.stage(call, "decode", 0.1)  # late: there is nothing to add it to
-    tracer.finished(call, None)
-    (span,) = exporter.get_finished_spans()
-    assert span.status.description == "detector-failed"
-    assert span.parent is None
+    call = Call("grpc", "DetectGrasps", problem=report(DetectorFailed("why")))
+    call.end_stage("admission")
+    tracer.trace_call(call)
+    tracer.trace_call(Call("http", "Live"))  # has none
+    root = exporter.get_finished_spans()[-1]
+    assert (root.name, root.status.description) == ("DetectGrasps", "detector-failed")
+    assert root.parent is None
 
 
 @pytest.mark.parametrize("header", ["", "nonsense", "00-" + "0" * 32 + "-" + "0" * 16 + "-01"])
-async def test_a_bad_traceparent_begins_a_trace(
-    serving, exporter, tracer: Tracer, header: str, cloud: np.ndarray
-) -> None:
-    async with (
-        serving(GraspService(DummyCatalogue, Settings(), tracer)) as server,
-        httpx.AsyncClient(base_url=server.http_url) as http,
-    ):
-        body = {"points": cloud.tolist()}
-        answer = await http.post("/v1/grasps", json=body, headers={"traceparent": header})
-        assert answer.status_code == 200
-    root = next(span for span in exporter.get_finished_spans() if span.name == "DetectGrasps")
-    assert root.parent is None
+def test_a_bad_traceparent_begins_a_trace(exporter, tracer: Tracer, header: str) -> None:
+    call = Call("http", "DetectGrasps", traceparent=header)
+    call.end_stage("admission")
+    tracer.trace_call(call)
+    assert exporter.get_finished_spans()[-1].parent is None
 
 
 def test_without_the_packages_the_setting_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "opentelemetry.sdk.trace", None)
     with pytest.raises(InvalidSettings, match=r"otlp_endpoint: got .*edgegrasp\[otel\]"):
         otlp_provider("http://127.0.0.1:4318/v1/traces")
-
-
-async def test_a_failing_observer_harms_nobody(
-    serving, exporter, tracer: Tracer, cloud: np.ndarray, caplog: pytest.LogCaptureFixture
-) -> None:
-    class Failing(Observer):
-        def started(self, call: Call) -> None:
-            raise ValueError("an observer's own fault")
-
-    observers = Observers([Failing(), tracer])
-    async with (
-        serving(GraspService(DummyCatalogue, Settings(), observers)) as server,
-        httpx.AsyncClient(base_url=server.http_url) as http,
-    ):
-        answer = await http.post("/v1/grasps", json={"points": cloud.tolist()})
-        assert answer.status_code == 200
-    assert "DetectGrasps" in {span.name for span in exporter.get_finished_spans()}
-    assert "Failing failed on started" in caplog.text
-
-
-def test_observers_pass_everything_on() -> None:
-    told = {name for name in vars(Observer) if not name.startswith("_")}
-    assert {name for name in vars(Observers) if not name.startswith("_")} == told

@@ -144,8 +144,8 @@ def test_errors_on_a_cluster_are_those_of_a_process_here(
     cause = PlannerUnavailableError("gone for good")
     fake = MagicMock(exceptions=ray.exceptions)
     fake.cluster_resources.return_value = {"CPU": 1.0}
-    fake.wait.side_effect = lambda running: (running[:1], running[1:])
-    fake.get.side_effect = kind("run", "traceback", cause) if error == "RayTaskError" else kind()
+    failed = kind("run", "traceback", cause) if error == "RayTaskError" else kind()
+    fake.util.ActorPool.return_value.map_unordered.side_effect = failed
     monkeypatch.setitem(sys.modules, "ray", fake)
     with pytest.raises(expected, match=message):
         run_benchmark(alone[0], make_planner, ray="local")

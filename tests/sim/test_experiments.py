@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from edgegrasp_sim.experiments import EXPERIMENTS, Case
+from edgegrasp_sim.experiments import EXPERIMENTS, Case, cases_of
 from edgegrasp_sim.objects import FAMILIES, SceneKind
 from edgegrasp_sim.protocol import load_protocol
 
@@ -13,7 +13,7 @@ PAPER = load_protocol("edgegrasp")
 
 def cases(name: str, folder: Path) -> list[Case]:
     model = "runs/3000/edgegrasp-plus.safetensors" if name == "labels" else "edgegrasp-plus"
-    return EXPERIMENTS[name](PAPER, list(SceneKind), [model], folder)
+    return cases_of(name, PAPER, list(SceneKind), [model], folder)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -42,14 +42,14 @@ def test_robustness_changes_one_thing_at_a_time(tmp_path: Path) -> None:
 
 def test_labels_are_what_the_folders_say(tmp_path: Path) -> None:
     models = ["runs/900/plus.safetensors", "runs/3000/plus.safetensors"]
-    found = EXPERIMENTS["labels"](PAPER, [SceneKind.PILE], models, tmp_path)
+    found = cases_of("labels", PAPER, [SceneKind.PILE], models, tmp_path)
     assert [(case.value, case.planner) for case in found] == [
         (900.0, {"model": models[0]}),
         (3000.0, {"model": models[1]}),
     ]
     for model in ("edgegrasp-plus", "runs/new/plus.safetensors"):
         with pytest.raises(ValueError, match=rf"{model}.*runs/3000/"):
-            EXPERIMENTS["labels"](PAPER, [SceneKind.PILE], [model], tmp_path)
+            cases_of("labels", PAPER, [SceneKind.PILE], [model], tmp_path)
 
 
 def test_families_have_folders_of_their_own_and_keep_their_size(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.examples import (
     SUPPORT,
     TRIED_WEIGHT,
-    SoftLabels,
     hand_batch,
     pack_balls,
     tried_grasps,
@@ -108,8 +107,6 @@ def test_a_view_without_points_teaches_nothing(made_up_view, teacher, tmp_path) 
     )
     empty.save(tmp_path / "packed_0_0.npz")
     assert len(teacher.soft_labels(tmp_path / "packed_0_0.npz").chance) == 0
-    SoftLabels.none().save(tmp_path / "none.npz")
-    assert len(SoftLabels.load(tmp_path / "none.npz").approach) == 0
 
 
 def test_soft_labels_are_packed_beside_the_labels_which_weigh_more(

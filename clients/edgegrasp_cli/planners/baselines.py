@@ -1,6 +1,6 @@
 """Planners without a network, Edge-Sample and an oracle, and the candidates they choose from."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -100,7 +100,7 @@ class OraclePlanner:
         for pose in poses:
             if not self._holds(pose):
                 continue
-            if all(self._holds(_shifted(pose, *shift)) for shift in SHIFTS):
+            if all(self._holds(shifted) for shifted in _shifted(pose)):
                 return PlannedGrasp(pose, 1.0, MAX_OPENING)
             if fallback.score == 0.0:
                 fallback = PlannedGrasp(pose, 0.5, MAX_OPENING)
@@ -112,10 +112,11 @@ class OraclePlanner:
         return self._try_grasp(pose).success
 
 
-def _shifted(pose: Float32, along_x: float, along_y: float) -> Float32:
-    shifted = pose.copy()
-    shifted[:3, 3] += along_x * pose[:3, 0] + along_y * pose[:3, 1]
-    return shifted
+def _shifted(pose: Float32) -> Iterator[Float32]:
+    for along_x, along_y in SHIFTS:
+        shifted = pose.copy()
+        shifted[:3, 3] += along_x * pose[:3, 0] + along_y * pose[:3, 1]
+        yield shifted
 
 
 @dataclass(frozen=True)
@@ -235,10 +236,11 @@ def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
         The mean of the points and normals in each voxel; normals are of either sign.
     """
     dense = points.astype(np.float64)
-    for keep in (_statistical_outlier_removal, _radius_outlier_removal):
-        if len(dense) < MIN_POINTS:
-            return None
-        dense = dense[keep(dense)]
+    if len(dense) >= MIN_POINTS:  # statistical outliers
+        mean = _nearest(dense)[0].mean(axis=1)
+        dense = dense[mean < mean.mean() + OUTLIER_DEVIATIONS * mean.std(ddof=1)]
+    if len(dense) >= MIN_POINTS:  # isolated points
+        dense = dense[_nearest(dense, NEIGHBORS + 1)[0][:, -1] <= ISOLATED]
     if len(dense) < MIN_POINTS:
         return None
     normals = estimate_normals(dense)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from edgegrasp_cli.flags import connect
 from edgegrasp_sim.protocol import PlanningRules
@@ -47,14 +47,6 @@ class PlannerChoice:
     options: dict[str, Any] = field(default_factory=dict)
     voxel_size: float | None = None
     flipped_normals: float = 0.0
-
-    def sampling(self) -> dict[str, int]:
-        """The protocol's sampling that is changed."""
-        return {name: self.options[name] for name in SAMPLING if name in self.options}
-
-    def request_options(self) -> dict[str, Any]:
-        """Of each request for grasps."""
-        return {"collision": "penalise"} | self.options
 
     def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
         """The weights to load, and the name to ask for.
@@ -93,7 +85,8 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
     """Find a planner for a protocol; a server of its own runs as long as the context.
 
     Raises:
-        ValueError: no such planner, or weights that cannot be used.
+        ValueError: no such planner, or no such file of weights.
+        EdgeGraspError: weights that cannot be used.
         GraspClientError: the server does not answer.
     """
     only_in_process = choice.voxel_size is not None or choice.flipped_normals > 0
@@ -104,12 +97,8 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
     if choice.name == "server":
         with _server(choice, rules) as planner:
             yield planner
-    elif choice.name == "in-process":
-        yield _in_process(choice, rules)
-    elif choice.name in ("edge-sample", "oracle"):
-        yield _on_paper_candidates(choice, rules)
-    elif choice.name == "oracle-own":
-        yield _on_own_candidates(choice, rules)
+    elif choice.name in SHIPPED:
+        yield _in_this_process(choice, rules)
     else:
         make = partial(named_planner, choice.name)
         make()  # a wrong name fails here, not in every worker
@@ -126,23 +115,20 @@ def named_planner(name: str) -> Planner:
     """
     installed = entry_points(group=GROUP)
     module, colon, attribute = name.partition(":")
-    if name not in installed.names and not (module and colon and attribute):
-        known = [*SHIPPED, *sorted(installed.names)]
-        raise ValueError(
-            f"planner is {name!r}; choose one of {', '.join(known)}, or module:callable"
-        )
     try:
         if name in installed.names:
             found = installed[name].load()
-        else:
+        elif module and colon and attribute:
             found = getattr(importlib.import_module(module), attribute)
+        else:
+            known = ", ".join([*SHIPPED, *sorted(installed.names)])
+            raise ValueError(f"planner is {name!r}; choose one of {known}, or module:callable")
     except (ImportError, AttributeError) as error:
         raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
     planner: Any = found() if isinstance(found, type) else found
     if not callable(planner):
         raise ValueError(f"planner {name!r} is no callable; name a function or a class")
-    made: Planner = planner
-    return made
+    return cast("Planner", planner)
 
 
 @contextmanager
@@ -153,7 +139,7 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.weights_and_model()
-    options = choice.request_options()
+    options = {"collision": "penalise"} | choice.options
     flags = [text for path in weights for text in ("--weights", str(path))]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
@@ -173,64 +159,41 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
         )
 
 
-def _in_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
+def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
+    """A planner with the detector, or of random candidates: the paper's or our own."""
+    from edgegrasp_cli.planners.baselines import (
+        MAX_TRIES,
+        EdgeSamplePlanner,
+        OraclePlanner,
+        OwnCandidates,
+        PaperCandidates,
+    )
     from edgegrasp_cli.planners.detection import InProcessPlanner
+    from edgegrasp_model.detector import ModelCatalogue
 
+    facts: dict[str, Any] = {"name": choice.name}
+    sampling = {name: choice.options[name] for name in SAMPLING if name in choice.options}
+    if choice.name in ("edge-sample", "oracle"):
+        numbers = {name: getattr(rules, name) for name in SAMPLING} | sampling
+        sampler = PaperCandidates(**numbers, voxel_size=rules.voxel_size)
+        facts |= {"candidates": "paper", **sampling}
+        if choice.name == "edge-sample":
+            return ChosenPlanner(partial(EdgeSamplePlanner, sampler), facts)
+        return ChosenPlanner(partial(OraclePlanner, sampler), facts | {"max_tries": MAX_TRIES})
     weights, model = choice.weights_and_model()
-    used = _metadata(weights, model)
-    options = choice.request_options()
+    used = ModelCatalogue.load(weights).get(model).metadata
+    if choice.name == "oracle-own":
+        options = {"collision": "avoid", **sampling}
+        own = OwnCandidates(rules, options, weights, model)
+        facts |= {"candidates": "own", "voxel_size": used.voxel_size, "max_tries": MAX_TRIES}
+        return ChosenPlanner(partial(OraclePlanner, own), facts | {"options": options})
     changes: dict[str, Any] = {}
     if choice.voxel_size is not None:
         changes["voxel_size"] = choice.voxel_size
     if choice.flipped_normals > 0:
         changes["flipped_normals"] = choice.flipped_normals
-    facts = {"model": used.name, "digest": used.digest, "options": options, **changes}
+    options = {"collision": "penalise"} | choice.options
+    facts |= {"model": used.name, "digest": used.digest, "options": options, **changes}
     return ChosenPlanner(
-        partial(InProcessPlanner, weights, model, rules, options, **changes),
-        {"name": choice.name, **facts},
+        partial(InProcessPlanner, weights, model, rules, options, **changes), facts
     )
-
-
-def _on_paper_candidates(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
-    from edgegrasp_cli.planners.baselines import (
-        MAX_TRIES,
-        EdgeSamplePlanner,
-        OraclePlanner,
-        PaperCandidates,
-    )
-
-    numbers = {name: getattr(rules, name) for name in SAMPLING} | choice.sampling()
-    sampler = PaperCandidates(**numbers, voxel_size=rules.voxel_size)
-    facts = {"name": choice.name, "candidates": "paper", **choice.sampling()}
-    if choice.name == "edge-sample":
-        return ChosenPlanner(partial(EdgeSamplePlanner, sampler), facts)
-    return ChosenPlanner(partial(OraclePlanner, sampler), facts | {"max_tries": MAX_TRIES})
-
-
-def _on_own_candidates(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
-    from edgegrasp_cli.planners.baselines import MAX_TRIES, OraclePlanner, OwnCandidates
-
-    weights, model = choice.weights_and_model()
-    used = _metadata(weights, model)
-    options = {"collision": "avoid", **choice.sampling()}
-    return ChosenPlanner(
-        partial(OraclePlanner, OwnCandidates(rules, options, weights, model)),
-        {
-            "name": choice.name,
-            "candidates": "own",
-            "voxel_size": used.voxel_size,
-            "max_tries": MAX_TRIES,
-            "options": options,
-        },
-    )
-
-
-def _metadata(weights: tuple[Path, ...], model: str) -> Any:
-    """The metadata of the weights that a name stands for."""
-    from edgegrasp_model.detector import ModelCatalogue
-    from edgegrasp_model.errors import EdgeGraspError
-
-    try:
-        return ModelCatalogue.load(weights).get(model).metadata
-    except EdgeGraspError as error:
-        raise ValueError(str(error)) from error

@@ -1,10 +1,9 @@
 """Planners that ask a detector, on a server or in this process, and which grasp they take."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,15 +137,21 @@ class InProcessPlanner:
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The best grasp; None where there is none."""
+        import torch
+
         from edgegrasp_model.options import parse_options
         from edgegrasp_model.scene.cloud import CloudInput
 
         options = parse_options(request_options(observation, seed, self._rules, self._options))
         cloud = CloudInput(observation.cloud, view_ids=view_ids(observation))
-        with _one_thread():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # sums then do not depend on how many there are elsewhere
+        try:
             if self._flipped_normals > 0:
                 cloud = self._with_flipped_normals(cloud, options)
             detection = self._detector.detect(cloud, options)
+        finally:
+            torch.set_num_threads(threads)
         return _planned(detection.grasps, self._rules, observation)
 
     def _with_flipped_normals(self, cloud: "CloudInput", options: "DetectOptions") -> "CloudInput":
@@ -168,19 +173,6 @@ class InProcessPlanner:
         return replace(cloud, normals=normals)
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch use one thread: sums then do not depend on how many there are elsewhere."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def model_used(client: GraspClient, name: str) -> Model:
     """The model that a request naming `name` gets; the default for an empty one.
 
@@ -195,22 +187,6 @@ def model_used(client: GraspClient, name: str) -> Model:
     raise GraspClientError(f"model is {name!r}; the server has {known}")
 
 
-class Scored(Protocol):
-    """A grasp with what it is chosen by."""
-
-    @property
-    def score(self) -> float: ...  # noqa: D102
-    @property
-    def width(self) -> float: ...  # noqa: D102
-    @property
-    def T_cloud_hand(self) -> NDArray[np.float32]: ...  # noqa: D102, N802  # (4, 4)
-    @property
-    def T_cloud_tcp(self) -> NDArray[np.float32]: ...  # noqa: D102, N802  # (4, 4)
-
-
-G = TypeVar("G", bound=Scored)
-
-
 def request_options(
     observation: Observation, seed: int, rules: PlanningRules, extra: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -220,35 +196,33 @@ def request_options(
     """
     low, high = observation.workspace.tolist()
     positions = observation.camera_positions.tolist()
+    support: dict[str, Any] = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
+    if observation.table == "ransac":
+        support = {"kind": "ransac"}
+    elif observation.table == "seen":
+        support["max_depth_error"] = MAX_DEPTH_ERROR
     options: dict[str, Any] = {
         "seed": seed,
         "num_approach_points": rules.num_approach_points,
         "num_candidates": rules.num_candidates,
         "viewpoint": positions[0] if len(positions) == 1 else positions,
-        "support": _support(observation),
+        "support": support,
         "workspace": {"min": low, "max": high},
         "top_k": 1 if rules.selection == "best" else CHOICE,
     }
     return options | dict(extra)
 
 
-def _support(observation: Observation) -> dict[str, Any]:
-    if observation.table == "ransac":
-        return {"kind": "ransac"}
-    plane = {"normal": (0.0, 0.0, 1.0), "offset": observation.table_height}
-    return plane | ({"max_depth_error": MAX_DEPTH_ERROR} if observation.table == "seen" else {})
-
-
 def select_grasp(
-    grasps: Sequence[G], rules: PlanningRules, failed: NDArray[np.floating]
-) -> G | None:
+    grasps: Sequence[Any], rules: PlanningRules, failed: NDArray[np.floating]
+) -> Any | None:
     """The grasp a protocol takes of those given best first; None if there is none.
 
     `highest`: of those with `min_score` or more, if there are any, that whose TCP is highest.
     `elsewhere`: the best, where scores near grips that failed before are worth less.
 
     Args:
-        grasps: Best first.
+        grasps: Of the client or of the detector, best first.
         rules: Of the protocol.
         failed: (F, 4, 4) T_world_hand of the grasps of this round that failed.
     """
@@ -270,13 +244,13 @@ def view_ids(observation: Observation) -> NDArray[np.int32] | None:
 
 
 def _planned(
-    grasps: Sequence[G], rules: PlanningRules, observation: Observation
+    grasps: Sequence[Any], rules: PlanningRules, observation: Observation
 ) -> PlannedGrasp | None:
     best = select_grasp(grasps, rules, observation.failed)
     return PlannedGrasp(best.T_cloud_hand, best.score, best.width) if best else None
 
 
-def _worth(grasp: Scored, T_cloud_failed: NDArray[np.floating]) -> float:
+def _worth(grasp: Any, T_cloud_failed: NDArray[np.floating]) -> float:
     """A grasp's score, less near TCP poses (F, 4, 4) at which a grasp has failed."""
     T_cloud_tcp = grasp.T_cloud_tcp
     distance = np.linalg.norm(T_cloud_failed[:, :3, 3] - T_cloud_tcp[:3, 3], axis=1)

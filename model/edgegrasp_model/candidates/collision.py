@@ -38,7 +38,7 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
     if scene.support is not None:
         hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
-    if len(scene.obstacles):
+    if scene.obstacles is not None:
         hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
     return hit
 
@@ -105,15 +105,8 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
     nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
     if scene.support is not None:
         nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
-    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
-    for place in range(len(scene.obstacles)):
-        box = scene.obstacles.take(np.full(len(hands), place))
-        # A bound that costs little leaves few boxes to measure exactly.
-        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
-        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
-        distance = np.full(len(hands), np.inf)
-        distance[near] = signed_distance(hands.take(near), box.take(near))
-        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
+    if scene.obstacles is not None:
+        nearest = _nearest_obstacle(scene.obstacles, T_cloud_hand, boxes, nearest)
     return nearest.astype(np.float32)
 
 
@@ -144,6 +137,22 @@ def _swept_over(position: Float32, lift: Float32, low: Float64, high: Float64) -
     one, other = (position - high) / step, (position - low) / step  # shares of the way
     enter, leave = np.minimum(one, other).max(axis=1), np.maximum(one, other).min(axis=1)
     return np.asarray((enter < leave) & (enter < 1.0) & (leave > 0.0))
+
+
+def _nearest_obstacle(
+    obstacles: SolidBoxes, T_cloud_hand: Float32, boxes: Float64, nearest: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """The distances `nearest` (E,), or those of obstacles that are nearer."""
+    hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
+    for place in range(len(obstacles)):
+        box = obstacles.take(np.full(len(hands), place))
+        # A bound that costs little leaves few boxes to measure exactly.
+        gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
+        near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
+        distance = np.full(len(hands), np.inf)
+        distance[near] = signed_distance(hands.take(near), box.take(near))
+        nearest = np.minimum(nearest, distance.reshape(len(nearest), len(boxes)).min(axis=1))
+    return nearest
 
 
 def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -> Bools:

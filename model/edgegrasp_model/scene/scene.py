@@ -45,7 +45,7 @@ class Scene:
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
     support: SupportPlane | None
-    obstacles: SolidBoxes
+    obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
@@ -106,6 +106,7 @@ def build_scene(
     number = np.where(kept, np.cumsum(kept) - 1, -1)
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
     point_of_row[sent.row] = number[voxels.voxel]
+    obstacles = options.collision.obstacles
     return Scene(
         frame=frame,
         cloud=cloud,
@@ -116,7 +117,7 @@ def build_scene(
         support=None if support is None else plane_in_frame(support, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
         viewpoint=single_viewpoint(viewpoints, frame),
-        obstacles=SolidBoxes.from_shapes(options.collision.obstacles, frame),
+        obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )
 
 

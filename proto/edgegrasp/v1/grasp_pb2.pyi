@@ -548,8 +548,12 @@ Global___Intrinsics: _TypeAlias = Intrinsics  # noqa: Y015
 
 @_typing.final
 class DetectOptions(_message.Message):
-    """What a caller may ask of one detection. The order is that of the options elsewhere; the numbers
-    tell what was there first.
+    """The messages between the marks follow from DetectOptions in edgegrasp_model.options: edit that, and
+    run `make proto`.
+
+    generated: begin options
+
+    Options of one detection; the defaults suit a tabletop scene seen by one camera.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -574,36 +578,38 @@ class DetectOptions(_message.Message):
     ORDER_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
     model: _builtins.str
-    """Weights to use, one of ListModels; empty: the server's default."""
+    """Weights to use; empty: the server's default."""
     num_approach_points: _builtins.int
     """Approach points sampled."""
     num_candidates: _builtins.int
     """Candidates scored at most."""
     sampling: _builtins.str
-    """How approach points are sampled: "farthest" or "uniform"."""
+    """How approach points are sampled. One of "farthest", "uniform"."""
     seed: _builtins.int
-    """Seed of every random choice: same cloud, options and seed, same grasps."""
+    """Seed of every random choice."""
     min_score: _builtins.float
-    """Lowest score returned, in [0, 1]."""
+    """Lowest score returned."""
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """What comes first: "score"; "highest", the highest TCP along up among scores of 0.9 and more;
-    or "clearance".
+    """What comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
+    others by score; or the clearance. One of "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
     @_builtins.property
     def gripper(self) -> Global___GripperChoice:
-        """Absent: the gripper the weights were trained for."""
+        """Name of a gripper, or a gripper; absent: the one the weights were trained for."""
 
     @_builtins.property
     def viewpoint(self) -> _containers.RepeatedCompositeFieldContainer[Global___Vector]:
-        """Camera position, metres; orients the normals. Several: `view_ids` says which saw each point."""
+        """Camera position, metres; orients the normals. Several positions: `view_ids` beside the cloud
+        says which one saw each point.
+        """
 
     @_builtins.property
     def up(self) -> Global___Vector:
-        """Direction away from gravity; of any length but zero."""
+        """Direction away from gravity; any length but zero."""
 
     @_builtins.property
     def support(self) -> Global___Support:
@@ -611,7 +617,7 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def workspace(self) -> Global___Workspace:
-        """Points outside are dropped first."""
+        """Points outside are dropped."""
 
     @_builtins.property
     def approach_region(self) -> Global___Region:
@@ -627,11 +633,11 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def collision(self) -> Global___Collision:
-        """What the hand must not meet."""
+        """What the hand must not meet; a bare mode will do."""
 
     @_builtins.property
     def suppression(self) -> Global___Suppression:
-        """Non-maximum suppression."""
+        """Non-maximum suppression; disabled: none."""
 
     def __init__(
         self,
@@ -700,8 +706,737 @@ class DetectOptions(_message.Message):
 Global___DetectOptions: _TypeAlias = DetectOptions  # noqa: Y015
 
 @_typing.final
+class GripperGeometry(_message.Message):
+    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    MAX_OPENING_FIELD_NUMBER: _builtins.int
+    TIP_Z_FIELD_NUMBER: _builtins.int
+    CONTACT_Z_FIELD_NUMBER: _builtins.int
+    TCP_Z_FIELD_NUMBER: _builtins.int
+    HAND_FIELD_NUMBER: _builtins.int
+    FINGER_FIELD_NUMBER: _builtins.int
+    SWING_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """Shown in results."""
+    max_opening: _builtins.float
+    """Metres between the open fingers' inner faces."""
+    tip_z: _builtins.float
+    """Fingertips of the open gripper, metres along z."""
+    contact_z: _builtins.float
+    """Where contacts are put, metres along z; between palm and fingertips."""
+    tcp_z: _builtins.float
+    """Origin of the TCP frame, metres along z."""
+    @_builtins.property
+    def hand(self) -> Global___HandPart:
+        """The hand without its fingers."""
+
+    @_builtins.property
+    def finger(self) -> Global___HandPart:
+        """One finger, its inner face at y = 0; mirrored."""
+
+    @_builtins.property
+    def swing(self) -> Global___Swing:
+        """How the fingers swing; absent: they close in a straight line."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str | None = ...,
+        max_opening: _builtins.float | None = ...,
+        tip_z: _builtins.float | None = ...,
+        contact_z: _builtins.float | None = ...,
+        tcp_z: _builtins.float | None = ...,
+        hand: Global___HandPart | None = ...,
+        finger: Global___HandPart | None = ...,
+        swing: Global___Swing | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__contact_z: _TypeAlias = _typing.Literal["contact_z"]  # noqa: Y015
+    _WhichOneofArgType__contact_z: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z"]  # noqa: Y015
+    _WhichOneofReturnType__max_opening: _TypeAlias = _typing.Literal["max_opening"]  # noqa: Y015
+    _WhichOneofArgType__max_opening: _TypeAlias = _typing.Literal["_max_opening", b"_max_opening"]  # noqa: Y015
+    _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
+    _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
+    _WhichOneofReturnType__tcp_z: _TypeAlias = _typing.Literal["tcp_z"]  # noqa: Y015
+    _WhichOneofArgType__tcp_z: _TypeAlias = _typing.Literal["_tcp_z", b"_tcp_z"]  # noqa: Y015
+    _WhichOneofReturnType__tip_z: _TypeAlias = _typing.Literal["tip_z"]  # noqa: Y015
+    _WhichOneofArgType__tip_z: _TypeAlias = _typing.Literal["_tip_z", b"_tip_z"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__contact_z) -> _WhichOneofReturnType__contact_z | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_opening) -> _WhichOneofReturnType__max_opening | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__name) -> _WhichOneofReturnType__name | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tcp_z) -> _WhichOneofReturnType__tcp_z | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__tip_z) -> _WhichOneofReturnType__tip_z | None: ...
+
+Global___GripperGeometry: _TypeAlias = GripperGeometry  # noqa: Y015
+
+@_typing.final
+class Support(_message.Message):
+    """The plane objects rest on: the points x with normal . x = offset; the normal points up."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NORMAL_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    MAX_DEPTH_ERROR_FIELD_NUMBER: _builtins.int
+    RANSAC_FIELD_NUMBER: _builtins.int
+    offset: _builtins.float
+    """Normal . x of its points, metres."""
+    max_depth_error: _builtins.float
+    """Share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up to
+    this until the plane that it sees lies in place; 0: not at all.
+    """
+    @_builtins.property
+    def normal(self) -> Global___Vector:
+        """Unit normal, away from the table."""
+
+    @_builtins.property
+    def ransac(self) -> Global___RansacPlane:
+        """Look for the plane in the cloud: the largest of those near the level. `kind` is "ransac" in
+        JSON, its fields beside it.
+        """
+
+    def __init__(
+        self,
+        *,
+        normal: Global___Vector | None = ...,
+        offset: _builtins.float | None = ...,
+        max_depth_error: _builtins.float | None = ...,
+        ransac: Global___RansacPlane | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_depth_error: _TypeAlias = _typing.Literal["max_depth_error"]  # noqa: Y015
+    _WhichOneofArgType__max_depth_error: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error"]  # noqa: Y015
+    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
+    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_depth_error) -> _WhichOneofReturnType__max_depth_error | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
+
+Global___Support: _TypeAlias = Support  # noqa: Y015
+
+@_typing.final
+class RansacPlane(_message.Message):
+    """Look for the plane in the cloud: the largest of those near the level."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DISTANCE_FIELD_NUMBER: _builtins.int
+    MAX_TILT_FIELD_NUMBER: _builtins.int
+    MIN_SHARE_FIELD_NUMBER: _builtins.int
+    distance: _builtins.float
+    """Metres from the plane within which points belong to it."""
+    max_tilt: _builtins.float
+    """Radians between its normal and up; a quarter turn: any plane."""
+    min_share: _builtins.float
+    """Share of the seen surface it must hold."""
+    def __init__(
+        self,
+        *,
+        distance: _builtins.float | None = ...,
+        max_tilt: _builtins.float | None = ...,
+        min_share: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__distance: _TypeAlias = _typing.Literal["distance"]  # noqa: Y015
+    _WhichOneofArgType__distance: _TypeAlias = _typing.Literal["_distance", b"_distance"]  # noqa: Y015
+    _WhichOneofReturnType__max_tilt: _TypeAlias = _typing.Literal["max_tilt"]  # noqa: Y015
+    _WhichOneofArgType__max_tilt: _TypeAlias = _typing.Literal["_max_tilt", b"_max_tilt"]  # noqa: Y015
+    _WhichOneofReturnType__min_share: _TypeAlias = _typing.Literal["min_share"]  # noqa: Y015
+    _WhichOneofArgType__min_share: _TypeAlias = _typing.Literal["_min_share", b"_min_share"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__distance) -> _WhichOneofReturnType__distance | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_tilt) -> _WhichOneofReturnType__max_tilt | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__min_share) -> _WhichOneofReturnType__min_share | None: ...
+
+Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
+
+@_typing.final
+class Workspace(_message.Message):
+    """An axis-aligned box in the cloud's frame; points outside are dropped first."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def min(self) -> Global___Vector:
+        """Lower corner, metres."""
+
+    @_builtins.property
+    def max(self) -> Global___Vector:
+        """Upper corner, metres."""
+
+    def __init__(
+        self,
+        *,
+        min: Global___Vector | None = ...,
+        max: Global___Vector | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Workspace: _TypeAlias = Workspace  # noqa: Y015
+
+@_typing.final
+class Region(_message.Message):
+    """What lies in any of `include` and in none of `exclude`."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INCLUDE_FIELD_NUMBER: _builtins.int
+    EXCLUDE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def include(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
+        """Union of shapes; empty: everywhere."""
+
+    @_builtins.property
+    def exclude(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
+        """Union of shapes taken away."""
+
+    def __init__(
+        self,
+        *,
+        include: _abc.Iterable[Global___Shape] | None = ...,
+        exclude: _abc.Iterable[Global___Shape] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exclude", b"exclude", "include", b"include"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Region: _TypeAlias = Region  # noqa: Y015
+
+@_typing.final
+class ApproachDirection(_message.Message):
+    """Directions in which the hand may move: those in any cone or in the preset."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CONES_FIELD_NUMBER: _builtins.int
+    PRESET_FIELD_NUMBER: _builtins.int
+    preset: _builtins.str
+    """Or this, relative to up. One of "top-down", "side"."""
+    @_builtins.property
+    def cones(self) -> _containers.RepeatedCompositeFieldContainer[Global___Cone]:
+        """Any of these."""
+
+    def __init__(
+        self,
+        *,
+        cones: _abc.Iterable[Global___Cone] | None = ...,
+        preset: _builtins.str | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "preset", b"preset"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "cones", b"cones", "preset", b"preset"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__preset: _TypeAlias = _typing.Literal["preset"]  # noqa: Y015
+    _WhichOneofArgType__preset: _TypeAlias = _typing.Literal["_preset", b"_preset"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__preset) -> _WhichOneofReturnType__preset | None: ...
+
+Global___ApproachDirection: _TypeAlias = ApproachDirection  # noqa: Y015
+
+@_typing.final
+class Collision(_message.Message):
+    """What the hand must not meet, and on which way: cloud, support plane and obstacles."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MODE_FIELD_NUMBER: _builtins.int
+    MARGIN_FIELD_NUMBER: _builtins.int
+    OPENING_FIELD_NUMBER: _builtins.int
+    APPROACH_LENGTH_FIELD_NUMBER: _builtins.int
+    RETREAT_LENGTH_FIELD_NUMBER: _builtins.int
+    RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
+    OBSTACLES_FIELD_NUMBER: _builtins.int
+    mode: _builtins.str
+    """Grasps whose hand collides: left out, their scores worth half in the ranking, or not looked
+    for. One of "avoid", "penalise", "ignore".
+    """
+    margin: _builtins.float
+    """Metres kept free around the hand: its boxes are grown by this on every side."""
+    opening: _builtins.float
+    """Metres between the fingers on the way in; absent: the gripper's maximum."""
+    approach_length: _builtins.float
+    """Metres of straight way in along the approach."""
+    retreat_length: _builtins.float
+    """Metres of straight way out."""
+    retreat_direction: _builtins.str
+    """Way out: back along the approach, or along up. One of "back", "up"."""
+    @_builtins.property
+    def obstacles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Obstacle]:
+        """Solid boxes beside the cloud."""
+
+    def __init__(
+        self,
+        *,
+        mode: _builtins.str | None = ...,
+        margin: _builtins.float | None = ...,
+        opening: _builtins.float | None = ...,
+        approach_length: _builtins.float | None = ...,
+        retreat_length: _builtins.float | None = ...,
+        retreat_direction: _builtins.str | None = ...,
+        obstacles: _abc.Iterable[Global___Obstacle] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "obstacles", b"obstacles", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__approach_length: _TypeAlias = _typing.Literal["approach_length"]  # noqa: Y015
+    _WhichOneofArgType__approach_length: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length"]  # noqa: Y015
+    _WhichOneofReturnType__margin: _TypeAlias = _typing.Literal["margin"]  # noqa: Y015
+    _WhichOneofArgType__margin: _TypeAlias = _typing.Literal["_margin", b"_margin"]  # noqa: Y015
+    _WhichOneofReturnType__mode: _TypeAlias = _typing.Literal["mode"]  # noqa: Y015
+    _WhichOneofArgType__mode: _TypeAlias = _typing.Literal["_mode", b"_mode"]  # noqa: Y015
+    _WhichOneofReturnType__opening: _TypeAlias = _typing.Literal["opening"]  # noqa: Y015
+    _WhichOneofArgType__opening: _TypeAlias = _typing.Literal["_opening", b"_opening"]  # noqa: Y015
+    _WhichOneofReturnType__retreat_direction: _TypeAlias = _typing.Literal["retreat_direction"]  # noqa: Y015
+    _WhichOneofArgType__retreat_direction: _TypeAlias = _typing.Literal["_retreat_direction", b"_retreat_direction"]  # noqa: Y015
+    _WhichOneofReturnType__retreat_length: _TypeAlias = _typing.Literal["retreat_length"]  # noqa: Y015
+    _WhichOneofArgType__retreat_length: _TypeAlias = _typing.Literal["_retreat_length", b"_retreat_length"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__approach_length) -> _WhichOneofReturnType__approach_length | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__margin) -> _WhichOneofReturnType__margin | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__mode) -> _WhichOneofReturnType__mode | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__opening) -> _WhichOneofReturnType__opening | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_direction) -> _WhichOneofReturnType__retreat_direction | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_length) -> _WhichOneofReturnType__retreat_length | None: ...
+
+Global___Collision: _TypeAlias = Collision  # noqa: Y015
+
+@_typing.final
+class Suppression(_message.Message):
+    """Drop a grasp near a better one: nearer than both distances."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    TRANSLATION_FIELD_NUMBER: _builtins.int
+    ROTATION_FIELD_NUMBER: _builtins.int
+    DISABLED_FIELD_NUMBER: _builtins.int
+    translation: _builtins.float
+    """Metres between TCPs."""
+    rotation: _builtins.float
+    """Radians between hands, the 180 degree flip about the approach ignored."""
+    disabled: _builtins.bool
+    """True: null in JSON."""
+    def __init__(
+        self,
+        *,
+        translation: _builtins.float | None = ...,
+        rotation: _builtins.float | None = ...,
+        disabled: _builtins.bool = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_rotation", b"_rotation", "_translation", b"_translation", "rotation", b"rotation", "translation", b"translation"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_rotation", b"_rotation", "_translation", b"_translation", "disabled", b"disabled", "rotation", b"rotation", "translation", b"translation"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__rotation: _TypeAlias = _typing.Literal["rotation"]  # noqa: Y015
+    _WhichOneofArgType__rotation: _TypeAlias = _typing.Literal["_rotation", b"_rotation"]  # noqa: Y015
+    _WhichOneofReturnType__translation: _TypeAlias = _typing.Literal["translation"]  # noqa: Y015
+    _WhichOneofArgType__translation: _TypeAlias = _typing.Literal["_translation", b"_translation"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__rotation) -> _WhichOneofReturnType__rotation | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__translation) -> _WhichOneofReturnType__translation | None: ...
+
+Global___Suppression: _TypeAlias = Suppression  # noqa: Y015
+
+@_typing.final
+class HandPart(_message.Message):
+    """Boxes of the hand or of one finger, hand frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOXES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def boxes(self) -> _containers.RepeatedCompositeFieldContainer[Global___HandBox]:
+        """[min corner, max corner] each."""
+
+    def __init__(
+        self,
+        *,
+        boxes: _abc.Iterable[Global___HandBox] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["boxes", b"boxes"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___HandPart: _TypeAlias = HandPart  # noqa: Y015
+
+@_typing.final
+class Swing(_message.Message):
+    """A linkage that carries each finger along an arc: its tips come forward as it closes."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    RADIUS_FIELD_NUMBER: _builtins.int
+    REACH_FIELD_NUMBER: _builtins.int
+    radius: _builtins.float
+    """Length of the link that carries a finger, metres."""
+    reach: _builtins.float
+    """Outward part (y) of that link in the open gripper, metres."""
+    def __init__(
+        self,
+        *,
+        radius: _builtins.float | None = ...,
+        reach: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
+    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
+    _WhichOneofReturnType__reach: _TypeAlias = _typing.Literal["reach"]  # noqa: Y015
+    _WhichOneofArgType__reach: _TypeAlias = _typing.Literal["_reach", b"_reach"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__reach) -> _WhichOneofReturnType__reach | None: ...
+
+Global___Swing: _TypeAlias = Swing  # noqa: Y015
+
+@_typing.final
+class Box(_message.Message):
+    """An axis-aligned box in the cloud's frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def min(self) -> Global___Vector:
+        """Lower corner, metres."""
+
+    @_builtins.property
+    def max(self) -> Global___Vector:
+        """Upper corner, metres."""
+
+    def __init__(
+        self,
+        *,
+        min: Global___Vector | None = ...,
+        max: Global___Vector | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Box: _TypeAlias = Box  # noqa: Y015
+
+@_typing.final
+class HalfSpace(_message.Message):
+    """Everything on one side of a plane: the points x with normal . x >= offset."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NORMAL_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    offset: _builtins.float
+    """Normal . x on the plane, metres."""
+    @_builtins.property
+    def normal(self) -> Global___Vector:
+        """Unit, into the region."""
+
+    def __init__(
+        self,
+        *,
+        normal: Global___Vector | None = ...,
+        offset: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
+    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
+
+Global___HalfSpace: _TypeAlias = HalfSpace  # noqa: Y015
+
+@_typing.final
+class Indices(_message.Message):
+    """Points by their row in the cloud as it was sent."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INDICES_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Rows of the cloud as sent; row-major where organised."""
+
+    def __init__(
+        self,
+        *,
+        indices: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["indices", b"indices"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Indices: _TypeAlias = Indices  # noqa: Y015
+
+@_typing.final
+class Mask(_message.Message):
+    """Points by one truth value for each row of the cloud as it was sent."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MASK_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
+        """As many values as the cloud has rows."""
+
+    def __init__(
+        self,
+        *,
+        mask: _abc.Iterable[_builtins.bool] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["mask", b"mask"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Mask: _TypeAlias = Mask  # noqa: Y015
+
+@_typing.final
+class OrientedBox(_message.Message):
+    """A box in any orientation."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CENTER_FIELD_NUMBER: _builtins.int
+    HALF_EXTENTS_FIELD_NUMBER: _builtins.int
+    QUATERNION_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def center(self) -> Global___Vector:
+        """Its middle, metres."""
+
+    @_builtins.property
+    def half_extents(self) -> Global___Vector:
+        """Half its lengths along its own axes, metres."""
+
+    @_builtins.property
+    def quaternion(self) -> Global___Quaternion:
+        """x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)."""
+
+    def __init__(
+        self,
+        *,
+        center: Global___Vector | None = ...,
+        half_extents: Global___Vector | None = ...,
+        quaternion: Global___Quaternion | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___OrientedBox: _TypeAlias = OrientedBox  # noqa: Y015
+
+@_typing.final
+class Segments(_message.Message):
+    """Points by the segment they belong to: `segment_ids`, sent beside the cloud."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    IDS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Values of segment_ids."""
+
+    def __init__(
+        self,
+        *,
+        ids: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["ids", b"ids"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Segments: _TypeAlias = Segments  # noqa: Y015
+
+@_typing.final
+class Sphere(_message.Message):
+    """A ball."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CENTER_FIELD_NUMBER: _builtins.int
+    RADIUS_FIELD_NUMBER: _builtins.int
+    radius: _builtins.float
+    """Metres."""
+    @_builtins.property
+    def center(self) -> Global___Vector:
+        """Its middle, metres."""
+
+    def __init__(
+        self,
+        *,
+        center: Global___Vector | None = ...,
+        radius: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
+    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
+
+Global___Sphere: _TypeAlias = Sphere  # noqa: Y015
+
+@_typing.final
+class Cone(_message.Message):
+    """Directions within an angle of one."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    DIRECTION_FIELD_NUMBER: _builtins.int
+    MAX_ANGLE_FIELD_NUMBER: _builtins.int
+    max_angle: _builtins.float
+    """Radians between it and the hand's way."""
+    @_builtins.property
+    def direction(self) -> Global___Vector:
+        """The way the hand moves toward the object, +z of the hand; any length but zero."""
+
+    def __init__(
+        self,
+        *,
+        direction: Global___Vector | None = ...,
+        max_angle: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__max_angle: _TypeAlias = _typing.Literal["max_angle"]  # noqa: Y015
+    _WhichOneofArgType__max_angle: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_angle) -> _WhichOneofReturnType__max_angle | None: ...
+
+Global___Cone: _TypeAlias = Cone  # noqa: Y015
+
+@_typing.final
+class Shape(_message.Message):
+    """In JSON `kind` is the name of the field set here, its fields beside it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOX_FIELD_NUMBER: _builtins.int
+    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
+    SPHERE_FIELD_NUMBER: _builtins.int
+    HALF_SPACE_FIELD_NUMBER: _builtins.int
+    INDICES_FIELD_NUMBER: _builtins.int
+    MASK_FIELD_NUMBER: _builtins.int
+    SEGMENTS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def box(self) -> Global___Box: ...
+    @_builtins.property
+    def oriented_box(self) -> Global___OrientedBox: ...
+    @_builtins.property
+    def sphere(self) -> Global___Sphere: ...
+    @_builtins.property
+    def half_space(self) -> Global___HalfSpace: ...
+    @_builtins.property
+    def indices(self) -> Global___Indices: ...
+    @_builtins.property
+    def mask(self) -> Global___Mask: ...
+    @_builtins.property
+    def segments(self) -> Global___Segments: ...
+    def __init__(
+        self,
+        *,
+        box: Global___Box | None = ...,
+        oriented_box: Global___OrientedBox | None = ...,
+        sphere: Global___Sphere | None = ...,
+        half_space: Global___HalfSpace | None = ...,
+        indices: Global___Indices | None = ...,
+        mask: Global___Mask | None = ...,
+        segments: Global___Segments | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box", "sphere", "half_space", "indices", "mask", "segments"]  # noqa: Y015
+    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
+
+Global___Shape: _TypeAlias = Shape  # noqa: Y015
+
+@_typing.final
+class Obstacle(_message.Message):
+    """In JSON `kind` is the name of the field set here, its fields beside it."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    BOX_FIELD_NUMBER: _builtins.int
+    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def box(self) -> Global___Box: ...
+    @_builtins.property
+    def oriented_box(self) -> Global___OrientedBox: ...
+    def __init__(
+        self,
+        *,
+        box: Global___Box | None = ...,
+        oriented_box: Global___OrientedBox | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box"]  # noqa: Y015
+    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
+
+Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
+
+@_typing.final
 class Vector(_message.Message):
-    """x, y, z in the cloud's frame; [x, y, z] in JSON."""
+    """generated: end options
+
+    x, y, z in the cloud's frame; [x, y, z] in JSON.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -785,103 +1520,6 @@ class GripperChoice(_message.Message):
 Global___GripperChoice: _TypeAlias = GripperChoice  # noqa: Y015
 
 @_typing.final
-class GripperGeometry(_message.Message):
-    """A parallel-jaw gripper; the fields of a gripper file. z toward the object, y closing."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NAME_FIELD_NUMBER: _builtins.int
-    MAX_OPENING_FIELD_NUMBER: _builtins.int
-    TIP_Z_FIELD_NUMBER: _builtins.int
-    CONTACT_Z_FIELD_NUMBER: _builtins.int
-    TCP_Z_FIELD_NUMBER: _builtins.int
-    HAND_FIELD_NUMBER: _builtins.int
-    FINGER_FIELD_NUMBER: _builtins.int
-    SWING_FIELD_NUMBER: _builtins.int
-    name: _builtins.str
-    """Shown in results."""
-    max_opening: _builtins.float
-    """Metres between the open fingers' inner faces."""
-    tip_z: _builtins.float
-    """Fingertips of the open gripper, metres along z."""
-    contact_z: _builtins.float
-    """Where contacts are put, metres along z."""
-    tcp_z: _builtins.float
-    """Origin of the TCP frame, metres along z."""
-    @_builtins.property
-    def hand(self) -> Global___HandPart:
-        """The hand without its fingers."""
-
-    @_builtins.property
-    def finger(self) -> Global___HandPart:
-        """One finger, its inner face at y = 0; mirrored."""
-
-    @_builtins.property
-    def swing(self) -> Global___Swing:
-        """How the fingers swing; absent: they close in a straight line."""
-
-    def __init__(
-        self,
-        *,
-        name: _builtins.str | None = ...,
-        max_opening: _builtins.float | None = ...,
-        tip_z: _builtins.float | None = ...,
-        contact_z: _builtins.float | None = ...,
-        tcp_z: _builtins.float | None = ...,
-        hand: Global___HandPart | None = ...,
-        finger: Global___HandPart | None = ...,
-        swing: Global___Swing | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z", "_max_opening", b"_max_opening", "_name", b"_name", "_tcp_z", b"_tcp_z", "_tip_z", b"_tip_z", "contact_z", b"contact_z", "finger", b"finger", "hand", b"hand", "max_opening", b"max_opening", "name", b"name", "swing", b"swing", "tcp_z", b"tcp_z", "tip_z", b"tip_z"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__contact_z: _TypeAlias = _typing.Literal["contact_z"]  # noqa: Y015
-    _WhichOneofArgType__contact_z: _TypeAlias = _typing.Literal["_contact_z", b"_contact_z"]  # noqa: Y015
-    _WhichOneofReturnType__max_opening: _TypeAlias = _typing.Literal["max_opening"]  # noqa: Y015
-    _WhichOneofArgType__max_opening: _TypeAlias = _typing.Literal["_max_opening", b"_max_opening"]  # noqa: Y015
-    _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
-    _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
-    _WhichOneofReturnType__tcp_z: _TypeAlias = _typing.Literal["tcp_z"]  # noqa: Y015
-    _WhichOneofArgType__tcp_z: _TypeAlias = _typing.Literal["_tcp_z", b"_tcp_z"]  # noqa: Y015
-    _WhichOneofReturnType__tip_z: _TypeAlias = _typing.Literal["tip_z"]  # noqa: Y015
-    _WhichOneofArgType__tip_z: _TypeAlias = _typing.Literal["_tip_z", b"_tip_z"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__contact_z) -> _WhichOneofReturnType__contact_z | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_opening) -> _WhichOneofReturnType__max_opening | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__name) -> _WhichOneofReturnType__name | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__tcp_z) -> _WhichOneofReturnType__tcp_z | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__tip_z) -> _WhichOneofReturnType__tip_z | None: ...
-
-Global___GripperGeometry: _TypeAlias = GripperGeometry  # noqa: Y015
-
-@_typing.final
-class HandPart(_message.Message):
-    """Boxes of the hand or of one finger, hand frame."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    BOXES_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def boxes(self) -> _containers.RepeatedCompositeFieldContainer[Global___HandBox]: ...
-    def __init__(
-        self,
-        *,
-        boxes: _abc.Iterable[Global___HandBox] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["boxes", b"boxes"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___HandPart: _TypeAlias = HandPart  # noqa: Y015
-
-@_typing.final
 class HandBox(_message.Message):
     """An axis-aligned box in the hand frame; [min, max] in JSON."""
 
@@ -910,621 +1548,6 @@ class HandBox(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___HandBox: _TypeAlias = HandBox  # noqa: Y015
-
-@_typing.final
-class Swing(_message.Message):
-    """A linkage that carries each finger along an arc."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    RADIUS_FIELD_NUMBER: _builtins.int
-    REACH_FIELD_NUMBER: _builtins.int
-    radius: _builtins.float
-    """Length of the link that carries a finger, metres."""
-    reach: _builtins.float
-    """Outward part (y) of that link in the open gripper, metres."""
-    def __init__(
-        self,
-        *,
-        radius: _builtins.float | None = ...,
-        reach: _builtins.float | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "_reach", b"_reach", "radius", b"radius", "reach", b"reach"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
-    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
-    _WhichOneofReturnType__reach: _TypeAlias = _typing.Literal["reach"]  # noqa: Y015
-    _WhichOneofArgType__reach: _TypeAlias = _typing.Literal["_reach", b"_reach"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__reach) -> _WhichOneofReturnType__reach | None: ...
-
-Global___Swing: _TypeAlias = Swing  # noqa: Y015
-
-@_typing.final
-class Support(_message.Message):
-    """Either a plane that is given, the points p with normal . p = offset, or one to look for."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NORMAL_FIELD_NUMBER: _builtins.int
-    OFFSET_FIELD_NUMBER: _builtins.int
-    MAX_DEPTH_ERROR_FIELD_NUMBER: _builtins.int
-    RANSAC_FIELD_NUMBER: _builtins.int
-    offset: _builtins.float
-    """normal . p of its points, metres."""
-    max_depth_error: _builtins.float
-    """Share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up to
-    this until the plane that it sees lies in place. 0: not at all.
-    """
-    @_builtins.property
-    def normal(self) -> Global___Vector:
-        """Unit normal, away from the table."""
-
-    @_builtins.property
-    def ransac(self) -> Global___RansacPlane:
-        """Look for the plane in the cloud; `"kind": "ransac"` in JSON, its fields beside it."""
-
-    def __init__(
-        self,
-        *,
-        normal: Global___Vector | None = ...,
-        offset: _builtins.float | None = ...,
-        max_depth_error: _builtins.float | None = ...,
-        ransac: Global___RansacPlane | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__max_depth_error: _TypeAlias = _typing.Literal["max_depth_error"]  # noqa: Y015
-    _WhichOneofArgType__max_depth_error: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error"]  # noqa: Y015
-    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
-    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_depth_error) -> _WhichOneofReturnType__max_depth_error | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
-
-Global___Support: _TypeAlias = Support  # noqa: Y015
-
-@_typing.final
-class RansacPlane(_message.Message):
-    """How to look for the support plane. Its points are removed; the plane stays as an obstacle."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    DISTANCE_FIELD_NUMBER: _builtins.int
-    MAX_TILT_FIELD_NUMBER: _builtins.int
-    MIN_SHARE_FIELD_NUMBER: _builtins.int
-    distance: _builtins.float
-    """Metres from the plane within which points belong to it."""
-    max_tilt: _builtins.float
-    """Radians between its normal and up."""
-    min_share: _builtins.float
-    """Share of the cloud's points it must hold."""
-    def __init__(
-        self,
-        *,
-        distance: _builtins.float | None = ...,
-        max_tilt: _builtins.float | None = ...,
-        min_share: _builtins.float | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_distance", b"_distance", "_max_tilt", b"_max_tilt", "_min_share", b"_min_share", "distance", b"distance", "max_tilt", b"max_tilt", "min_share", b"min_share"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__distance: _TypeAlias = _typing.Literal["distance"]  # noqa: Y015
-    _WhichOneofArgType__distance: _TypeAlias = _typing.Literal["_distance", b"_distance"]  # noqa: Y015
-    _WhichOneofReturnType__max_tilt: _TypeAlias = _typing.Literal["max_tilt"]  # noqa: Y015
-    _WhichOneofArgType__max_tilt: _TypeAlias = _typing.Literal["_max_tilt", b"_max_tilt"]  # noqa: Y015
-    _WhichOneofReturnType__min_share: _TypeAlias = _typing.Literal["min_share"]  # noqa: Y015
-    _WhichOneofArgType__min_share: _TypeAlias = _typing.Literal["_min_share", b"_min_share"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__distance) -> _WhichOneofReturnType__distance | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_tilt) -> _WhichOneofReturnType__max_tilt | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__min_share) -> _WhichOneofReturnType__min_share | None: ...
-
-Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
-
-@_typing.final
-class Workspace(_message.Message):
-    """An axis-aligned box in the cloud's frame."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    MIN_FIELD_NUMBER: _builtins.int
-    MAX_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def min(self) -> Global___Vector:
-        """Lower corner, metres."""
-
-    @_builtins.property
-    def max(self) -> Global___Vector:
-        """Upper corner, metres."""
-
-    def __init__(
-        self,
-        *,
-        min: Global___Vector | None = ...,
-        max: Global___Vector | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Workspace: _TypeAlias = Workspace  # noqa: Y015
-
-@_typing.final
-class Region(_message.Message):
-    """What lies in any of `include` and in none of `exclude`."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    INCLUDE_FIELD_NUMBER: _builtins.int
-    EXCLUDE_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def include(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
-        """Union of shapes; none: everywhere."""
-
-    @_builtins.property
-    def exclude(self) -> _containers.RepeatedCompositeFieldContainer[Global___Shape]:
-        """Union of shapes taken away."""
-
-    def __init__(
-        self,
-        *,
-        include: _abc.Iterable[Global___Shape] | None = ...,
-        exclude: _abc.Iterable[Global___Shape] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["exclude", b"exclude", "include", b"include"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Region: _TypeAlias = Region  # noqa: Y015
-
-@_typing.final
-class Shape(_message.Message):
-    """A part of the cloud; in JSON `kind` is the name of the field set here, its fields beside it."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    BOX_FIELD_NUMBER: _builtins.int
-    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
-    SPHERE_FIELD_NUMBER: _builtins.int
-    HALF_SPACE_FIELD_NUMBER: _builtins.int
-    INDICES_FIELD_NUMBER: _builtins.int
-    MASK_FIELD_NUMBER: _builtins.int
-    SEGMENTS_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def box(self) -> Global___Box: ...
-    @_builtins.property
-    def oriented_box(self) -> Global___OrientedBox: ...
-    @_builtins.property
-    def sphere(self) -> Global___Sphere: ...
-    @_builtins.property
-    def half_space(self) -> Global___HalfSpace: ...
-    @_builtins.property
-    def indices(self) -> Global___Indices: ...
-    @_builtins.property
-    def mask(self) -> Global___Mask: ...
-    @_builtins.property
-    def segments(self) -> Global___Segments: ...
-    def __init__(
-        self,
-        *,
-        box: Global___Box | None = ...,
-        oriented_box: Global___OrientedBox | None = ...,
-        sphere: Global___Sphere | None = ...,
-        half_space: Global___HalfSpace | None = ...,
-        indices: Global___Indices | None = ...,
-        mask: Global___Mask | None = ...,
-        segments: Global___Segments | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "half_space", b"half_space", "indices", b"indices", "kind", b"kind", "mask", b"mask", "oriented_box", b"oriented_box", "segments", b"segments", "sphere", b"sphere"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box", "sphere", "half_space", "indices", "mask", "segments"]  # noqa: Y015
-    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
-
-Global___Shape: _TypeAlias = Shape  # noqa: Y015
-
-@_typing.final
-class Box(_message.Message):
-    """An axis-aligned box in the cloud's frame."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    MIN_FIELD_NUMBER: _builtins.int
-    MAX_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def min(self) -> Global___Vector:
-        """Lower corner, metres."""
-
-    @_builtins.property
-    def max(self) -> Global___Vector:
-        """Upper corner, metres."""
-
-    def __init__(
-        self,
-        *,
-        min: Global___Vector | None = ...,
-        max: Global___Vector | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Box: _TypeAlias = Box  # noqa: Y015
-
-@_typing.final
-class OrientedBox(_message.Message):
-    """A box in any orientation."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    CENTER_FIELD_NUMBER: _builtins.int
-    HALF_EXTENTS_FIELD_NUMBER: _builtins.int
-    QUATERNION_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def center(self) -> Global___Vector:
-        """Its middle, metres."""
-
-    @_builtins.property
-    def half_extents(self) -> Global___Vector:
-        """Half its lengths along its own axes, metres."""
-
-    @_builtins.property
-    def quaternion(self) -> Global___Quaternion:
-        """Turns the box's axes into the cloud's (T_cloud_box); absent: no rotation."""
-
-    def __init__(
-        self,
-        *,
-        center: Global___Vector | None = ...,
-        half_extents: Global___Vector | None = ...,
-        quaternion: Global___Quaternion | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["center", b"center", "half_extents", b"half_extents", "quaternion", b"quaternion"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___OrientedBox: _TypeAlias = OrientedBox  # noqa: Y015
-
-@_typing.final
-class Sphere(_message.Message):
-    """A ball."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    CENTER_FIELD_NUMBER: _builtins.int
-    RADIUS_FIELD_NUMBER: _builtins.int
-    radius: _builtins.float
-    """Metres."""
-    @_builtins.property
-    def center(self) -> Global___Vector:
-        """Its middle, metres."""
-
-    def __init__(
-        self,
-        *,
-        center: Global___Vector | None = ...,
-        radius: _builtins.float | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_radius", b"_radius", "center", b"center", "radius", b"radius"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__radius: _TypeAlias = _typing.Literal["radius"]  # noqa: Y015
-    _WhichOneofArgType__radius: _TypeAlias = _typing.Literal["_radius", b"_radius"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__radius) -> _WhichOneofReturnType__radius | None: ...
-
-Global___Sphere: _TypeAlias = Sphere  # noqa: Y015
-
-@_typing.final
-class HalfSpace(_message.Message):
-    """The points p with normal . p >= offset."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    NORMAL_FIELD_NUMBER: _builtins.int
-    OFFSET_FIELD_NUMBER: _builtins.int
-    offset: _builtins.float
-    """normal . p on the plane, metres."""
-    @_builtins.property
-    def normal(self) -> Global___Vector:
-        """Unit, into the region."""
-
-    def __init__(
-        self,
-        *,
-        normal: Global___Vector | None = ...,
-        offset: _builtins.float | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_offset", b"_offset", "normal", b"normal", "offset", b"offset"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__offset: _TypeAlias = _typing.Literal["offset"]  # noqa: Y015
-    _WhichOneofArgType__offset: _TypeAlias = _typing.Literal["_offset", b"_offset"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__offset) -> _WhichOneofReturnType__offset | None: ...
-
-Global___HalfSpace: _TypeAlias = HalfSpace  # noqa: Y015
-
-@_typing.final
-class Indices(_message.Message):
-    """Points by their row in the cloud as it was sent."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    INDICES_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def indices(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]: ...
-    def __init__(
-        self,
-        *,
-        indices: _abc.Iterable[_builtins.int] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["indices", b"indices"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Indices: _TypeAlias = Indices  # noqa: Y015
-
-@_typing.final
-class Mask(_message.Message):
-    """Points by one truth value for each row of the cloud as it was sent."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    MASK_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]: ...
-    def __init__(
-        self,
-        *,
-        mask: _abc.Iterable[_builtins.bool] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["mask", b"mask"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Mask: _TypeAlias = Mask  # noqa: Y015
-
-@_typing.final
-class Segments(_message.Message):
-    """Points by the segment they belong to: `segment_ids` of the request."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    IDS_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]: ...
-    def __init__(
-        self,
-        *,
-        ids: _abc.Iterable[_builtins.int] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["ids", b"ids"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
-
-Global___Segments: _TypeAlias = Segments  # noqa: Y015
-
-@_typing.final
-class ApproachDirection(_message.Message):
-    """Directions in which the hand may move: those in any cone or in the preset."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    CONES_FIELD_NUMBER: _builtins.int
-    PRESET_FIELD_NUMBER: _builtins.int
-    preset: _builtins.str
-    """"top-down": within 30 degrees of straight down; "side": within 30 degrees of the horizontal."""
-    @_builtins.property
-    def cones(self) -> _containers.RepeatedCompositeFieldContainer[Global___Cone]: ...
-    def __init__(
-        self,
-        *,
-        cones: _abc.Iterable[Global___Cone] | None = ...,
-        preset: _builtins.str | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "preset", b"preset"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_preset", b"_preset", "cones", b"cones", "preset", b"preset"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__preset: _TypeAlias = _typing.Literal["preset"]  # noqa: Y015
-    _WhichOneofArgType__preset: _TypeAlias = _typing.Literal["_preset", b"_preset"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__preset) -> _WhichOneofReturnType__preset | None: ...
-
-Global___ApproachDirection: _TypeAlias = ApproachDirection  # noqa: Y015
-
-@_typing.final
-class Cone(_message.Message):
-    """Directions within an angle of one."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    DIRECTION_FIELD_NUMBER: _builtins.int
-    MAX_ANGLE_FIELD_NUMBER: _builtins.int
-    max_angle: _builtins.float
-    """Radians between it and the hand's way."""
-    @_builtins.property
-    def direction(self) -> Global___Vector:
-        """The way the hand moves toward the object, +z of the hand; any length but zero."""
-
-    def __init__(
-        self,
-        *,
-        direction: Global___Vector | None = ...,
-        max_angle: _builtins.float | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle", "direction", b"direction", "max_angle", b"max_angle"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__max_angle: _TypeAlias = _typing.Literal["max_angle"]  # noqa: Y015
-    _WhichOneofArgType__max_angle: _TypeAlias = _typing.Literal["_max_angle", b"_max_angle"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_angle) -> _WhichOneofReturnType__max_angle | None: ...
-
-Global___Cone: _TypeAlias = Cone  # noqa: Y015
-
-@_typing.final
-class Collision(_message.Message):
-    """What the hand must not meet, and on which way; in JSON a bare mode will do."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    MODE_FIELD_NUMBER: _builtins.int
-    MARGIN_FIELD_NUMBER: _builtins.int
-    OPENING_FIELD_NUMBER: _builtins.int
-    APPROACH_LENGTH_FIELD_NUMBER: _builtins.int
-    RETREAT_LENGTH_FIELD_NUMBER: _builtins.int
-    RETREAT_DIRECTION_FIELD_NUMBER: _builtins.int
-    OBSTACLES_FIELD_NUMBER: _builtins.int
-    mode: _builtins.str
-    """Grasps whose hand collides: "avoid" (left out), "penalise" (scores worth half) or "ignore"."""
-    margin: _builtins.float
-    """Metres kept free around the hand."""
-    opening: _builtins.float
-    """Metres between the fingers on the way in; absent: the gripper's maximum."""
-    approach_length: _builtins.float
-    """Metres of straight way in along the approach."""
-    retreat_length: _builtins.float
-    """Metres of straight way out."""
-    retreat_direction: _builtins.str
-    """Way out: "back" along the approach, or "up"."""
-    @_builtins.property
-    def obstacles(self) -> _containers.RepeatedCompositeFieldContainer[Global___Obstacle]:
-        """Solid boxes beside the cloud."""
-
-    def __init__(
-        self,
-        *,
-        mode: _builtins.str | None = ...,
-        margin: _builtins.float | None = ...,
-        opening: _builtins.float | None = ...,
-        approach_length: _builtins.float | None = ...,
-        retreat_length: _builtins.float | None = ...,
-        retreat_direction: _builtins.str | None = ...,
-        obstacles: _abc.Iterable[Global___Obstacle] | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length", "_margin", b"_margin", "_mode", b"_mode", "_opening", b"_opening", "_retreat_direction", b"_retreat_direction", "_retreat_length", b"_retreat_length", "approach_length", b"approach_length", "margin", b"margin", "mode", b"mode", "obstacles", b"obstacles", "opening", b"opening", "retreat_direction", b"retreat_direction", "retreat_length", b"retreat_length"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__approach_length: _TypeAlias = _typing.Literal["approach_length"]  # noqa: Y015
-    _WhichOneofArgType__approach_length: _TypeAlias = _typing.Literal["_approach_length", b"_approach_length"]  # noqa: Y015
-    _WhichOneofReturnType__margin: _TypeAlias = _typing.Literal["margin"]  # noqa: Y015
-    _WhichOneofArgType__margin: _TypeAlias = _typing.Literal["_margin", b"_margin"]  # noqa: Y015
-    _WhichOneofReturnType__mode: _TypeAlias = _typing.Literal["mode"]  # noqa: Y015
-    _WhichOneofArgType__mode: _TypeAlias = _typing.Literal["_mode", b"_mode"]  # noqa: Y015
-    _WhichOneofReturnType__opening: _TypeAlias = _typing.Literal["opening"]  # noqa: Y015
-    _WhichOneofArgType__opening: _TypeAlias = _typing.Literal["_opening", b"_opening"]  # noqa: Y015
-    _WhichOneofReturnType__retreat_direction: _TypeAlias = _typing.Literal["retreat_direction"]  # noqa: Y015
-    _WhichOneofArgType__retreat_direction: _TypeAlias = _typing.Literal["_retreat_direction", b"_retreat_direction"]  # noqa: Y015
-    _WhichOneofReturnType__retreat_length: _TypeAlias = _typing.Literal["retreat_length"]  # noqa: Y015
-    _WhichOneofArgType__retreat_length: _TypeAlias = _typing.Literal["_retreat_length", b"_retreat_length"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__approach_length) -> _WhichOneofReturnType__approach_length | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__margin) -> _WhichOneofReturnType__margin | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__mode) -> _WhichOneofReturnType__mode | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__opening) -> _WhichOneofReturnType__opening | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_direction) -> _WhichOneofReturnType__retreat_direction | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_length) -> _WhichOneofReturnType__retreat_length | None: ...
-
-Global___Collision: _TypeAlias = Collision  # noqa: Y015
-
-@_typing.final
-class Obstacle(_message.Message):
-    """A solid box; in JSON `kind` is the name of the field set here, its fields beside it."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    BOX_FIELD_NUMBER: _builtins.int
-    ORIENTED_BOX_FIELD_NUMBER: _builtins.int
-    @_builtins.property
-    def box(self) -> Global___Box: ...
-    @_builtins.property
-    def oriented_box(self) -> Global___OrientedBox: ...
-    def __init__(
-        self,
-        *,
-        box: Global___Box | None = ...,
-        oriented_box: Global___OrientedBox | None = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["box", b"box", "kind", b"kind", "oriented_box", b"oriented_box"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType_kind: _TypeAlias = _typing.Literal["box", "oriented_box"]  # noqa: Y015
-    _WhichOneofArgType_kind: _TypeAlias = _typing.Literal["kind", b"kind"]  # noqa: Y015
-    def WhichOneof(self, oneof_group: _WhichOneofArgType_kind) -> _WhichOneofReturnType_kind | None: ...
-
-Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
-
-@_typing.final
-class Suppression(_message.Message):
-    """Drops a grasp near a better one: nearer than both distances."""
-
-    DESCRIPTOR: _descriptor.Descriptor
-
-    TRANSLATION_FIELD_NUMBER: _builtins.int
-    ROTATION_FIELD_NUMBER: _builtins.int
-    DISABLED_FIELD_NUMBER: _builtins.int
-    translation: _builtins.float
-    """Metres between TCPs."""
-    rotation: _builtins.float
-    """Radians between hands, the 180 degree flip about the approach ignored."""
-    disabled: _builtins.bool
-    """True: no suppression at all; `"suppression": null` in JSON."""
-    def __init__(
-        self,
-        *,
-        translation: _builtins.float | None = ...,
-        rotation: _builtins.float | None = ...,
-        disabled: _builtins.bool = ...,
-    ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_rotation", b"_rotation", "_translation", b"_translation", "rotation", b"rotation", "translation", b"translation"]  # noqa: Y015
-    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_rotation", b"_rotation", "_translation", b"_translation", "disabled", b"disabled", "rotation", b"rotation", "translation", b"translation"]  # noqa: Y015
-    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    _WhichOneofReturnType__rotation: _TypeAlias = _typing.Literal["rotation"]  # noqa: Y015
-    _WhichOneofArgType__rotation: _TypeAlias = _typing.Literal["_rotation", b"_rotation"]  # noqa: Y015
-    _WhichOneofReturnType__translation: _TypeAlias = _typing.Literal["translation"]  # noqa: Y015
-    _WhichOneofArgType__translation: _TypeAlias = _typing.Literal["_translation", b"_translation"]  # noqa: Y015
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__rotation) -> _WhichOneofReturnType__rotation | None: ...
-    @_typing.overload
-    def WhichOneof(self, oneof_group: _WhichOneofArgType__translation) -> _WhichOneofReturnType__translation | None: ...
-
-Global___Suppression: _TypeAlias = Suppression  # noqa: Y015
 
 @_typing.final
 class DetectGraspsResponse(_message.Message):

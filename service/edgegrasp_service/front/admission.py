@@ -1,0 +1,194 @@
+"""Who is let in: how many requests and bytes the server holds, and whose turn it is."""
+
+import asyncio
+import math
+import statistics
+from collections import Counter, deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
+
+LATEST = 15  # service times whose median is the pace: one slow request does not change it
+MARGIN = 1.5  # the wait is told from a median; half of the requests take longer
+
+
+class Ticket:
+    """The right of one request to be in the server.
+
+    Args:
+        client: Who asks; see `Admission.admit`.
+    """
+
+    def __init__(self, client: str) -> None:
+        self.client = client
+        self.at_work = False  # whether a worker has its job
+        self.bytes = 0
+        self.left = False
+        self._reason: ServiceError | None = None
+        self._timeout: asyncio.Timeout | None = None
+
+    def refuse(self, reason: ServiceError) -> None:
+        """End the request, wherever it is, with an error."""
+        self._reason = reason
+        if self._timeout is not None and not self._timeout.expired():
+            self._timeout.reschedule(asyncio.get_running_loop().time())
+
+
+class Admission:
+    """Bounds the requests and the bytes in the server; used in the event loop only.
+
+    Every client may have all places while nobody else asks. Where there is none left, who holds
+    more than half of them gives one up to the next client.
+
+    Args:
+        workers: Requests worked on at a time.
+        max_waiting: Requests in the server beside those.
+        max_bytes: Of bodies held; a client holds at most half of them.
+    """
+
+    def __init__(self, workers: int, max_waiting: int, max_bytes: int) -> None:
+        self.held_bytes = 0
+        self._workers = workers
+        self._max_tickets = workers + max_waiting
+        self._max_bytes = max_bytes
+        self._tickets: list[Ticket] = []  # in the order they came
+        self._client_bytes: Counter[str] = Counter()
+        self._waiting: deque[asyncio.Future[None]] = deque()  # for bytes
+        self._took: deque[float] = deque(maxlen=LATEST)  # seconds of the latest jobs
+        self._empty = asyncio.Event()
+        self._empty.set()
+
+    @property
+    def tickets(self) -> int:
+        """Requests in the server."""
+        return len(self._tickets)
+
+    @asynccontextmanager
+    async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
+        """Be in the server for a while.
+
+        Args:
+            client: The name of the token or else the address; requests of one are told apart
+                from those of others.
+            deadline: By the clock of the event loop; what happens inside is cancelled then.
+            size: Bytes that its body may have. Waits until there is room for them.
+
+        Raises:
+            Overloaded: There is no place, or its turn would come after its deadline.
+            DeadlineExceeded: The deadline passed inside.
+        """
+        self._check_pace(deadline)
+        self.check_room(client, make_room=True)
+        ticket = Ticket(client)
+        self._tickets.append(ticket)
+        self._empty.clear()
+        try:
+            async with asyncio.timeout_at(deadline) as ticket._timeout:
+                await self._reserve(ticket, size)
+                yield ticket
+        except TimeoutError:
+            if ticket._timeout is None or not ticket._timeout.expired():
+                raise
+            raise ticket._reason or deadline_exceeded() from None
+        finally:
+            self._leave(ticket)
+
+    def check_room(self, client: str, *, make_room: bool = False) -> None:
+        """Raise Overloaded unless there is a place for one more, or another client may lose one.
+
+        Args:
+            client: Who asks.
+            make_room: Refuse the other client's latest request.
+        """
+        if len(self._tickets) < self._max_tickets:
+            return
+        holder, count = Counter(ticket.client for ticket in self._tickets).most_common(1)[0]
+        for ticket in reversed(self._tickets):
+            if count * 2 <= self._max_tickets or holder == client:
+                break
+            if ticket.client == holder and not ticket.at_work:
+                if make_room:
+                    ticket.refuse(self._full("Others wait, and you hold most of its places"))
+                    self._leave(ticket)
+                return
+        raise self._full(f"{len(self._tickets)} requests are in it")
+
+    def resize(self, ticket: Ticket, size: int) -> None:
+        """Say how many bytes a ticket really holds."""
+        if not ticket.left:
+            self.held_bytes += size - ticket.bytes
+            self._client_bytes[ticket.client] += size - ticket.bytes
+            ticket.bytes = size
+            for waiting in self._waiting:
+                if not waiting.done():
+                    waiting.set_result(None)
+            self._waiting.clear()
+
+    def worked(self, seconds: float) -> None:
+        """Tell how long a worker took."""
+        self._took.append(seconds)
+
+    def refuse_all(self, reason: ServiceError) -> None:
+        """End every request in the server with an error."""
+        for ticket in self._tickets:
+            ticket.refuse(reason)
+
+    async def empty(self) -> None:
+        """Return once no request is in the server."""
+        await self._empty.wait()
+
+    @property
+    def _wait(self) -> float:
+        """Seconds until a new request has its turn, at the latest pace."""
+        pace = statistics.median(self._took) if self._took else 0.0
+        return max(0, len(self._tickets) + 1 - self._workers) * pace / self._workers
+
+    def _check_pace(self, deadline: float) -> None:
+        remaining = deadline - asyncio.get_running_loop().time()
+        if remaining <= 0.0:
+            raise deadline_exceeded()
+        wait = self._wait
+        if self._tickets and wait * MARGIN > remaining:
+            seconds = _whole_seconds(wait)
+            raise Overloaded(
+                f"The deadline is {remaining:.3g} s away, and {len(self._tickets)} requests come "
+                f"first, which take about {wait:.3g} s. Try again in {seconds} s.",
+                seconds,
+            )
+
+    def _full(self, why: str) -> Overloaded:
+        seconds = _whole_seconds(self._wait)
+        return Overloaded(f"The server is full: {why}. Try again in {seconds} s.", seconds)
+
+    async def _reserve(self, ticket: Ticket, size: int) -> None:
+        """Wait until the bytes of all requests, and of this client, leave room for so many."""
+        while (self.held_bytes and self.held_bytes + size > self._max_bytes) or (
+            self._client_bytes[ticket.client]
+            and self._client_bytes[ticket.client] + size > self._max_bytes // 2
+        ):
+            waiting = asyncio.get_running_loop().create_future()
+            self._waiting.append(waiting)
+            await waiting
+        self.resize(ticket, size)
+
+    def _leave(self, ticket: Ticket) -> None:
+        if ticket.left:
+            return
+        self.resize(ticket, 0)
+        ticket.left = True
+        self._tickets.remove(ticket)
+        if not self._client_bytes[ticket.client]:
+            del self._client_bytes[ticket.client]
+        if not self._tickets:
+            self._empty.set()
+
+
+def deadline_exceeded() -> DeadlineExceeded:
+    """The error for an answer that comes too late."""
+    return DeadlineExceeded("The deadline passed before there was an answer.")
+
+
+def _whole_seconds(wait: float) -> int:
+    """As in the header Retry-After: whole, and never none."""
+    return max(1, math.ceil(wait))

@@ -1,0 +1,346 @@
+"""What is told of requests: a log line, counts for Prometheus, and OpenTelemetry spans."""
+
+import contextlib
+import http
+import json
+import logging
+import logging.handlers
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
+
+from edgegrasp_service.call import CALL, Call
+from edgegrasp_service.errors import STATUS, InvalidSettings
+from edgegrasp_service.settings import Settings, one_line
+
+# Logs: JSON lines or text; a thread writes them, so that no log can hold up a request
+
+MAX_WAITING = 4096  # records; more than that, and new ones are dropped
+STOP_SECONDS = 1.0
+PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
+
+requests = logging.getLogger("edgegrasp_service.requests")
+
+
+def log_call(call: Call) -> None:
+    """Write one line about a call that has ended, and another about a fault of the server."""
+    if call.facts.traceback:
+        fault = {"traceback": call.facts.traceback}
+        requests.error("%s failed with %s", call.method, call.facts.options, extra=fault)
+    level = logging.DEBUG if call.method in PROBES else logging.INFO
+    if call.problem is not None and call.problem.status >= 500:
+        level = logging.WARNING
+    if not requests.isEnabledFor(level):
+        return
+    milliseconds = {name: round(seconds * 1e3, 1) for name, seconds in call.stages.items()}
+    fields = {
+        "transport": call.transport,
+        "method": call.method,
+        "code": call.code,
+        "error": "" if call.problem is None else call.problem.kind,
+        "detail": "" if call.problem is None else call.problem.detail,
+        "seconds": round(call.seconds, 6),
+        "peer": call.peer,
+        "token": call.token,
+        "bytes_in": call.bytes_in,
+        "bytes_out": call.bytes_out,
+        "model": call.facts.model,
+        "points": call.facts.points,
+        "voxels": call.facts.voxels,
+        "grasps": call.facts.grasps,
+        "milliseconds": milliseconds,
+    }
+    known = {name: value for name, value in fields.items() if value not in ("", 0, {})}
+    requests.log(level, "request", extra={"fields": {"request_id": call.request_id} | known})
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line, with `fields` of the record beside its message."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record."""
+        line = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        line |= getattr(record, "fields", {})
+        if trace := _traceback(self, record):
+            line["exception"] = trace
+        return json.dumps(line, default=str)
+
+
+class TextFormatter(logging.Formatter):
+    """A line to read; nothing a caller sent can begin another one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line of a record, and its traceback below."""
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(" ", "milliseconds")[:23]
+        fields = getattr(record, "fields", {})
+        words = " ".join(f"{name}={value}" for name, value in fields.items())
+        line = f"{time} {record.levelname} {record.name}: {record.getMessage()} {words}"
+        trace = _traceback(self, record)
+        return one_line(line.rstrip()) + (f"\n{trace}" if trace else "")
+
+
+def _traceback(formatter: logging.Formatter, record: logging.LogRecord) -> str:
+    """Of this process, or of the worker that told of it; empty: there is none."""
+    told: str = getattr(record, "traceback", "")
+    return formatter.formatException(record.exc_info) if record.exc_info else told
+
+
+class LogQueue(logging.handlers.QueueHandler):
+    """Hands lines to a thread that writes them, and goes on where that fails.
+
+    Attributes:
+        dropped: Lines that no one will read: the disk is full, the stream closed or not read.
+    """
+
+    def __init__(self, stream: TextIO | None, formatter: logging.Formatter) -> None:
+        super().__init__(queue.Queue(MAX_WAITING))
+        self.setFormatter(formatter)
+        self.dropped = 0
+        self._closed = False
+        self._stream = stream
+        writer = logging.Handler()
+        writer.handle = self._write  # type: ignore[method-assign, assignment]
+        self._listener = logging.handlers.QueueListener(self.queue, writer)
+        self._listener.start()
+
+    def prepare(self, record: logging.LogRecord) -> str:
+        """The line of a record, while its request is known."""
+        call = CALL.get()
+        if call is not None and not hasattr(record, "fields"):
+            record.fields = {"request_id": call.request_id}
+        return self.format(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Count a line that cannot be formatted, or that there is no room for."""
+        self.dropped += 1
+
+    def close(self) -> None:
+        """Write what is queued, unless nobody reads it."""
+        if self._closed:
+            return
+        self._closed = True
+        stop = threading.Thread(target=self._stop, daemon=True)
+        stop.start()
+        stop.join(STOP_SECONDS)
+        super().close()
+
+    def _stop(self) -> None:
+        with contextlib.suppress(queue.Full):
+            self._listener.stop()
+
+    def _write(self, line: str) -> None:
+        self.dropped += not write_line(self._stream, line)
+
+
+def write_line(stream: TextIO | None, line: str) -> bool:
+    """Write a line past the stream's buffer, which would keep it and fail again on closing.
+
+    Args:
+        stream: None: this process was started with it closed.
+        line: Without a line end.
+
+    Returns:
+        Whether it was written.
+    """
+    if stream is None:
+        return False
+    try:
+        rest = f"{line}\n".encode("utf-8", "backslashreplace")
+        while rest:
+            rest = rest[os.write(stream.fileno(), rest) :]
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
+    """Send every record of this process to a stream; close what is returned when it ends."""
+    terminal = stream is not None and not stream.closed and stream.isatty()
+    text = settings.log_format == "text" or (settings.log_format == "auto" and terminal)
+    handler = LogQueue(stream, TextFormatter() if text else JsonFormatter())
+    logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    return handler
+
+
+# Metrics: every label has few values, whatever callers send
+
+OTHER = "other"
+SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
+FEW = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
+
+_CODES = {"OK", "UNKNOWN", "499"} | {code for code, _ in STATUS.values()}
+_CODES |= {str(status.value) for status in http.HTTPStatus}
+
+
+class Metrics:
+    """Counts, gauges and histograms of one server.
+
+    Args:
+        methods: Values of the label `method`; any other counts as "other".
+    """
+
+    def __init__(self, methods: Sequence[str]) -> None:
+        self.registry = CollectorRegistry()
+        self._methods = frozenset(methods)
+        ProcessCollector(registry=self.registry)
+        calls = ("transport", "method")
+        self._requests = self._counter("requests", "requests answered", (*calls, "code"))
+        self._seconds = self._histogram("request_seconds", "from headers to answer", SECONDS, calls)
+        self._stages = self._histogram("stage_seconds", "stages of a request", SECONDS, ("stage",))
+        self._candidates = self._histogram("candidates", "candidates of a detection", MANY)
+        self._grasps = self._histogram("grasps_returned", "grasps of a detection", FEW)
+        self._results = self._counter("stream_results", "results sent on streams", ("code",))
+        self._workers = self._counter("workers_replaced", "worker processes that died")
+        self._reloads = self._counter("reloads", "weights loaded anew", ("outcome",))
+
+    def count_call(self, call: Call) -> None:
+        """Count a call that has ended; a request of a stream as a result of it."""
+        code = call.code if call.code in _CODES else OTHER
+        if call.in_stream:
+            self._results.labels(code).inc()
+        else:
+            method = call.method if call.method in self._methods else OTHER
+            self._requests.labels(call.transport, method, code).inc()
+            if not call.long:
+                self._seconds.labels(call.transport, method).observe(call.seconds)
+        for stage, seconds in call.stages.items():
+            self._stages.labels(stage).observe(seconds)
+        if call.problem is None and call.method.startswith("DetectGrasps") and call.facts.model:
+            self._candidates.observe(call.facts.counts.get("candidates", 0))
+            self._grasps.observe(call.facts.grasps)
+
+    def reloaded(self, succeeded: bool) -> None:
+        """Count a reload."""
+        self._reloads.labels("succeeded" if succeeded else "failed").inc()
+
+    def worker_replaced(self) -> None:
+        """Count a worker that died."""
+        self._workers.inc()
+
+    def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
+        """Show a number that is asked for when metrics are read."""
+        Gauge(f"edgegrasp_{name}", meaning, registry=self.registry).set_function(value)
+
+    def describe_models(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
+        """Show the loaded weights, whichever they are when metrics are read."""
+        self.registry.register(_ModelCollector(models))
+
+    def page(self, accept: str) -> tuple[bytes, str]:
+        """All metrics as text, and its content type.
+
+        Args:
+            accept: The header of that name; OpenMetrics to whom asks for it.
+        """
+        encoder, content_type = choose_encoder(accept)
+        return encoder(self.registry), content_type
+
+    def _counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
+        return Counter(f"edgegrasp_{name}", meaning, labels, registry=self.registry)
+
+    def _histogram(
+        self, name: str, meaning: str, buckets: Sequence[float], labels: Sequence[str] = ()
+    ) -> Histogram:
+        return Histogram(
+            f"edgegrasp_{name}", meaning, labels, buckets=buckets, registry=self.registry
+        )
+
+
+class _ModelCollector(Collector):
+    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
+        self._models = models
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        labels = ("name", "digest", "architecture", "default", "device")
+        family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
+        for model in self._models():
+            default = str(model.get("default", False)).lower()
+            facts = [str((model | {"default": default}).get(label, "")) for label in labels]
+            family.add_metric(facts, 1.0)
+        yield family
+
+
+# Traces: a span for each request, and one for each of its stages inside it
+
+NANOSECONDS = 1_000_000_000
+
+
+class Tracer:
+    """Makes spans of calls; a caller's `traceparent` is the parent of its request's.
+
+    Args:
+        provider: An OpenTelemetry tracer provider.
+    """
+
+    def __init__(self, provider: Any) -> None:
+        from opentelemetry import trace
+        from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
+
+        self._trace = trace
+        self._propagator = TraceContextTextMapPropagator()
+        self._tracer = provider.get_tracer("edgegrasp_service")
+
+    def trace_call(self, call: Call) -> None:
+        """Make the spans of a call that has ended; of those only that had to do with grasps."""
+        if "admission" not in call.stages:
+            return
+        start = time.time_ns() - int((time.monotonic() - call.start) * NANOSECONDS)
+        attributes: dict[str, str | int] = {
+            "edgegrasp.transport": call.transport,
+            "edgegrasp.request_id": call.request_id,
+            "edgegrasp.model": call.facts.model,
+            "edgegrasp.code": "OK" if call.problem is None else call.problem.code,
+        }
+        for name, count in call.facts.counts.items():
+            attributes[f"edgegrasp.count.{name}"] = count
+        span = self._tracer.start_span(
+            call.method,
+            context=self._propagator.extract({"traceparent": call.traceparent}),
+            kind=self._trace.SpanKind.SERVER,
+            start_time=start,
+            attributes=attributes,
+        )
+        if call.problem is not None and call.problem.status >= 500:
+            span.set_status(self._trace.StatusCode.ERROR, call.problem.kind)
+        inside = self._trace.set_span_in_context(span)
+        begin = start
+        for name, seconds in call.stages.items():
+            end = begin + int(seconds * NANOSECONDS)
+            self._tracer.start_span(name, context=inside, start_time=begin).end(end)
+            begin = end
+        span.end(start + int(call.seconds * NANOSECONDS))
+
+
+def otlp_provider(endpoint: str) -> Any:
+    """A tracer provider that posts spans to an OTLP/HTTP endpoint; shut it down in the end.
+
+    Raises:
+        InvalidSettings: The OpenTelemetry packages are not installed.
+    """
+    try:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+        from opentelemetry.sdk.resources import SERVICE_NAME, Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+    except ModuleNotFoundError as error:
+        raise InvalidSettings(
+            f"otlp_endpoint: got {endpoint!r}. {error}: pip install 'edgegrasp[otel]'."
+        ) from None
+    provider = TracerProvider(resource=Resource.create({SERVICE_NAME: "edgegrasp"}))
+    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter(endpoint=endpoint, timeout=5)))
+    return provider

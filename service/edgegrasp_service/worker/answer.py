@@ -1,0 +1,219 @@
+"""Answer requests: decode, detect, encode; one at a time, in a worker process.
+
+Whatever is wrong with a request comes back as a Problem. Nothing here knows of event loops,
+connections or the servers of either transport.
+"""
+
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
+from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
+from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
+from edgegrasp_service.schemas import GIVEN
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker import http_bodies, messages
+from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
+from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
+
+Result = TypeVar("Result", Detection, Scoring)
+
+
+class Catalogue(Protocol):
+    """Detectors by the name of their weights: a ModelCatalogue, or the dummy's."""
+
+    def get(self, name: str = "") -> Any:
+        """The detector of that name, the default for ""; raises UnknownModel."""
+
+    def describe(self) -> Sequence[Mapping[str, Any]]:
+        """The facts of each set of weights."""
+
+    def warm_up(self) -> None:
+        """Run every detector once, so that the first request is not the slowest."""
+
+
+def load_catalogue(settings: Settings) -> Catalogue:
+    """Load the detectors that the settings name and warm them up; takes seconds.
+
+    Raises:
+        EdgeGraspError: Weights cannot be used, or the device is not there.
+    """
+    if settings.backend == "dummy":
+        from edgegrasp_service.worker.dummy import DummyCatalogue
+
+        return DummyCatalogue(settings.dummy_seconds)
+    # Torch takes seconds to import, and the dummy does without.
+    from edgegrasp_model.detector import ModelCatalogue, choose_device
+
+    catalogue: Catalogue = ModelCatalogue.load(
+        settings.weights,
+        settings.default_model,
+        choose_device(settings.device),
+        settings.grippers,
+        settings.max_voxels,
+    )
+    catalogue.warm_up()
+    return catalogue
+
+
+def describe(catalogue: Catalogue) -> list[dict[str, Any]]:
+    """The facts of each set of weights, keyed as the fields of edgegrasp.v1.Model."""
+    known = grasp_pb2.Model.DESCRIPTOR.fields_by_name
+    return [
+        {name: value for name, value in facts.items() if name in known}
+        for facts in catalogue.describe()
+    ]
+
+
+class Answerer:
+    """Answers jobs with the detectors of a catalogue; keeps nothing of one for the next."""
+
+    def __init__(self, catalogue: Catalogue, limits: Limits | None = None) -> None:
+        """Wrap a catalogue; `limits` bound every request."""
+        self._catalogue = catalogue
+        self._limits = limits or Limits()
+
+    def answer(self, job: Job) -> Answer:
+        """Decode a job, detect, and encode the answer.
+
+        Returns:
+            The answer; or, for a request that cannot be answered, an empty one with its Problem.
+
+        Raises:
+            MemoryError: There is not enough; the process is better replaced.
+        """
+        work = _Work(job, self._catalogue, self._limits)
+        try:
+            return Answer(work.answer(), work.facts)
+        except EdgeGraspError as error:
+            problem = report(error)
+        except Exception as error:
+            if _out_of_memory(error):
+                raise MemoryError(str(error)) from None
+            problem = report(error)
+            work.facts.traceback = traceback.format_exc()
+            if work.options is not None:  # rows in it may be millions
+                work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
+        return Answer(b"", work.facts, problem)
+
+
+class _Work:
+    """One job on its way to an answer."""
+
+    def __init__(self, job: Job, catalogue: Catalogue, limits: Limits) -> None:
+        self.facts = Facts()
+        self.options: DetectOptions | None = None  # known once they are parsed
+        self._job = job
+        self._catalogue = catalogue
+        self._limits = limits
+        self._deadline = time.monotonic() + job.remaining
+
+    def answer(self) -> bytes:
+        """The body of the answer; raises any error that there may be."""
+        encoding: Any = messages if self._job.transport == "grpc" else http_bodies
+        if self._job.method == "DetectGrasps":
+            return self._encoded(self._detect(), encoding.write_detection)
+        return self._encoded(self._score(), encoding.write_scoring)
+
+    def _detect(self) -> Detection:
+        with self._stage("decode"):
+            detector, cloud, options, _ = self._decode()
+        with self._stage("prepare"):
+            prepared = detector.prepare(cloud, options)
+            self._count(prepared.counts)
+        with self._stage("network"):
+            logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
+        prepared.seconds["network"] = self.facts.seconds["network"]
+        with self._stage("finish"):
+            detection: Detection = detector.finish(prepared, logits)
+        self.facts.grasps = len(detection.grasps)
+        return detection
+
+    def _score(self) -> Scoring:
+        with self._stage("decode"):
+            detector, cloud, options, given = self._decode()
+        with self._stage("score"):
+            scoring: Scoring = detector.score(cloud, options, **given)
+        self.facts.grasps = len(scoring.evaluations)
+        return scoring
+
+    def _encoded(self, result: Result, write: Callable[[Result], bytes]) -> bytes:
+        self.facts.model = result.model
+        self._count(result.counts)
+        with self._stage("encode"):
+            return write(result)
+
+    def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
+        """What a request is about, within the limits: detector, cloud, options, given grasps."""
+        job, limits = self._job, self._limits
+        if job.transport == "grpc":
+            fields = messages.read_request(job.method, job.body)
+        else:
+            fields = http_bodies.read_body(job.method, job.content_type, job.query, job.body)
+        self.options = options = parse_options(fields["options"])
+        _limit(
+            "options.num_approach_points", options.num_approach_points, limits.max_approach_points
+        )
+        _limit("options.num_candidates", options.num_candidates, limits.max_candidates)
+        detector = self._catalogue.get(options.model)
+        given = {} if job.method == "DetectGrasps" else _given(fields, limits)
+        cloud, options = decode_cloud(fields, options, limits.max_points)
+        points = cloud.points
+        self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
+        return detector, cloud, options, given
+
+    def _count(self, counts: Mapping[str, int]) -> None:
+        self.facts.counts = dict(counts)
+        self.facts.voxels = counts.get("voxels", 0)
+
+    @contextmanager
+    def _stage(self, name: str) -> Iterator[None]:
+        """Time a stage; raises DeadlineExceeded instead of beginning it too late."""
+        start = time.monotonic()
+        if start > self._deadline:
+            raise DeadlineExceeded("The deadline passed before there was an answer.")
+        try:
+            yield
+        finally:
+            self.facts.seconds[name] = time.monotonic() - start
+
+
+def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]:
+    """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
+    names = [name for name in GIVEN if fields.get(name) is not None]
+    if not names:
+        raise InvalidRequest("edges", "nothing", "Send edges or hand_poses.")
+    if len(names) == 2:
+        raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
+    name, given = names[0], fields[names[0]]
+    if not isinstance(given, np.ndarray):
+        given = decode_array(name, given, limits.max_points)
+    rows = given.shape[0] if given.ndim else 0
+    if rows <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
+        _limit(name, rows, limits.max_candidates)
+    if name == "hand_poses" and given.dtype.kind in "iu":
+        given = given.astype(np.float64)
+    return {name: given}
+
+
+def _limit(field: str, asked: int, most: int) -> None:
+    if asked > most:
+        raise PayloadTooLarge(field, str(asked), f"This server takes at most {most}.")
+
+
+def _out_of_memory(error: Exception) -> bool:
+    """Whether an error says so; PyTorch has a RuntimeError of its own for each device."""
+    return (
+        isinstance(error, MemoryError)
+        or type(error).__name__ == "OutOfMemoryError"
+        or "can't allocate memory" in str(error)
+    )

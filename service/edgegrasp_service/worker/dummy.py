@@ -1,0 +1,168 @@
+"""A detector of known service time and made-up grasps, to measure and test the service alone."""
+
+import time
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.errors import UnknownModel
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import (
+    DebugInfo,
+    Detection,
+    Evaluation,
+    Float32,
+    Grasp,
+    NoGrasp,
+    Outcome,
+    Scoring,
+)
+from edgegrasp_model.scene.cloud import (
+    CloudInput,
+    check_cloud,
+    check_edges,
+    check_hand_poses,
+)
+
+NAME = "dummy"
+TCP_Z = 0.1  # metres along the hand's z
+GRASPS = 10  # made at most
+WARNING = "The dummy detector made these grasps up."
+
+
+@dataclass(frozen=True)
+class DummyPrepared:
+    """A request between the stages."""
+
+    options: DetectOptions
+    points: Float32  # (N, 3)
+    drawn: NDArray[np.int64]  # (A,) approach points, rows of `points`
+    batch: Float32  # (A,) scores, descending, which the network gives back
+    counts: dict[str, int]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class DummyDetector:
+    """Puts top-down grasps on points drawn by the seed; they hold nothing.
+
+    Args:
+        seconds: What the network takes for one request.
+    """
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._seconds = seconds
+
+    def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
+        """Draw approach points, the same ones for the same cloud and options.
+
+        Args:
+            cloud: As for a real detector.
+            options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
+
+        Raises:
+            InvalidRequest: The cloud cannot be used, as for a real detector.
+        """
+        points = check_cloud(cloud, options.num_approach_points).points
+        random = np.random.default_rng(options.seed)
+        drawn = random.choice(len(points), options.num_approach_points, replace=False)
+        scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
+        counts = {"points": len(points), "scored": len(drawn)}
+        counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
+        return DummyPrepared(options, points, drawn, scores, counts)
+
+    def run(self, batch: Float32) -> Float32:
+        """Take the time of a network."""
+        time.sleep(self._seconds)
+        return batch
+
+    def finish(self, prepared: DummyPrepared, logits: Float32) -> Detection:
+        """Put a grasp on each of the best approach points."""
+        options, points, drawn = prepared.options, prepared.points, prepared.drawn
+        grasps = [
+            _top_down(points[row], float(score))
+            for row, score in zip(drawn[:GRASPS], logits[:GRASPS], strict=True)
+            if score >= options.min_score
+        ][: options.top_k]
+        counts = prepared.counts | {"returned": len(grasps)}
+        seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
+        debug = _debug(points, drawn, logits) if options.debug else None
+        return Detection(grasps, counts, seconds, NAME, [WARNING], debug)
+
+    def score(
+        self,
+        cloud: CloudInput,
+        options: DetectOptions,
+        *,
+        edges: NDArray[Any] | None = None,
+        hand_poses: NDArray[Any] | None = None,
+    ) -> Scoring:
+        """Make up scores; an edge from a row to itself defines no grasp.
+
+        Raises:
+            InvalidRequest: The cloud, an edge or a pose cannot be used, as for a real detector.
+        """
+        checked = check_cloud(cloud)
+        if edges is not None:
+            rows = check_edges(edges, checked.rows_sent)
+            nearest = np.searchsorted(checked.row, rows[:, 1]).clip(max=len(checked.row) - 1)
+            contacts, is_grasp = checked.points[nearest], rows[:, 0] != rows[:, 1]
+        else:
+            poses = check_hand_poses(hand_poses)
+            contacts = (poses @ np.array([0.0, 0.0, TCP_Z, 1.0], np.float32))[:, :3]
+            is_grasp = np.ones(len(poses), dtype=bool)
+        scores = np.random.default_rng(options.seed).random(len(contacts), dtype=np.float32)
+        evaluations = [
+            Evaluation(_top_down(contact, float(score)), None)
+            if grasps
+            else Evaluation(None, NoGrasp.TOO_SHORT)
+            for contact, score, grasps in zip(contacts, scores, is_grasp, strict=True)
+        ]
+        counts = {"points": len(checked.points), "scored": int(is_grasp.sum())}
+        return Scoring(evaluations, counts, {"total": 0.0}, NAME, [WARNING])
+
+
+class DummyCatalogue:
+    """The dummy detector as the only weights."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._detector = DummyDetector(seconds)
+
+    def get(self, name: str = "") -> DummyDetector:
+        """The detector; raises UnknownModel for any name but its own."""
+        if name not in ("", NAME):
+            raise UnknownModel(name, [NAME])
+        return self._detector
+
+    def describe(self) -> list[dict[str, Any]]:
+        """The facts of the dummy."""
+        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
+        return [facts | {"device": "cpu"}]
+
+    def warm_up(self) -> None:
+        """There is nothing to warm up."""
+
+
+def _top_down(point: Float32, score: float) -> Grasp:
+    T_cloud_hand = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
+    T_cloud_tcp = T_cloud_hand.copy()
+    T_cloud_tcp[:3, 3] = point
+    T_cloud_hand[:3, 3] = point + np.array([0.0, 0.0, TCP_Z], dtype=np.float32)
+    down = np.array([0.0, 0.0, -1.0], dtype=np.float32)
+    return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, down, True, 0.0)
+
+
+def _debug(points: Float32, drawn: NDArray[np.int64], scores: Float32) -> DebugInfo:
+    returned = np.arange(len(drawn)) < GRASPS
+    return DebugInfo(
+        points=points,
+        normals=np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(points), 1)),
+        approach_index=drawn,
+        contact_index=drawn,
+        T_cloud_hand=np.stack([_top_down(points[row], 0.0).T_cloud_hand for row in drawn]),
+        score=np.where(returned, scores, np.float32(np.nan)),
+        outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
+        support_plane=None,
+    )

@@ -1,0 +1,273 @@
+"""HTTP bodies: take those of requests apart, and write those of answers.
+
+A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
+"""
+
+import gc
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from email.message import Message
+from email.parser import HeaderParser
+from functools import partial
+from pathlib import PurePath
+from typing import Any, NamedTuple
+from urllib.parse import parse_qsl
+
+import numpy as np
+import orjson
+
+from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_service.errors import UnsupportedMediaType
+from edgegrasp_service.schemas import FILE_TYPES, GIVEN, PER_POINT
+from edgegrasp_service.worker.job import Method
+from edgegrasp_service.worker.request_cloud import SOURCES, File
+
+JSON, FORM = "application/json", "multipart/form-data"
+MAX_QUERY_FIELDS = 64
+MAX_PART_HEADER = 8192  # bytes
+MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
+
+
+def read_body(method: Method, content_type: str, query: str, body: bytes) -> dict[str, Any]:
+    """The fields of a request.
+
+    Args:
+        method: What is asked for; ScoreGrasps has the fields GIVEN and takes no bare file.
+        content_type: The header as sent.
+        query: The query string: the options of a bare file.
+        body: The whole body.
+
+    Returns:
+        Those of SOURCES, PER_POINT and GIVEN that were sent, JSON or File; and `options`, a dict.
+
+    Raises:
+        InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
+            there are query parameters beside one that has its own options.
+        UnsupportedMediaType: There is no reader for the content type.
+    """
+    header = _header(f"Content-Type: {content_type}")
+    media_type = content_type.partition(";")[0].strip().lower()
+    scores = method == "ScoreGrasps"
+    accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
+    if media_type not in accepted:
+        fix = f"Send one of: {', '.join(accepted)}."
+        raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
+    parameters = _query_fields(query)
+    if media_type in FILE_TYPES:
+        file = File(FILE_TYPES[media_type], body)
+        return {"cloud": file, "options": options_from_query(parameters)}
+    if parameters:
+        fix = "Send options in the part `options`."
+        raise InvalidRequest(parameters[0][0], "a query parameter", fix)
+    known = ("points", *SOURCES[2:], *PER_POINT, *(GIVEN if scores else ()), "options")
+    if media_type == JSON:
+        fields: dict[str, Any] = read_json("body", body)
+        if not isinstance(fields, dict):
+            raise InvalidRequest("body", brief(fields), "Send a JSON object.")
+        _refuse_unknown(fields, known, "field")
+    else:
+        known = ("cloud", *known[1:])
+        parts = list(_parts(body, header.get_boundary(), len(known) + 1))
+        fields = _fields_of_form(parts, known)
+    if not isinstance(fields.setdefault("options", {}), dict):
+        raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
+    return fields
+
+
+def write_detection(detection: Detection) -> bytes:
+    """A detection as DetectionBody; every float is a float32 written out exactly."""
+    debug = None if detection.debug is None else _plain(detection.debug)
+    grasps = [_plain(grasp) for grasp in detection.grasps]
+    return orjson.dumps(vars(detection) | {"grasps": grasps, "debug": debug})
+
+
+def write_scoring(scoring: Scoring) -> bytes:
+    """Evaluations as ScoringBody."""
+    evaluations = [
+        {"grasp": None if each.grasp is None else _plain(each.grasp), "reason": each.reason}
+        for each in scoring.evaluations
+    ]
+    return orjson.dumps(vars(scoring) | {"evaluations": evaluations})
+
+
+def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
+    for name in fields:
+        if name not in known:
+            *names, last = known
+            fix = f"Send {', '.join(names)} and {last} only."
+            raise InvalidRequest(name, f"an unknown {kind}", fix)
+
+
+# JSON
+
+
+def read_json(field: str, text: bytes) -> Any:
+    """What a text says, within the memory that a request of its size is worth.
+
+    Args:
+        field: What it is in the request.
+        text: UTF-8.
+
+    Raises:
+        InvalidRequest: It is no JSON, has a key twice, or would take far more memory than points
+            of its size do.
+    """
+    lists = text.count(b"[") + text.count(b"{")
+    # Most lists are points, of 8 bytes or more. An empty one takes 3 bytes, and 64 in memory.
+    if lists > len(text) // 7 + MAX_SHORT_LISTS:
+        value = f"{lists} lists and objects in {len(text)} bytes"
+        raise InvalidRequest(field, value, "Send lists that hold numbers.")
+    collecting = gc.isenabled()
+    gc.disable()  # it would look through millions of lists again and again, and find nothing
+    try:
+        return json.loads(text, object_pairs_hook=partial(_object, field))
+    except (ValueError, RecursionError) as error:
+        raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((name, count),) = Counter(name for name, _ in pairs).most_common(1)
+        raise InvalidRequest(field, f"{count} times the key {brief(name)}", "Send it once.")
+    return found
+
+
+# Options in a query
+
+
+def _query_fields(query: str) -> list[tuple[str, str]]:
+    try:
+        return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS)
+    except ValueError:
+        value = f"more than {MAX_QUERY_FIELDS} parameters"
+        raise InvalidRequest("query", value, "Send each option once.") from None
+
+
+def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """Decode query parameters, or what the command line takes; one an option.
+
+    A value is JSON (`seed=3`, `suppression=null`, `workspace={"min":[0,0,0],"max":[1,1,1]}`),
+    numbers between commas (`viewpoint=0.1,0.2,0.3`), or else the text itself
+    (`sampling=uniform`).
+
+    Raises:
+        InvalidRequest: A parameter stands there twice.
+    """
+    options: dict[str, Any] = {}
+    for name, text in items:
+        if name in options:
+            raise InvalidRequest(f"options.{name}", "two values", "Send it once.")
+        options[name] = _value(name, text)
+    return options
+
+
+def _value(name: str, text: str) -> object:
+    field = DetectOptions.model_fields.get(name)
+    if field is not None and field.annotation is str:
+        return text  # weights may be named 7 or null
+    if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
+        return text  # as may grippers
+    try:
+        return json.loads(text, object_pairs_hook=partial(_object, f"options.{name}"))
+    except (ValueError, RecursionError):
+        pass
+    if "," in text:
+        try:
+            return [float(part) for part in text.split(",")]
+        except ValueError:
+            pass
+    return text
+
+
+# Forms
+
+
+class Part(NamedTuple):
+    """One part of a form."""
+
+    name: str
+    file_format: str | None  # None: it is no file
+    data: bytes
+
+
+def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[Part]:
+    """The parts of a multipart body; what is no such body costs no more than one look at it."""
+    if not boundary:
+        raise _no_form("no boundary in its Content-Type")
+    delimiter = b"\r\n--" + boundary.encode("utf-8", "replace")
+    pieces = (b"\r\n" + body).split(delimiter, most + 1)
+    for piece in pieces[1:]:
+        if piece.startswith(b"--"):
+            return
+        if len(pieces) > most + 1:
+            raise _no_form(f"more than {most} parts")
+        padding, _, rest = piece.partition(b"\r\n")
+        end = rest.find(b"\r\n\r\n", 0, MAX_PART_HEADER)
+        if padding.strip(b" \t") or end < 0:
+            raise _no_form("a part without a header of its own")
+        header = _header(rest[:end].decode("utf-8", "replace"))
+        name = header.get_param("name", header="Content-Disposition")
+        if not isinstance(name, str):
+            raise _no_form("a part without a name")
+        is_file = header.get_filename() is not None
+        yield Part(name, _format_of(header) if is_file else None, rest[end + 4 :])
+    raise _no_form("no boundary at its end")
+
+
+def _no_form(fault: str) -> InvalidRequest:
+    fix = "Send a file part `cloud` and a JSON part `options`."
+    return InvalidRequest("body", f"a form that cannot be read ({fault})", fix)
+
+
+def _header(text: str) -> Message:
+    whole_characters = text.encode("utf-8", "replace").decode()
+    return HeaderParser().parsestr(whole_characters, headersonly=True)
+
+
+def _format_of(header: Message) -> str:
+    """The format a part's content type names, or else its file name's ending."""
+    suffix = PurePath(header.get_filename("").replace("\0", "")).suffix
+    return FILE_TYPES.get(header.get_content_type()) or suffix[1:].lower()
+
+
+def _fields_of_form(parts: list[Part], known: tuple[str, ...]) -> dict[str, Any]:
+    """Files as File, other parts as the JSON that they hold."""
+    counts: Mapping[str, int] = Counter(part.name for part in parts)
+    _refuse_unknown(counts, known, "part")
+    for name, count in counts.items():
+        if count > 1:
+            raise InvalidRequest(name, f"{count} parts", "Send one.")
+    fields: dict[str, Any] = {}
+    for name, file_format, data in parts:
+        if name == "cloud" and file_format is None:
+            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+        # curl sends `-F options=@file;type=application/json` as a file too.
+        is_array = file_format == "npy" and name != "options"
+        if file_format is not None and (name == "cloud" or is_array):
+            fields[name] = File(file_format, data)
+        else:
+            fields[name] = read_json(name, data)
+    return fields
+
+
+# Answers
+
+
+def _plain(result: Grasp | DebugInfo) -> dict[str, Any]:
+    """Its fields as JSON has them; orjson writes NaN as null."""
+    fields: dict[str, Any] = {}
+    for name, value in vars(result).items():
+        if isinstance(value, np.ndarray | np.bool_):
+            fields[name] = value.tolist()
+        elif isinstance(value, float | np.floating):
+            fields[name] = float(np.float32(value))
+        else:
+            fields[name] = value
+    return fields

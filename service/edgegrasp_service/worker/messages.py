@@ -1,0 +1,238 @@
+"""Messages of gRPC: take requests apart, and write answers.
+
+What a request message holds becomes the fields in which the same request is written in JSON, so
+that one schema checks both.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from google.protobuf.descriptor import Descriptor
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.unknown_fields import UnknownFieldSet
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
+from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_service.schemas import PER_POINT
+from edgegrasp_service.worker.job import Method
+from edgegrasp_service.worker.request_cloud import File
+
+MAX_PARTS = 64  # messages in a repeated field; no option takes more
+MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
+CLOUD_FIX = "Send one of points, encoded, point_cloud2 and depth_images."
+
+
+def read_request(method: Method, body: bytes) -> dict[str, Any]:
+    """The fields of a request, as `http_bodies.read_body` gives them.
+
+    Args:
+        method: Whose request it is.
+        body: The serialized message.
+
+    Returns:
+        Plain values, with bytes where the message has bytes; edges (M, 2) and hand poses (M, 4, 4)
+        as arrays.
+
+    Raises:
+        InvalidRequest: It is no such message, has no cloud or two, a pose that is none, more parts
+            than any request needs, or a field that this server does not know.
+    """
+    scores = method == "ScoreGrasps"
+    kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
+    try:
+        message: Any = kind.FromString(body)
+    except DecodeError:
+        value = f"{len(body)} bytes that are no message of this method"
+        fix = "Send a message as the .proto file has it."
+        raise InvalidRequest("request", value, fix) from None
+    _check(message, "request")
+    fields = _cloud(message)
+    fields |= {name: getattr(message, name) for name in PER_POINT if message.HasField(name)}
+    fields["options"] = plain_options(message.options)
+    if scores and message.edges:
+        pairs = [(edge.approach_index, edge.contact_index) for edge in message.edges]
+        fields["edges"] = np.array(pairs)
+    if scores and message.hand_poses:
+        poses = enumerate(message.hand_poses)
+        fields["hand_poses"] = np.array(
+            [_matrix(pose.T_cloud_hand, f"hand_poses.{row}.T_cloud_hand") for row, pose in poses]
+        )
+    return fields
+
+
+def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
+    """The options that are set."""
+    return {field.name: _field(message, field) for field, _ in message.ListFields()}
+
+
+def write_detection(detection: Detection) -> bytes:
+    """A detection as DetectGraspsResponse."""
+    return grasp_pb2.DetectGraspsResponse(
+        grasps=[grasp_pb2.Grasp(**_flat(grasp)) for grasp in detection.grasps],
+        counts=detection.counts,
+        seconds=detection.seconds,
+        model=detection.model,
+        warnings=detection.warnings,
+        debug=None if detection.debug is None else grasp_pb2.DebugInfo(**_flat(detection.debug)),
+    ).SerializeToString()
+
+
+def write_scoring(scoring: Scoring) -> bytes:
+    """Evaluations as ScoreGraspsResponse."""
+    return grasp_pb2.ScoreGraspsResponse(
+        evaluations=[
+            grasp_pb2.Evaluation(
+                grasp=None if each.grasp is None else grasp_pb2.Grasp(**_flat(each.grasp)),
+                reason=each.reason,
+            )
+            for each in scoring.evaluations
+        ],
+        counts=scoring.counts,
+        seconds=scoring.seconds,
+        model=scoring.model,
+        warnings=scoring.warnings,
+    ).SerializeToString()
+
+
+# Requests
+
+
+def _check(message: Message, name: str) -> None:
+    """Refuse fields of no schema, and lists that would take minutes and gigabytes as Python."""
+    if len(unknown := UnknownFieldSet(message)):
+        numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
+        fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
+        raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
+    for field, is_repeated, is_message in _composite_fields(message.DESCRIPTOR):
+        here = f"{name}.{field}"
+        if is_repeated:
+            parts = getattr(message, field)
+            most = MAX_GIVEN.get(field, MAX_PARTS) if is_message else MAX_ROWS
+            if len(parts) > most:
+                here = here.removeprefix("request.")
+                raise InvalidRequest(here, f"{len(parts)} of them", f"Send at most {most}.")
+            for row, part in enumerate(parts if is_message else ()):
+                _check(part, f"{here}.{row}")
+        elif message.HasField(field):
+            _check(getattr(message, field), here)
+
+
+@cache
+def _composite_fields(descriptor: Descriptor) -> list[tuple[str, bool, bool]]:
+    """Fields that are repeated or messages; asking for bytes would copy them."""
+    return [
+        (field.name, field.is_repeated, field.message_type is not None)
+        for field in descriptor.fields
+        if field.is_repeated or field.message_type is not None
+    ]
+
+
+def _cloud(message: Any) -> dict[str, Any]:
+    """The cloud of either request; both have it in the same fields."""
+    which = message.WhichOneof("cloud")
+    if message.depth_images:
+        if which is not None:
+            raise InvalidRequest("depth_images", f"images beside {which}", CLOUD_FIX)
+        images = enumerate(message.depth_images)
+        return {"depth_images": [_depth_image(image, row) for row, image in images]}
+    match which:
+        case "points":
+            return {"points": message.points}
+        case "encoded":
+            return {"cloud": File(message.encoded.format, message.encoded.data)}
+        case "point_cloud2":
+            return {"point_cloud2": _plain_fields(message.point_cloud2)}
+    raise InvalidRequest("cloud", "nothing", CLOUD_FIX)
+
+
+def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:
+    pose = _matrix(message.T_cloud_camera, f"depth_images.{row}.T_cloud_camera")
+    message.ClearField("T_cloud_camera")
+    return _plain_fields(message) | {"T_cloud_camera": pose}
+
+
+def _matrix(numbers: Any, field: str) -> list[list[float]]:
+    if len(numbers) != 16:
+        raise InvalidRequest(field, f"{len(numbers)} numbers", "Send 16, row-major.")
+    return [list(numbers[start : start + 4]) for start in range(0, 16, 4)]
+
+
+def _plain_fields(message: Message) -> dict[str, Any]:
+    """The fields of a message: those set, and lists even where they are empty."""
+    return {
+        field.name: _field(message, field)
+        for field in message.DESCRIPTOR.fields
+        if field.is_repeated or not field.has_presence or message.HasField(field.name)
+    }
+
+
+def _field(message: Message, field: Any) -> Any:
+    value = getattr(message, field.name)
+    if field.is_repeated:
+        return list(value) if field.message_type is None else [_plain(part) for part in value]
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, Message):
+        return value
+    form = _FORMS.get(type(value))
+    return _plain_fields(value) if form is None else form(value)
+
+
+def _coordinates(message: Message) -> list[float]:
+    return [getattr(message, field.name) for field in message.DESCRIPTOR.fields]
+
+
+def _corners(message: grasp_pb2.HandBox) -> list[list[float]]:
+    return [_coordinates(message.min), _coordinates(message.max)]
+
+
+def _gripper(message: grasp_pb2.GripperChoice) -> Any:
+    which = message.WhichOneof("choice")
+    return None if which is None else _plain(getattr(message, which))
+
+
+def _tagged(message: Message) -> dict[str, Any]:
+    """The field of the oneof `kind` that is set, its name beside its fields."""
+    which = message.WhichOneof("kind")
+    return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
+
+
+def _support(message: grasp_pb2.Support) -> dict[str, Any]:
+    fields = _plain_fields(message)
+    ransac = fields.pop("ransac", None)
+    return fields if ransac is None else {"kind": "ransac"} | fields | ransac
+
+
+def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
+    fields = _plain_fields(message)
+    return None if fields.pop("disabled") else fields
+
+
+# What JSON writes in another way than field by field.
+_FORMS: dict[type[Message], Callable[[Any], Any]] = {
+    grasp_pb2.Vector: _coordinates,
+    grasp_pb2.Quaternion: _coordinates,
+    grasp_pb2.HandBox: _corners,
+    grasp_pb2.GripperChoice: _gripper,
+    grasp_pb2.Shape: _tagged,
+    grasp_pb2.Obstacle: _tagged,
+    grasp_pb2.Support: _support,
+    grasp_pb2.Suppression: _suppression,
+}
+
+
+# Answers
+
+
+def _flat(result: Grasp | DebugInfo) -> dict[str, Any]:
+    """Its fields as messages have them: arrays flat, in row-major order."""
+    return {
+        name: value.ravel().tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(result).items()
+    }

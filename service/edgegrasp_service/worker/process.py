@@ -1,0 +1,113 @@
+"""The processes that work: one that loads everything once, and those that fork from it.
+
+`main` is the nursery's. It imports and loads what a worker needs, and then forks a worker whenever
+the pool asks for one: there in milliseconds, its memory shared with all others until it is written
+to. The nursery never has a second thread.
+"""
+
+import contextlib
+import gc
+import os
+import resource
+import signal
+import socket
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from edgegrasp_model.errors import EdgeGraspError
+from edgegrasp_service.errors import WorkerLost, report
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.job import Answer, Facts, Limits
+from edgegrasp_service.worker.pipe import LOST, Failed, Ready, receive, send
+
+ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
+
+
+def main(load: Callable[[Settings], Any] | None = None) -> None:
+    """Load, then fork a worker for each socket that comes; until the pool is gone.
+
+    Args:
+        load: Makes the catalogue; None: `load_catalogue`.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # the pool says when to end
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
+    pool = socket.socket(fileno=0)
+    if (told := receive(pool)) is None:
+        return
+    settings = Settings(**told.settings)
+    try:
+        start = _prepare(settings, load)
+        send(pool, Ready(os.getpid(), []))
+    except EdgeGraspError as error:
+        send(pool, Failed(str(error)))
+        return
+    gc.collect()
+    gc.freeze()  # collecting would write to pages that are shared
+    while True:
+        _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
+        if not descriptors:
+            return
+        if os.fork() == 0:
+            try:
+                pool.close()
+                _work(socket.socket(fileno=descriptors[0]), settings, start)
+            except Exception:
+                traceback.print_exc()
+            finally:
+                os._exit(0)
+        os.close(descriptors[0])
+
+
+def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
+    """Import and load; returns what gives each worker its answerer and facts of its models.
+
+    A GPU's context cannot be forked: with one, every worker loads the weights for itself.
+    """
+    from edgegrasp_service.worker import answer
+
+    load = load or answer.load_catalogue
+    catalogue = load(settings) if settings.device == "cpu" else None
+
+    def start() -> tuple[Any, list[dict[str, Any]]]:
+        loaded = catalogue or load(settings)
+        return answer.Answerer(loaded, limits(settings)), answer.describe(loaded)
+
+    return start
+
+
+def limits(settings: Settings) -> Limits:
+    """The settings that bound one request."""
+    return Limits(**{name: getattr(settings, name) for name in Limits.__dataclass_fields__})
+
+
+def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> None:
+    """Answer jobs, one after the other, until the pool closes the socket."""
+    try:
+        answerer, models = start()
+    except EdgeGraspError as error:
+        send(pool, Failed(str(error)))
+        return
+    _limit_memory(settings.max_worker_bytes)
+    send(pool, Ready(os.getpid(), models))
+    while (job := receive(pool)) is not None:
+        signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
+        try:
+            answer: Answer = answerer.answer(job)
+        except BaseException:  # out of memory
+            facts = Facts(traceback=traceback.format_exc())
+            send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
+            return
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        send(pool, answer)
+        del job, answer  # or the next request would add to them
+
+
+def _limit_memory(most: int) -> None:
+    """Let this process take so many bytes more than it has; an allocation beyond that fails."""
+    with contextlib.suppress(OSError):  # no /proc: no limit
+        data_pages = int(Path("/proc/self/statm").read_text().split()[5])
+        limit = data_pages * resource.getpagesize() + most
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))

@@ -1,0 +1,378 @@
+"""Make the cloud of a request, in whichever form it was sent, into arrays.
+
+A request's fields are those of the JSON body on both transports. A value is JSON; or a `File`, as
+a form or a message carries it; or bytes, little-endian numbers that a message carries. Whether the
+arrays suit is for the detector to say.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+
+from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
+from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
+from edgegrasp_service.worker.formats import (
+    PCL_COLORS,
+    PCL_NORMALS,
+    cloud_of_pcl_fields,
+    read_file,
+    read_npy,
+    too_many,
+)
+
+Array = NDArray[Any]
+Schema = TypeVar("Schema", bound=BaseModel)
+
+SOURCES = ("points", "cloud", "point_cloud2", "depth_images")  # `cloud` is a File
+
+
+class File(NamedTuple):
+    """A file in a request."""
+
+    format: str  # such as "npy"; not checked yet
+    data: bytes
+
+
+def decode_cloud(
+    fields: Mapping[str, Any], options: DetectOptions, max_points: int
+) -> tuple[CloudInput, DetectOptions]:
+    """Decode the cloud of a request and the arrays beside it.
+
+    Args:
+        fields: Those of the request; one of SOURCES, any of PER_POINT.
+        options: Those of the request.
+        max_points: Most points accepted.
+
+    Returns:
+        The cloud; and the options, in which the cameras of depth images are the viewpoints.
+
+    Raises:
+        InvalidRequest: It cannot be decoded, or the same thing is sent twice.
+        PayloadTooLarge: More than `max_points` points.
+        DecoderMissing: The reader of the file's format is not installed.
+        UnsupportedMediaType: There is no reader for the file's format.
+    """
+    source = _source(fields)
+    if source == "depth_images":
+        if options.viewpoint is not None:
+            fix = "Leave it out: the viewpoints are the cameras of depth_images."
+            raise InvalidRequest("options.viewpoint", brief(options.viewpoint), fix)
+        if fields.get("view_ids") is not None:
+            fix = "Leave it out: it follows from depth_images."
+            raise InvalidRequest("view_ids", "an array beside depth_images", fix)
+        cloud, cameras = fuse_depth_images(fields[source], max_points)
+        viewpoint = cameras[0] if len(cameras) == 1 else tuple(cameras)
+        options = options.model_copy(update={"viewpoint": viewpoint})
+    elif source == "point_cloud2":
+        cloud = read_point_cloud2(fields[source], max_points)
+    elif source == "cloud":
+        file: File = fields[source]
+        cloud = read_file(file.format, file.data, max_points)
+    else:
+        cloud = CloudInput(decode_points(fields[source], max_points))
+    arrays: dict[str, Any] = {}
+    for name in PER_POINT:
+        if fields.get(name) is None:
+            continue
+        if getattr(cloud, name) is not None:
+            raise InvalidRequest(name, "an array beside the one in the cloud", "Send it once.")
+        arrays[name] = decode_array(name, fields[name], max_points)
+    return replace(cloud, **arrays), options
+
+
+def _source(fields: Mapping[str, Any]) -> str:
+    """Which of SOURCES a request has."""
+    sources = [name for name in SOURCES if fields.get(name) is not None]
+    if not sources:
+        fix = "Send a list of [x, y, z] in metres, point_cloud2, depth_images or a file."
+        raise InvalidRequest("points", "nothing", fix)
+    if len(sources) > 1:
+        raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
+    name = sources[0]
+    if isinstance(fields[name], File) != (name == "cloud"):
+        if name == "cloud":
+            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+        raise InvalidRequest(name, "an .npy file", "Send JSON, or the part `cloud`.")
+    return name
+
+
+# Points and arrays beside them
+
+
+def decode_points(points: object, max_points: int) -> Array:
+    """Read points: packed float32 x, y, z; or lists, with [null, null, null] for a hole.
+
+    Returns:
+        (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
+
+    Raises:
+        InvalidRequest: No whole number of points, no list, or lists that are no array of numbers.
+        PayloadTooLarge: More than `max_points` points.
+    """
+    if isinstance(points, bytes):
+        if len(points) % 12:
+            raise InvalidRequest(
+                "points",
+                f"{len(points)} bytes, which are no whole number of points",
+                "Send 12 bytes a point: little-endian float32 x, y, z.",
+            )
+        if len(points) // 12 > max_points:
+            raise too_many(len(points) // 12, max_points)
+        return np.frombuffer(points, dtype="<f4").reshape(-1, 3)
+    if not isinstance(points, list):
+        raise InvalidRequest("points", brief(points), "Send a list of [x, y, z] in metres.")
+    if len(points) > max_points:
+        raise too_many(len(points), max_points)
+    if not points:
+        return np.empty((0, 3))
+    array = _numbers("points", points, holes=True)
+    if array.size // 3 > max_points:
+        raise too_many(array.size // 3, max_points)
+    return array.astype(np.float64)
+
+
+def decode_array(field: str, value: object, max_points: int) -> Array:
+    """Read an array other than the points: packed numbers, an .npy file or lists.
+
+    Returns:
+        Of bytes (N, 3) float32 or (N,) int32, as PER_POINT says; of lists int64 where all numbers
+        are whole, else float64; of a file whatever is in it.
+
+    Raises:
+        InvalidRequest: A broken number, no .npy file, or lists that are no array of numbers.
+        PayloadTooLarge: More than `max_points` rows in a file.
+    """
+    if isinstance(value, File):
+        return read_npy(value.data, max_points, field)
+    if isinstance(value, bytes):
+        width, dtype, _ = PER_POINT[field]
+        if len(value) % (4 * width):
+            kind = "float32" if dtype == "<f4" else "int32"
+            fix = f"Send {4 * width} bytes a row: little-endian {kind}."
+            raise InvalidRequest(
+                field, f"{len(value)} bytes, which are no whole number of rows", fix
+            )
+        array = np.frombuffer(value, dtype=dtype)
+        return array.reshape(-1, 3) if width == 3 else array
+    if not isinstance(value, list):
+        raise InvalidRequest(field, brief(value), "Send a list of numbers, or of lists of them.")
+    return _numbers(field, value) if value else np.empty(0)
+
+
+def _numbers(field: str, values: list[Any], holes: bool = False) -> Array:
+    """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
+    one_length = "Send [x, y, z] rows." if holes else "Send rows of one length."
+    # As objects: an array of text would give every element the room of the longest.
+    try:
+        array = np.array(values, dtype=object)
+    except ValueError:
+        raise InvalidRequest(field, "rows of different lengths", one_length) from None
+    kinds = set(map(type, array.ravel().tolist()))
+    if list in kinds:
+        raise InvalidRequest(field, "rows of different lengths", one_length)
+    allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
+    if not kinds <= allowed:
+        bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
+        raise InvalidRequest(field, brief(bad), "Send numbers only.")
+    try:
+        return array.astype(np.int64 if kinds == {int} else np.float64)
+    except OverflowError:
+        bad = next(row for row in values if _holds(row, _too_large))
+        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
+
+
+def _holds(value: object, of_kind: Callable[[object], bool]) -> bool:
+    """Whether any number in lists of any depth is of a kind."""
+    if isinstance(value, list):
+        return any(_holds(part, of_kind) for part in value)
+    return of_kind(value)
+
+
+def _too_large(value: object) -> bool:
+    return isinstance(value, int) and not -(2**63) <= value < 2**63
+
+
+# sensor_msgs/PointCloud2
+
+POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
+    """Read x, y, z of a cloud, and normals and colours where there are any.
+
+    Args:
+        fields: As PointCloud2; `data` as bytes or base64.
+        max_points: Most points accepted.
+
+    Returns:
+        Points (N, 3), or (H, W, 3) where the height is 2 or more.
+
+    Raises:
+        InvalidRequest: A field is missing, unknown or wrong, or they contradict each other.
+        PayloadTooLarge: More than `max_points` points.
+    """
+    layout = _parse(PointCloud2, fields, "point_cloud2")
+    if layout.height * layout.width > max_points:
+        raise too_many(layout.height * layout.width, max_points, "point_cloud2")
+    record = _record(layout)
+    if layout.row_step < layout.width * layout.point_step:
+        value = f"{layout.row_step} for {layout.width} points of {layout.point_step} bytes"
+        raise InvalidRequest("point_cloud2.row_step", value, "Send width * point_step or more.")
+    expected = layout.height * layout.row_step
+    if len(layout.data) != expected:
+        value = f"{len(layout.data)} bytes where height * row_step is {expected}"
+        raise InvalidRequest("point_cloud2.data", value, "Send the whole cloud.")
+    shape, strides = (layout.height, layout.width), (layout.row_step, layout.point_step)
+    if 0 in shape:
+        return CloudInput(np.empty((0, 3), np.float32))
+    rows = np.ndarray(shape, record, layout.data, strides=strides).astype(record.newbyteorder("="))
+    return cloud_of_pcl_fields(rows[0] if layout.height == 1 else rows)
+
+
+def _record(layout: PointCloud2) -> np.dtype[Any]:
+    """The layout of a point, with the fields that are read."""
+    order = ">" if layout.is_bigendian else "<"
+    found: dict[str, tuple[str, int]] = {}
+    for row, field in enumerate(layout.fields):
+        here = f"point_cloud2.fields.{row}"
+        kind = order + POINT_TYPES[field.datatype]
+        size = np.dtype(kind).itemsize * max(1, field.count)
+        if field.offset + size > layout.point_step:
+            value = f"{field.name!r} of {size} bytes at {field.offset}"
+            fix = f"Send fields within point_step = {layout.point_step}."
+            raise InvalidRequest(f"{here}.offset", value, fix)
+        if field.name in found:
+            raise InvalidRequest(f"{here}.name", repr(field.name), "Send it once.")
+        if field.name in ("x", "y", "z") and (field.datatype not in (7, 8) or field.count > 1):
+            value = f"{field.datatype} with count {field.count} for {field.name!r}"
+            raise InvalidRequest(
+                f"{here}.datatype", value, "Send one 7 (float32) or 8 (float64), metres."
+            )
+        if field.count <= 1:
+            found[field.name] = (kind, field.offset)
+    missing = [axis for axis in "xyz" if axis not in found]
+    if missing:
+        value = ", ".join(found)[:80] or "no single numbers"
+        raise InvalidRequest("point_cloud2.fields", value, f"Send {', '.join(missing)} too.")
+    names = [name for name in ("x", "y", "z", *PCL_NORMALS, *PCL_COLORS) if name in found]
+    return np.dtype(
+        {
+            "names": names,
+            "formats": [found[name][0] for name in names],
+            "offsets": [found[name][1] for name in names],
+            "itemsize": layout.point_step,
+        }
+    )
+
+
+# Depth images
+
+DEPTH_ENCODINGS = {"32FC1": ("<f4", 1.0), "64FC1": ("<f8", 1.0), "16UC1": ("<u2", 0.001)}  # metres
+
+
+def fuse_depth_images(
+    images: object, max_points: int
+) -> tuple[CloudInput, list[tuple[float, float, float]]]:
+    """Turn views into one cloud.
+
+    Args:
+        images: A list of DepthImage, as plain values.
+        max_points: Most pixels accepted, of all images together.
+
+    Returns:
+        A cloud whose rows are the pixels, one image after the other, with NaN where a pixel has no
+        reading: (H, W, 3) for one image, (1, N, 3) and the view of each for several. And the
+        position of each camera, metres.
+
+    Raises:
+        InvalidRequest: A field is missing, unknown or wrong.
+        PayloadTooLarge: More than `max_points` pixels.
+    """
+    if not isinstance(images, list) or not 1 <= len(images) <= MAX_VIEWS:
+        count = f"{len(images)} images" if isinstance(images, list) else brief(images)
+        raise InvalidRequest("depth_images", count, f"Send a list of 1 to {MAX_VIEWS} images.")
+    views = [_parse(DepthImage, image, f"depth_images.{row}") for row, image in enumerate(images)]
+    depths: list[NDArray[np.float64]] = []
+    for row, view in enumerate(views):
+        depths.append(_depth(view.depth, f"depth_images.{row}.depth"))
+        pixels = sum(depth.size for depth in depths)
+        if pixels > max_points:
+            raise too_many(pixels, max_points, "depth_images")
+    clouds = [_points_of_pixels(depth, view) for depth, view in zip(depths, views, strict=True)]
+    cameras = [_position(view) for view in views]
+    if len(views) == 1:
+        return CloudInput(clouds[0]), cameras
+    points = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
+    view_ids = np.repeat(np.arange(len(clouds)), [depth.size for depth in depths])
+    return CloudInput(points, view_ids=view_ids), cameras
+
+
+def _position(view: DepthImage) -> tuple[float, float, float]:
+    (*_, x), (*_, y), (*_, z), _ = view.T_cloud_camera
+    return x, y, z
+
+
+def _depth(depth: object, field: str) -> NDArray[np.float64]:
+    """(H, W) metres, NaN where there is no reading."""
+    if isinstance(depth, list):
+        array = decode_array(field, [_nan_for_none(row) for row in depth], 0)
+        if array.ndim != 2 or 0 in array.shape:
+            raise InvalidRequest(field, f"shape {array.shape}", "Send rows of one length.")
+        metres = array.astype(np.float64)
+    else:
+        metres = _unpacked_depth(depth, field)
+    if (metres < 0).any():
+        worst = float(np.nanmin(metres))
+        raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
+    metres[~(np.isfinite(metres) & (metres > 0))] = np.nan
+    return metres
+
+
+def _unpacked_depth(depth: object, field: str) -> NDArray[np.float64]:
+    image = _parse(Depth, depth, field)
+    if image.encoding not in DEPTH_ENCODINGS:
+        fix = f"Send one of: {', '.join(DEPTH_ENCODINGS)}."
+        raise InvalidRequest(f"{field}.encoding", brief(image.encoding), fix)
+    dtype, metres = DEPTH_ENCODINGS[image.encoding]
+    expected = image.height * image.width * np.dtype(dtype).itemsize
+    if len(image.data) != expected:
+        value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
+        raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
+    pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
+    return pixels.astype(np.float64) * metres
+
+
+def _nan_for_none(row: object) -> object:
+    return [np.nan if value is None else value for value in row] if isinstance(row, list) else row
+
+
+def _points_of_pixels(depth: NDArray[np.float64], view: DepthImage) -> NDArray[np.float32]:
+    """(H, W, 3) in the cloud's frame."""
+    row, column = np.indices(depth.shape)
+    camera = view.intrinsics
+    pose = np.array(view.T_cloud_camera)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused as a point
+        x = (column - camera.cx) / camera.fx * depth
+        y = (row - camera.cy) / camera.fy * depth
+        points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
+        in_cloud: NDArray[np.float32] = points.astype(np.float32)
+    return in_cloud
+
+
+def _parse(schema: type[Schema], fields: object, name: str) -> Schema:
+    """Check plain values against a schema; raises InvalidRequest that names the field."""
+    try:
+        return schema.model_validate(fields)
+    except ValidationError as error:
+        problem = invalid_options(error, fields, name)
+        if error.errors(include_url=False)[0]["type"] == "extra_forbidden":
+            problem = InvalidRequest(problem.field, problem.value, "Remove it.")
+        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
+            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
+        raise problem from None

@@ -1,0 +1,109 @@
+"""The process that test servers' workers fork from: dummies whose stages wait and fail as told.
+
+usage: nursery.py FOLDER    what a test writes into the folder tells what happens
+"""
+
+import contextlib
+import os
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
+from edgegrasp_service import errors
+from edgegrasp_service.errors import Overloaded, kind_of
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
+from edgegrasp_service.worker.process import main
+
+PATIENCE = 20  # seconds; longer than anything takes
+FOLDER = Path(sys.argv[1])
+
+
+def stage(name: str) -> None:
+    """Note that a stage begins, then wait while it is shut, and fail where it is to."""
+    with (FOLDER / "begun").open("a") as begun:
+        begun.write(f"{name}\n")
+    end = time.monotonic() + PATIENCE
+    while (FOLDER / f"shut-{name}").exists():
+        assert time.monotonic() < end, f"the gate of {name} stayed shut"
+        time.sleep(0.002)
+    with contextlib.suppress(FileNotFoundError):
+        fault = FOLDER / f"fault-{name}"
+        kind = fault.read_text()
+        fault.unlink()
+        fail(kind)
+
+
+def fail(kind: str) -> None:
+    """Die, spin or raise; once for each file that says so."""
+    match kind:
+        case "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "spin":
+            while True:
+                pass
+        case "eat":
+            blocks = []
+            while True:
+                blocks.append(bytearray(2**24))
+        case "ValueError" | "MemoryError":
+            raise {"ValueError": ValueError, "MemoryError": MemoryError}[kind]("secret")
+        case _:
+            raise example(kind)
+
+
+def example(kind: str) -> Exception:
+    """An error of the table."""
+    found = next(error for error in errors.STATUS if kind_of(error) == kind)
+    if found is UnknownModel:
+        return UnknownModel("wanted", ["a", "b"])
+    if found is Overloaded:
+        return Overloaded("What happened.", 7.0)
+    if issubclass(found, InvalidRequest | errors._FieldError):
+        return found("cloud", "a value", "Fix it.")
+    return found("What happened.")
+
+
+class Detector(DummyDetector):
+    def prepare(self, *given: Any, **named: Any) -> Any:
+        stage("prepare")
+        return super().prepare(*given, **named)
+
+    def run(self, batch: Any) -> Any:
+        stage("run")
+        return super().run(batch)
+
+    def finish(self, *given: Any) -> Any:
+        stage("finish")
+        return super().finish(*given)
+
+    def score(self, *given: Any, **named: Any) -> Any:
+        stage("score")
+        return super().score(*given, **named)
+
+
+class Catalogue(DummyCatalogue):
+    """Every load gives the next digest."""
+
+    def __init__(self, seconds: float) -> None:
+        stage("load")
+        self.digest = str((FOLDER / "begun").read_text().split().count("load"))
+        self._detector = Detector(seconds)
+
+    def describe(self) -> Sequence[Mapping[str, Any]]:
+        return [{**super().describe()[0], "digest": self.digest}]
+
+
+def load(settings: Settings) -> Catalogue:
+    failing = FOLDER / "fault-weights"  # stays until it is deleted
+    if failing.exists():
+        raise EdgeGraspError(failing.read_text())
+    return Catalogue(settings.dummy_seconds)
+
+
+if __name__ == "__main__":
+    main(load)

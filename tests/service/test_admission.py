@@ -1,0 +1,237 @@
+"""Who is let in: bounds of requests and bytes, fairness between clients, and honest refusals."""
+
+import asyncio
+import io
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_service.errors import DeadlineExceeded, Overloaded
+from edgegrasp_service.front.admission import Admission, Ticket
+
+HD = np.random.default_rng(0).uniform(-0.3, 0.3, (720, 1280, 3))
+FAR = 1000.0  # seconds
+
+
+class Inside:
+    """Requests in an admission, each in a task of its own that stays until it is let go."""
+
+    def __init__(self, admission: Admission) -> None:
+        self.admission = admission
+        self.tasks: list[asyncio.Task[None]] = []
+        self.tickets: list[Ticket] = []
+        self._go = asyncio.Event()
+
+    async def enter(self, client: str, seconds: float = FAR, size: int = 1) -> "asyncio.Task[None]":
+        async def stay() -> None:
+            deadline = asyncio.get_running_loop().time() + seconds
+            async with self.admission.admit(client, deadline, size) as ticket:
+                self.tickets.append(ticket)
+                await self._go.wait()
+
+        task = asyncio.create_task(stay())
+        self.tasks.append(task)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        return task
+
+    async def leave(self) -> None:
+        self._go.set()
+        await asyncio.gather(*self.tasks, return_exceptions=True)
+
+
+async def test_a_client_alone_may_have_every_place() -> None:
+    inside = Inside(Admission(workers=2, max_waiting=4, max_bytes=100))
+    for _ in range(6):
+        assert not (await inside.enter("a")).done()
+    with pytest.raises(Overloaded, match="6 requests are in it"):
+        await (await inside.enter("a"))
+    await inside.leave()
+    await inside.admission.empty()
+
+
+async def test_who_holds_most_places_gives_one_up_to_another() -> None:
+    inside = Inside(Admission(workers=2, max_waiting=4, max_bytes=100))
+    greedy = [await inside.enter("a") for _ in range(6)]
+    inside.tickets[5].at_work = True  # what a worker has is not taken from it
+    modest = [await inside.enter("b") for _ in range(3)]
+    assert not any(task.done() for task in modest)
+    await asyncio.wait(greedy[2:5])
+    assert [task.done() for task in greedy] == [False, False, True, True, True, False]
+    assert all(isinstance(task.exception(), Overloaded) for task in greedy[2:5])
+    with pytest.raises(Overloaded):
+        await (await inside.enter("b"))  # half of them each: nobody gives any up
+    await inside.leave()
+    assert inside.admission.held_bytes == 0
+
+
+async def test_bytes_are_waited_for_and_one_client_leaves_some_to_others() -> None:
+    inside = Inside(Admission(workers=9, max_waiting=0, max_bytes=100))
+    await inside.enter("a", size=40)
+    await inside.enter("a", size=40)  # more than half of them: it waits
+    await inside.enter("b", size=40)
+    assert (len(inside.tickets), inside.admission.held_bytes) == (2, 80)
+    inside.admission.resize(inside.tickets[0], 10)
+    await inside.enter("c", size=10)
+    assert (len(inside.tickets), inside.admission.held_bytes) == (4, 100)
+    await inside.leave()
+    assert inside.admission.held_bytes == 0
+
+
+async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
+    inside = Inside(Admission(workers=2, max_waiting=0, max_bytes=100))
+    await inside.enter("a", size=1000)
+    await inside.enter("b", size=1)
+    assert len(inside.tickets) == 1
+    await inside.leave()
+    assert len(inside.tickets) == 2
+
+
+async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
+    inside = Inside(Admission(workers=2, max_waiting=10, max_bytes=100))
+    inside.admission.worked(4.0)
+    for _ in range(3):
+        await inside.enter("a")
+    with pytest.raises(Overloaded, match="3 requests come first, which take about 4 s") as caught:
+        await (await inside.enter("a", seconds=5.0))
+    assert caught.value.retry_after == 4
+    assert not (await inside.enter("a", seconds=50.0)).done()
+    with pytest.raises(DeadlineExceeded):
+        await (await inside.enter("a", seconds=0.0))
+    await inside.leave()
+
+
+async def test_one_slow_request_does_not_change_the_pace() -> None:
+    """Row 11: a request of 18 s among many of 50 ms, and then nobody with 5 s was let in."""
+    inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
+    for seconds in (0.05, 0.05, 18.0, 0.05):
+        inside.admission.worked(seconds)
+    for _ in range(5):
+        assert not (await inside.enter("a", seconds=5.0)).done()
+    await inside.leave()
+
+
+async def test_an_empty_server_tries_any_deadline() -> None:
+    inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
+    inside.admission.worked(1000.0)
+    assert not (await inside.enter("a", seconds=0.5)).done()
+    await inside.leave()
+
+
+async def test_a_full_server_refuses_at_once(serve, connect, is_error, cloud) -> None:
+    running = await serve(max_queue_length=1)
+    client = connect(running)
+    running.stages.shut("run")
+    accepted = [asyncio.create_task(client.detect(cloud))]
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    accepted.append(asyncio.create_task(client.detect(cloud, seed=1)))
+    await running.until(lambda: running.waiting == 1)
+    refused = await client.detect(cloud)
+    assert is_error(refused, "overloaded")
+    assert refused.retry_after is not None
+    assert refused.retry_after >= 1
+    assert is_error(await client.score(cloud), "overloaded")
+    running.stages.open("run")
+    assert [answer.fine for answer in await asyncio.gather(*accepted)] == [True, True]
+    assert (await client.detect(cloud)).fine
+
+
+async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
+    running = await serve(max_queue_length=0)
+    running.stages.shut("prepare")
+    points = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        accepted = stub.DetectGrasps(points)
+        await running.until(lambda: running.stages.begun["prepare"] == 1)
+        # As a stream, this client may send its message whenever it likes: never.
+        call = channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
+        assert await call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        host, port = running.server.http_url.removeprefix("http://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000\r\n\r\n")
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), 20)
+        assert b" 429 " in head
+        assert b"connection: close" in head
+        writer.close()
+        running.stages.open("prepare")
+        assert (await accepted).grasps
+
+
+async def test_turns_come_in_order(serve, connect, cloud) -> None:
+    running = await serve()
+    client = connect(running)
+    running.stages.shut("run")
+    answered: list[int] = []
+
+    async def ask(number: int) -> None:
+        assert (await client.detect(cloud)).fine
+        answered.append(number)
+
+    asked = [asyncio.create_task(ask(0))]
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    for number in (1, 2, 3):
+        asked.append(asyncio.create_task(ask(number)))
+        await running.until(lambda number=number: running.waiting == number)
+    running.stages.open("run")
+    await asyncio.gather(*asked)
+    assert answered == [0, 1, 2, 3]
+
+
+async def test_requests_over_a_bound(serve, connect, is_error, cloud) -> None:
+    bounds = {"max_approach_points": 33, "max_candidates": 34, "max_points": 600}
+    running = await serve(**bounds, max_body_bytes=100_000)
+    client = connect(running)
+    within = {"num_approach_points": 33, "num_candidates": 34}
+    assert (await client.detect(cloud, **within)).fine
+    for option, most in within.items():
+        refused = await client.detect(cloud, **(within | {option: most + 1}))
+        assert is_error(refused, "payload-too-large")
+        assert refused.field == f"options.{option}"
+    refused = await client.detect(np.tile(cloud, (2, 1)), **within)
+    assert is_error(refused, "payload-too-large")
+    refused = await client.detect(np.tile(cloud, (20, 1)), **within)
+    assert is_error(refused, "payload-too-large")
+    assert refused.field == "body"
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_cloud_of_1280_by_720(dtype: type, raw) -> None:
+    file = io.BytesIO()
+    np.save(file, HD.astype(dtype))
+    answer = raw.file("npy", file.getvalue())
+    counts = answer.body["counts"] if raw.name == "rest" else answer.body.counts
+    assert counts["points"] == 1280 * 720
+
+
+async def test_a_large_body_is_refused_in_words(serve, cloud) -> None:
+    """Content-Length alone is enough; a client that sends on all the same gets the answer."""
+    running = await serve(max_body_bytes=2**20)
+    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=20) as http:
+        for content in (HD.astype("<f4").tobytes(), chunks(HD.astype("<f4").tobytes())):
+            refused = await http.post("/v1/grasps", content=content)
+            assert (refused.status_code, refused.headers["connection"]) == (413, "close")
+        fine = await http.post("/v1/grasps", json={"points": cloud.tolist()})
+        assert fine.status_code == 200
+        assert "connection" not in fine.headers
+
+
+async def chunks(data: bytes):
+    for start in range(0, len(data), 2**18):
+        yield data[start : start + 2**18]
+
+
+async def test_http_connections_are_kept_through_answers_and_errors(serve, cloud) -> None:
+    running = await serve()
+    body, streams, statuses = {"points": cloud.tolist()}, set(), []
+    async with httpx.AsyncClient(base_url=running.server.http_url) as http:
+        for posted in (body, {"points": []}, body, {"nothing": 1}, body):
+            response = await http.post("/v1/grasps", json=posted)
+            statuses.append(response.status_code)
+            streams.add(response.extensions["network_stream"].get_extra_info("client_addr"))
+    assert statuses == [200, 400, 200, 400, 200]
+    assert len(streams) == 1

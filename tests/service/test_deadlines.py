@@ -1,0 +1,137 @@
+"""Nothing is computed in vain for long: deadlines, callers who leave, and the server's limit."""
+
+import asyncio
+
+import grpc
+import httpx
+import pytest
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.call import Call
+
+
+async def test_a_request_that_expires_while_it_waits_is_never_computed(
+    serve, connect, is_error, cloud
+) -> None:
+    running = await serve()
+    client = connect(running)
+    running.stages.shut("run")
+    first = asyncio.create_task(client.detect(cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    assert is_error(await client.detect(cloud, timeout=0.1), "deadline-exceeded")
+    running.stages.open("run")
+    assert (await first).fine
+    await running.until_idle()
+    assert running.stages.begun["prepare"] == 1
+
+
+async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
+    serve, connect, is_error, cloud
+) -> None:
+    running = await serve()
+    client, before = connect(running), running.server.pool.pids
+    running.stages.fail("run", "spin")
+    assert is_error(await client.detect(cloud, timeout=0.3), "deadline-exceeded")
+    assert (await client.detect(cloud)).fine
+    assert running.server.pool.pids != before
+    assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
+
+
+async def test_the_worker_itself_stops_after_the_deadline(serve, connect, is_error, cloud) -> None:
+    running = await serve()
+    client, before = connect(running), running.server.pool.pids
+    running.stages.shut("prepare")
+    assert is_error(await client.detect(cloud, timeout=0.2), "deadline-exceeded")
+    running.stages.open("prepare")
+    assert (await client.detect(cloud)).fine
+    assert running.stages.begun["run"] == 1
+    assert running.server.pool.pids == before
+
+
+async def test_a_request_whose_client_left_frees_its_worker(serve, connect, cloud) -> None:
+    running = await serve()
+    client = connect(running)
+    running.stages.shut("run")
+    asked = asyncio.create_task(client.detect(cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    asked.cancel()
+    await running.until(lambda: running.ended == ["cancelled"])
+    await running.until_idle()  # though the gate is shut
+    running.stages.open("run")
+    assert (await running.connect("grpc").detect(cloud)).fine
+
+
+async def test_a_client_that_left_while_it_waited_is_never_computed(serve, connect, cloud) -> None:
+    running = await serve()
+    client = connect(running)
+    running.stages.shut("run")
+    first = asyncio.create_task(client.detect(cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    second = asyncio.create_task(client.detect(cloud))
+    await running.until(lambda: running.waiting == 1)
+    second.cancel()
+    await running.until(lambda: running.waiting == 0)
+    running.stages.open("run")
+    assert (await first).fine
+    await running.until_idle()
+    assert running.stages.begun["prepare"] == 1
+
+
+async def test_the_servers_own_limit_holds_without_a_deadline(serve, cloud) -> None:
+    running = await serve(max_request_seconds=0.2)
+    running.stages.shut("run")
+    client = running.connect("rest")
+    assert (await client.detect(cloud)).kind == "deadline-exceeded"
+    await client.close()
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        call = channel.unary_unary(
+            "/edgegrasp.v1.GraspService/DetectGrasps",
+            grasp_pb2.DetectGraspsRequest.SerializeToString,
+            grasp_pb2.DetectGraspsResponse.FromString,
+        )
+        with pytest.raises(aio.AioRpcError) as caught:
+            await call(grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()))
+    assert caught.value.code() is grpc.StatusCode.DEADLINE_EXCEEDED
+    assert caught.value.details() == "The deadline passed before there was an answer."
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon", ""])
+def test_a_timeout_that_is_none_is_refused(dummy_server, text: str) -> None:
+    headers = {"X-Request-Timeout": text}
+    response = httpx.post(f"{dummy_server.http_url}/v1/grasps", headers=headers, content=b"")
+    assert (response.status_code, response.json()["field"]) == (400, "X-Request-Timeout")
+
+
+HEAD = b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+HEAD += b"Content-Length: 1000\r\n"
+
+
+async def test_a_client_that_vanishes_mid_body_leaves_its_place(serve) -> None:
+    running = await serve(max_queue_length=0)
+    host, port = running.server.http_url.removeprefix("http://").split(":")
+    _, writer = await asyncio.open_connection(host, int(port))
+    writer.write(HEAD + b'\r\n{"points": [')
+    await writer.drain()
+    await running.until(lambda: running.waiting == 1)
+    writer.close()
+    await running.until(lambda: running.waiting == 0)
+    await running.until(lambda: running.ended == ["cancelled"])
+
+
+async def test_a_body_that_never_ends_is_given_up_at_the_deadline(serve) -> None:
+    running = await serve()
+    host, port = running.server.http_url.removeprefix("http://").split(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    writer.write(HEAD + b'X-Request-Timeout: 0.2\r\n\r\n{"points": [')
+    assert b" 504 " in await asyncio.wait_for(reader.readline(), 20)
+    writer.close()
+    await running.until(lambda: running.ended == ["deadline-exceeded"])
+
+
+@pytest.mark.parametrize("given", ["a b", "", "x" * 129, "käse", "a\nb"])
+def test_an_unusable_request_id_is_replaced(given: str) -> None:
+    made = Call("http", "DetectGrasps", request_id=given).request_id
+    assert made != given
+    assert len(made) == 32
+    assert Call("http", "DetectGrasps", request_id="arm-1/7").request_id == "arm-1/7"

@@ -1,0 +1,391 @@
+"""What strangers may throw at a server: it stays alive, small and ready for the next good request.
+
+Bounds are wide, for busy machines: each attack here froze, filled or shut a server that had none.
+"""
+
+import asyncio
+import contextlib
+import io
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import grpc
+import httpx
+import numpy as np
+import pytest
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import GraspClient
+
+PATIENCE = 30
+HEAD = "POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-npy\r\n"
+
+
+def http_socket(url: str) -> socket.socket:
+    host, port = url.removeprefix("http://").split(":")
+    connection = socket.create_connection((host, int(port)), timeout=PATIENCE)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+@contextlib.contextmanager
+def in_background(work: Callable[[threading.Event], None], count: int) -> Iterator[None]:
+    """Threads that attack until the block ends."""
+    stop = threading.Event()
+    threads = [threading.Thread(target=work, args=(stop,)) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(PATIENCE)
+
+
+def check_alive(server, cloud: np.ndarray, seconds: float = 3.0) -> None:
+    """Liveness is answered all the time, and a good request in the end."""
+    end, slowest = time.monotonic() + seconds, 0.0
+    with httpx.Client(base_url=server.http_url, timeout=PATIENCE) as http:
+        while time.monotonic() < end:
+            begin = time.monotonic()
+            assert http.get("/health/live").status_code == 200
+            slowest = max(slowest, time.monotonic() - begin)
+    assert slowest < 3.0
+    with GraspClient(server.grpc_address, timeout=PATIENCE) as client:
+        assert len(client.detect(cloud).grasps) == 10
+
+
+def memory(server) -> int:
+    """Resident bytes of the process that accepts."""
+    pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
+    return pages * 4096
+
+
+def test_messages_that_never_end(dummy_server, cloud) -> None:
+    """Row 1: 60 gRPC messages of 31 MB, of which the end never comes, on one connection."""
+    before = memory(dummy_server)
+    with contextlib.closing(Http2(dummy_server.grpc_address)) as connection:
+        for stream in range(60):
+            connection.begin("/edgegrasp.v1.GraspService/DetectGrasps", 2 * stream + 1)
+        for stream in range(20):
+            connection.begin("/grpc.health.v1.Health/Check", 121 + 2 * stream)
+        sending = threading.Thread(target=connection.send_all, args=(31 * 2**20,))
+        sending.start()
+        peak, end = 0, time.monotonic() + 6
+        with httpx.Client(base_url=dummy_server.http_url, timeout=PATIENCE) as http:
+            while time.monotonic() < end:
+                assert http.get("/health/live").status_code == 200
+                peak = max(peak, memory(dummy_server))
+                time.sleep(0.05)
+        connection.stop.set()
+        sending.join(PATIENCE)
+    assert connection.sent > 50 * 2**20  # or there was no attack
+    assert peak - before < 900 * 2**20
+    with GraspClient(dummy_server.grpc_address, timeout=PATIENCE) as client:
+        assert len(client.detect(cloud).grasps) == 10
+
+
+class Http2:
+    """As much of an HTTP/2 client as begins messages and does not end them."""
+
+    def __init__(self, address: str) -> None:
+        host, port = address.split(":")
+        self._socket = socket.create_connection((host, int(port)), timeout=PATIENCE)
+        self._socket.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + self._frame(4, 0, 0, b""))
+        self._windows: dict[int, int] = {0: 65535}
+        self._initial = 65535
+        self.sent = 0
+        self.stop = threading.Event()
+
+    @staticmethod
+    def _frame(kind: int, flags: int, stream: int, payload: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(payload))[1:]
+            + bytes([kind, flags])
+            + struct.pack(">I", stream)
+            + payload
+        )
+
+    def begin(self, path: str, stream: int) -> None:
+        def text(value: str) -> bytes:
+            return bytes([len(value)]) + value.encode()
+
+        headers = b"\x83\x86"  # :method POST, :scheme http
+        for name, value in (
+            (":path", path),
+            (":authority", "x"),
+            ("content-type", "application/grpc"),
+            ("te", "trailers"),
+        ):
+            headers += b"\x00" + text(name) + text(value)
+        self._socket.sendall(self._frame(1, 4, stream, headers))
+        self._windows[stream] = 65535
+
+    def send_all(self, size: int) -> None:
+        """Send every message but its last byte, as far as the server lets it."""
+        left = {stream: size for stream in self._windows if stream}
+        started: set[int] = set()
+        buffer = b""
+        with contextlib.suppress(OSError):
+            while not self.stop.is_set():
+                moved = False
+                for stream, rest in list(left.items()):
+                    room = min(self._windows[0], self._windows[stream], 16384, rest - 1)
+                    if room <= 5:
+                        continue
+                    first = b"" if stream in started else b"\x00" + struct.pack(">I", size)
+                    started.add(stream)
+                    payload = first + bytes(room - len(first))
+                    self._socket.sendall(self._frame(0, 0, stream, payload))
+                    left[stream] -= room
+                    self.sent += room
+                    self._windows[0] -= room
+                    self._windows[stream] -= room
+                    moved = True
+                self._socket.settimeout(0.0 if moved else 0.02)
+                with contextlib.suppress(BlockingIOError, TimeoutError):
+                    buffer = self._take(buffer + self._socket.recv(2**16), left)
+                self._socket.settimeout(PATIENCE)
+
+    def _take(self, buffer: bytes, left: dict[int, int]) -> bytes:
+        while len(buffer) >= 9:
+            size = int.from_bytes(buffer[:3], "big")
+            if len(buffer) < 9 + size:
+                break
+            kind, flags = buffer[3], buffer[4]
+            stream = int.from_bytes(buffer[5:9], "big")
+            payload, buffer = buffer[9 : 9 + size], buffer[9 + size :]
+            if kind == 8 and (stream in self._windows):
+                self._windows[stream] += int.from_bytes(payload, "big")
+            elif kind == 3:
+                left.pop(stream, None)
+            elif kind == 4 and not flags & 1:
+                for start in range(0, size, 6):
+                    name, value = struct.unpack(">HI", payload[start : start + 6])
+                    if name == 4:
+                        for each in self._windows:
+                            self._windows[each] += (value - self._initial) * (each != 0)
+                        self._initial = value
+                self._socket.sendall(self._frame(4, 1, 0, b""))
+            elif kind == 6 and not flags & 1:
+                self._socket.sendall(self._frame(6, 1, 0, payload))
+        return buffer
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.mark.parametrize("token", ["none", "wanted"])
+def test_bodies_in_crumbs(dummy_server, cloud, token: str) -> None:
+    """Row 2: bodies in chunks of one byte, also after a refusal."""
+    crumbs = b"1\r\nX\r\n" * 40_000
+    path = "/v1/grasps" if token == "none" else "/v1/models:reload"
+    head = HEAD.replace("/v1/grasps", path) + "Transfer-Encoding: chunked\r\n\r\n"
+
+    def attack(stop: threading.Event) -> None:
+        while not stop.is_set():
+            with contextlib.suppress(OSError), http_socket(dummy_server.http_url) as connection:
+                connection.sendall(head.encode())
+                while not stop.is_set():
+                    connection.sendall(crumbs)
+
+    with in_background(attack, 4):
+        check_alive(dummy_server, cloud)
+
+
+def test_a_form_of_nothing_but_boundaries(dummy_server, cloud) -> None:
+    """Row 3: multipart bodies of boundaries."""
+    body = b"\r\n--X" * 2_000_000
+    headers = {"content-type": "multipart/form-data; boundary=X", "X-Request-Timeout": "5"}
+
+    def attack(stop: threading.Event) -> None:
+        while not stop.is_set():
+            with contextlib.suppress(httpx.HTTPError):
+                url = f"{dummy_server.http_url}/v1/grasps"
+                answer = httpx.post(url, content=body, headers=headers, timeout=PATIENCE)
+                assert answer.status_code in (400, 429, 504)
+
+    with in_background(attack, 2):
+        check_alive(dummy_server, cloud)
+
+
+@pytest.mark.parametrize("transport", ["grpc", "rest"])
+async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transport: str) -> None:
+    """Row 5: a body of one byte now and then, in every place."""
+    running = await serve(max_queue_length=3, read_seconds=3.0)
+    held, writers = [], []
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        for _ in range(4):
+            if transport == "grpc":
+                call = channel.stream_unary("/edgegrasp.v1.GraspService/DetectGrasps")()
+                held.append(asyncio.ensure_future(call.code()))
+            else:
+                host, port = running.server.http_url.removeprefix("http://").split(":")
+                reader, writer = await asyncio.open_connection(host, int(port))
+                writer.write(HEAD.encode() + b"Content-Length: 1000000\r\n\r\nX")
+                held.append(asyncio.ensure_future(reader.readline()))
+                writers.append(writer)
+        await running.until(lambda: running.waiting == 4)
+        client = running.connect(transport)
+        assert (await client.detect(cloud)).kind == "overloaded"
+        told = [await asyncio.wait_for(each, PATIENCE) for each in held]
+        slow = grpc.StatusCode.DEADLINE_EXCEEDED if transport == "grpc" else b"HTTP/1.1 408"
+        assert all(each is slow if transport == "grpc" else each.startswith(slow) for each in told)
+        assert (await client.detect(cloud)).fine
+        await client.close()
+    for writer in writers:
+        writer.close()
+
+
+async def test_a_length_over_the_limit_is_not_waited_for(serve) -> None:
+    running = await serve(max_body_bytes=10_000)
+    host, port = running.server.http_url.removeprefix("http://").split(":")
+    reader, writer = await asyncio.open_connection(host, int(port))
+    writer.write(HEAD.encode() + b"Content-Length: 10001\r\n\r\n")
+    assert b" 413 " in await asyncio.wait_for(reader.readline(), PATIENCE)
+    writer.close()
+
+
+@pytest.mark.parametrize("transport", ["grpc", "rest"])
+async def test_answers_that_nobody_takes_are_given_up(serve, cloud, transport: str) -> None:
+    """Row 7: clients that send and never read."""
+    running = await serve(write_seconds=0.5, min_bytes_per_second=10**9)
+    crowd = np.random.default_rng(0).uniform(-0.1, 0.1, (300_000, 3)).astype("<f4")
+    with contextlib.ExitStack() as stack:
+        if transport == "rest":
+            connection = stack.enter_context(http_socket(running.server.http_url))
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            body = npy(crowd)
+            head = (
+                HEAD.replace(" HTTP", "?debug=true HTTP") + f"Content-Length: {len(body)}\r\n\r\n"
+            )
+            await asyncio.to_thread(connection.sendall, head.encode() + body)
+        else:
+            options = [("grpc.http2.bdp_probe", 0)]
+            channel = aio.insecure_channel(running.server.grpc_address, options)
+            call = channel.stream_stream("/edgegrasp.v1.GraspService/DetectGrasps")()
+            debug = grasp_pb2.DetectOptions(debug=True)  # the whole cloud comes back
+            message = grasp_pb2.DetectGraspsRequest(points=crowd.tobytes(), options=debug)
+            await call.write(message.SerializeToString())
+        admission = running.server.service.admission
+        await running.until(lambda: admission.held_bytes > 5 * 10**6)  # unsent, and counted
+        await running.until_idle()
+        assert admission.held_bytes == 0
+        await running.until(lambda: running.server.service.in_flight == 0)
+        if transport == "grpc":
+            call.cancel()
+            await channel.close()
+
+
+def npy(cloud: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, cloud)
+    return stream.getvalue()
+
+
+async def test_connections_are_bounded(serve) -> None:
+    running = await serve(max_connections=3)
+    url = running.server.http_url
+    held = [http_socket(url) for _ in range(3)]
+    await asyncio.sleep(0.1)
+    extra = http_socket(url)
+    answer = await asyncio.to_thread(extra.recv, 4096)
+    assert b" 429 " in answer.splitlines()[0]
+    for connection in (*held, extra):
+        connection.close()
+    async with httpx.AsyncClient(base_url=url) as http:
+        for _ in range(100):  # until the server has seen them go
+            with contextlib.suppress(httpx.HTTPError):
+                if (await http.get("/health/live")).status_code == 200:
+                    return
+            await asyncio.sleep(0.05)
+    raise AssertionError("the places of connections that closed are gone")
+
+
+OUT_OF_DESCRIPTORS = """
+import resource, sys
+from edgegrasp_cli.main import main
+resource.setrlimit(resource.RLIMIT_NOFILE, (96, 96))
+main()
+"""
+
+
+def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud) -> None:
+    """Row 12."""
+    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve", "--backend", "dummy"]
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen(
+            [*command, "--http-port", "0", "--grpc-port", "0", "--workers", "1"],
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
+    try:
+        assert process.stdout is not None
+        url, address = process.stdout.readline().split()[3::2]
+        held = [http_socket(url) for _ in range(150)]
+        time.sleep(2.0)
+        for connection in held:
+            connection.close()
+        time.sleep(1.5)  # asyncio tries to accept again after a second
+        with GraspClient(address, timeout=PATIENCE) as client:
+            assert len(client.detect(cloud).grasps) == 10
+        process.terminate()
+        assert process.wait(PATIENCE) == 0
+    finally:
+        process.kill()
+        process.communicate()
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert any("Too many open files" in line for line in lines)
+    assert len(lines) < 20
+    assert not any("Traceback" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def real_server(start_server):
+    with start_server("--workers", "2", "--max-voxels", "10000000") as running:
+        yield running
+
+
+def test_a_cloud_far_too_dense(real_server, cloud) -> None:
+    """Row 4: 2 M points in a cube of 1 m are within every limit here, and take minutes."""
+    dense = np.random.default_rng(0).random((2_000_000, 3), np.float32).astype("<f4").tobytes()
+    codes = []
+
+    def attack() -> None:
+        with grpc.insecure_channel(
+            real_server.grpc_address, (("grpc.max_send_message_length", -1),)
+        ) as channel:
+            stub = grasp_pb2_grpc.GraspServiceStub(channel)
+            with pytest.raises(grpc.RpcError) as caught:
+                stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=dense), timeout=2.0)
+            codes.append(caught.value.code())
+
+    threads = [threading.Thread(target=attack) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    begin = time.monotonic()
+    with GraspClient(real_server.http_url, timeout=PATIENCE) as client:
+        client.detect(cloud, num_approach_points=2, num_candidates=20)
+    assert time.monotonic() - begin < 12  # 38 s and more where nothing is killed
+    assert set(codes) == {grpc.StatusCode.DEADLINE_EXCEEDED}
+
+
+def test_too_many_voxels_are_named(start_server) -> None:
+    room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
+    with (
+        start_server("--workers", "1", "--max-voxels", "20000") as server,
+        GraspClient(server.grpc_address, timeout=PATIENCE) as client,
+        pytest.raises(Exception, match=r"voxels.*workspace"),
+    ):
+        client.detect(room)

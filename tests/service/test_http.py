@@ -1,0 +1,78 @@
+"""HTTP as proxies, browsers and careless clients speak it."""
+
+import re
+import socket
+
+import httpx
+import pytest
+
+
+def test_pages_work_without_internet(dummy_server) -> None:
+    """Row 13."""
+    with httpx.Client(base_url=dummy_server.http_url, follow_redirects=True) as http:
+        page = http.get("/")
+        assert page.url.path == "/docs"
+        links = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+        assert any(link.endswith(".js") for link in links)
+        for link in links:
+            assert link.startswith("/"), "it would be fetched from elsewhere"
+            assert http.get(link).status_code == 200
+
+
+def test_head_is_get_without_the_body(dummy_server) -> None:
+    with httpx.Client(base_url=dummy_server.http_url) as http:
+        for path in ("/health/live", "/health/ready", "/v1/models", "/docs", "/metrics"):
+            answer = http.head(path)
+            assert (answer.status_code, answer.content) == (200, b""), path
+        assert http.head("/v1/grasps").status_code == 405
+
+
+def test_no_redirect_to_a_host_that_the_caller_names(dummy_server) -> None:
+    for path in ("/v1/grasps/", "/v1/models/", "//v1/grasps"):
+        answer = httpx.post(dummy_server.http_url + path, headers={"host": "evil.example"})
+        assert answer.status_code == 404, path
+        assert "location" not in answer.headers
+        assert answer.headers["content-type"] == "application/problem+json"
+
+
+def talk(url: str, data: bytes) -> bytes:
+    """All that the server says before it closes."""
+    host, port = url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(data)
+        said = b""
+        while part := connection.recv(65536):
+            said += part
+        return said
+
+
+POST = b"POST /v1/grasps HTTP/1.1\r\nHost: x\r\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (b"\x16\x03\x01 is no HTTP\r\n\r\n", 400),
+        (b"BREW /v1/grasps HTTP/1.1\r\nHost: x\r\n\r\n", 400),
+        (POST + b"Content-Length: none\r\n\r\n", 400),
+        (POST + b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", 400),
+        (POST + b"X: " + b"y" * 50_000 + b"\r\n\r\n", 431),
+        (POST + b"Y: " + b"y" * 50_000, 431),
+        (POST + b"".join(b"Z%d: z\r\n" % number for number in range(80)) + b"\r\n", 431),
+        (POST + b"Content-Length: 4\r\nContent-Encoding: gzip\r\n\r\n", 415),
+    ],
+)
+def test_what_is_no_good_request_is_told_why(dummy_server, data: bytes, status: int) -> None:
+    if status == 431 and data.endswith(b"\r\n\r\n"):
+        data = data[:-2] + b"Content-Length: 9\r\n\r\n"  # so that it is closed
+    head, _, body = talk(dummy_server.http_url, data).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 %d" % status), head
+    assert b"content-type: application/problem+json" in head
+    assert b"connection: close" in head
+    assert b'"status":%d' % status in body
+
+
+def test_headers_that_do_not_come_are_not_waited_for(start_server) -> None:
+    with start_server("--backend", "dummy", "--workers", "1", "--read-seconds", "0.5") as server:
+        assert talk(server.http_url, POST).startswith(b"HTTP/1.1 408")
+        assert talk(server.http_url, b"").startswith(b"HTTP/1.1 408")

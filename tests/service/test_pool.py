@@ -1,0 +1,94 @@
+"""Workers that die, spin, eat memory or lose their nursery: one request fails, others go on."""
+
+import asyncio
+import os
+import signal
+import zlib
+from collections import Counter
+
+import numpy as np
+import pytest
+
+
+def grown(running) -> int:
+    return len(running.server.pool.pids)
+
+
+@pytest.mark.parametrize("fault", ["kill", "eat"])
+async def test_a_worker_that_dies_fails_its_own_request_only(
+    serve, connect, is_error, cloud, fault: str
+) -> None:
+    running = await serve(max_worker_bytes=2**28)
+    client, before = connect(running), running.server.pool.pids
+    running.stages.fail("run", fault)
+    assert is_error(await client.detect(cloud), "worker-lost")
+    assert (await client.detect(cloud)).fine
+    assert running.server.pool.pids != before
+    assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
+
+
+async def test_workers_killed_under_load(serve, cloud) -> None:
+    """Whatever is killed, each answer is of its own cloud, and nothing is lost."""
+    running = await serve(workers=2)
+    client, outcomes, stop = running.connect("grpc"), Counter(), asyncio.Event()
+
+    async def ask(number: int) -> None:
+        mine = cloud + np.float32(number)
+        while not stop.is_set():
+            answer = await client.detect(mine)
+            if answer.fine:
+                assert answer.counts["crc32"] == zlib.crc32(mine.tobytes()) % 2**32
+            outcomes[answer.kind] += 1
+
+    asking = [asyncio.create_task(ask(number)) for number in range(8)]
+    for killed in range(4):
+        before = outcomes[""]
+        await running.until(lambda before=before: outcomes[""] >= before + 10)
+        await running.until(lambda: grown(running) == 2)
+        os.kill(running.server.pool.pids[killed % 2], signal.SIGKILL)
+        await running.until(lambda: grown(running) == 2)
+    stop.set()
+    await asyncio.gather(*asking)
+    assert set(outcomes) <= {"", "worker-lost"}
+    assert outcomes["worker-lost"] <= 4
+    await client.close()
+
+
+async def test_an_idle_worker_that_dies_is_replaced(serve, cloud) -> None:
+    running = await serve()
+    (before,) = running.server.pool.pids
+    os.kill(before, signal.SIGKILL)
+    await running.until(lambda: running.server.pool.pids not in ([], [before]))
+    client = running.connect("grpc")
+    assert (await client.detect(cloud)).fine
+    await client.close()
+
+
+async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
+    running = await serve()
+    client, pool = running.connect("rest"), running.server.pool
+    pool._nursery._process.kill()
+    assert (await client.detect(cloud)).fine
+    await running.until(lambda: running.stages.begun["load"] == 2)
+    await running.until(lambda: pool.models[0]["digest"] == "2")
+    os.kill(pool.pids[0], signal.SIGKILL)
+    await running.until(lambda: grown(running) == 0)
+    assert (await client.detect(cloud)).fine
+    await client.close()
+
+
+async def test_workers_end_with_the_server(serve) -> None:
+    running = await serve(workers=2)
+    pids = running.server.pool.pids
+    assert len(set(pids)) == 2
+    running.stop.set()
+    await running.serving
+    await running.until(lambda: not any(alive(pid) for pid in pids))
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

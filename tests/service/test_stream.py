@@ -1,0 +1,221 @@
+"""One stream, many clouds: answers in order, errors among them, and no more read than bounded."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from grpc import aio
+
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+
+
+def request(name: str, points: np.ndarray, **options: Any) -> grasp_pb2.DetectGraspsStreamRequest:
+    detect = grasp_pb2.DetectGraspsRequest(
+        points=points.tobytes(), options=grasp_pb2.DetectOptions(**options)
+    )
+    return grasp_pb2.DetectGraspsStreamRequest(request_id=name, request=detect)
+
+
+@pytest.fixture
+async def streams() -> AsyncIterator[Any]:
+    channels = []
+
+    def open_stream(running: Any) -> Any:
+        channels.append(aio.insecure_channel(running.server.grpc_address))
+        return grasp_pb2_grpc.GraspServiceStub(channels[-1]).DetectGraspsStream()
+
+    yield open_stream
+    for channel in channels:
+        await channel.close(None)
+
+
+async def test_answers_come_in_order_and_are_those_of_single_calls(serve, streams, cloud) -> None:
+    running = await serve()
+    stream = streams(running)
+    for seed in range(9):
+        await stream.write(request(f"cloud {seed}", cloud, seed=seed))
+    await stream.done_writing()
+    answers = [answer async for answer in stream]
+    assert [answer.request_id for answer in answers] == [f"cloud {seed}" for seed in range(9)]
+    assert await stream.code() is grpc.StatusCode.OK
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        for seed, answer in enumerate(answers):
+            alone = await stub.DetectGrasps(request("", cloud, seed=seed).request)
+            assert answer.detection.grasps == alone.grasps
+    assert running.ended == [""] * 18
+
+
+async def test_an_answer_comes_before_the_next_request(serve, streams, cloud) -> None:
+    stream = streams(await serve())
+    for name in ("a", "b", "a"):
+        await stream.write(request(name, cloud))
+        assert (await stream.read()).request_id == name
+    await stream.done_writing()
+    assert await stream.read() is aio.EOF
+
+
+async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, cloud) -> None:
+    running = await serve()
+    stream = streams(running)
+    bad = request("negative", cloud)
+    bad.timeout = -1.0
+    empty = grasp_pb2.DetectGraspsStreamRequest(request_id="empty")
+    few = request("few", cloud[:5])
+    for message in (request("fine", cloud), empty, bad, few, request("again", cloud)):
+        await stream.write(message)
+    await stream.done_writing()
+    answers = [answer async for answer in stream]
+    assert [answer.WhichOneof("answer") for answer in answers] == [
+        "detection",
+        "error",
+        "error",
+        "error",
+        "detection",
+    ]
+    told = {answer.request_id: answer.error for answer in answers[1:4]}
+    assert {name: error.detail.field for name, error in told.items()} == {
+        "empty": "cloud",
+        "negative": "timeout",
+        "few": "cloud",
+    }
+    for error in told.values():
+        assert error.code == grpc.StatusCode.INVALID_ARGUMENT.value[0]
+        assert error.detail.kind == "invalid-request"
+        assert error.message.startswith(error.detail.field)
+
+
+async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, streams, cloud) -> None:
+    running = await serve()
+    stream = streams(running)
+    running.stages.shut("run")
+    await stream.write(request("patient", cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    hasty = request("hasty", cloud)
+    hasty.timeout = 0.05
+    await stream.write(hasty)
+    await running.until(lambda: running.ended == ["deadline-exceeded"])
+    running.stages.open("run")
+    assert (await stream.read()).WhichOneof("answer") == "detection"
+    late = await stream.read()
+    assert (late.request_id, late.error.detail.kind) == ("hasty", "deadline-exceeded")
+    assert running.stages.begun["prepare"] == 1
+
+
+async def test_no_more_is_read_than_may_be(serve, streams, cloud) -> None:
+    running = await serve(max_stream_requests=3)
+    stream = streams(running)
+    running.stages.shut("run")
+    for number in range(8):
+        await stream.write(request(str(number), cloud))
+    await stream.done_writing()
+    await running.until(lambda: running.server.service.admission.tickets == 3)
+    await asyncio.sleep(0.1)
+    assert running.server.service.admission.tickets == 3
+    running.stages.open("run")
+    assert [answer.request_id async for answer in stream] == [str(number) for number in range(8)]
+
+
+async def test_what_the_client_does_not_take_is_not_computed(serve, cloud) -> None:
+    """A stream that waits for its client reads nothing; gRPC's flow control does the rest."""
+    running = await serve(max_stream_requests=2)
+    options = [("grpc.http2.lookahead_bytes", 16384)]
+    many = {"num_approach_points": 256, "debug": True}
+    crowd = np.tile(cloud, (8, 1))  # 4,000 points in each answer
+    async with aio.insecure_channel(running.server.grpc_address, options) as channel:
+        stream = grpc_stub(channel).DetectGraspsStream()
+        sending = asyncio.create_task(send(stream, [request("", crowd, **many)] * 60))
+        await running.until(lambda: len(running.calls) >= 3)
+        await asyncio.sleep(1.0)
+        assert len(running.calls) < 40
+        assert len([answer async for answer in stream]) == 60
+        await sending
+
+
+def grpc_stub(channel: aio.Channel) -> Any:
+    return grasp_pb2_grpc.GraspServiceStub(channel)
+
+
+async def send(stream: Any, requests: list[grasp_pb2.DetectGraspsStreamRequest]) -> None:
+    for each in requests:
+        await stream.write(each)
+    await stream.done_writing()
+
+
+async def test_a_full_server_is_told_of_in_the_stream(serve, streams, cloud) -> None:
+    running = await serve(max_queue_length=0)
+    stream = streams(running)
+    running.stages.shut("run")
+    for name in ("taken", "refused"):
+        await stream.write(request(name, cloud))
+    await running.until(lambda: running.ended == ["overloaded"])
+    running.stages.open("run")
+    assert (await stream.read()).WhichOneof("answer") == "detection"
+    refused = await stream.read()
+    assert refused.error.code == grpc.StatusCode.RESOURCE_EXHAUSTED.value[0]
+    assert refused.error.detail.retry_after >= 1.0
+
+
+async def test_streams_are_bounded(serve, streams, cloud) -> None:
+    running = await serve(max_streams=1)
+    first = streams(running)
+    await first.write(request("first", cloud))
+    assert (await first.read()).request_id == "first"
+    second = streams(running)
+    assert await second.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+    await first.done_writing()
+    assert await first.code() is grpc.StatusCode.OK
+
+
+async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
+    running = await serve()
+    stream = streams(running)
+    running.stages.shut("run")
+    for name in ("first", "second"):
+        await stream.write(request(name, cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.waiting == 1)
+    stream.cancel()
+    await running.until(lambda: running.ended == ["cancelled", "cancelled"])
+    running.stages.open("run")
+    await running.until_idle()
+    assert running.stages.begun["prepare"] == 1
+
+
+async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(
+    serve, streams, cloud
+) -> None:
+    running = await serve()
+    stream, idle = streams(running), streams(running)
+    running.stages.shut("run")
+    await stream.write(request("read", cloud))
+    await running.until(lambda: running.stages.begun["run"] == 1)
+    running.stop.set()
+    await running.until(running.server.service.stopping.is_set)
+    running.stages.open("run")
+    assert (await stream.read()).WhichOneof("answer") == "detection"
+    for each in (stream, idle):
+        assert await each.code() is grpc.StatusCode.UNAVAILABLE
+    await running.serving
+
+
+async def test_what_is_no_message_ends_the_stream(serve, cloud) -> None:
+    running = await serve()
+    method = "/edgegrasp.v1.GraspService/DetectGraspsStream"
+    bad = [b"\xff", b"\x0a\x02\xff\xfe"]  # no field at all; a name that is not UTF-8
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        for data in bad:
+            stream = channel.stream_stream(method)()
+            await stream.write(data)
+            assert await stream.code() is grpc.StatusCode.INVALID_ARGUMENT
+        unknown = channel.stream_stream(method)()
+        await unknown.write(b"\xa0\x06\x01")
+        answer = grasp_pb2.DetectGraspsStreamResponse.FromString(await unknown.read())
+        assert (answer.error.detail.kind, answer.error.detail.field) == (
+            "invalid-request",
+            "request",
+        )
+        unknown.cancel()

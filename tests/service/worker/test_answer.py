@@ -1,0 +1,123 @@
+"""The Answerer: the same answer over both transports, facts, deadlines and faults."""
+
+import json
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import Answerer, describe, load_catalogue
+from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
+from edgegrasp_service.worker.job import Answer, Job
+
+from .conftest import GrpcAsker, RestAsker
+
+
+class FailingCatalogue(DummyCatalogue):
+    """Its network raises."""
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__()
+        self.error = error
+
+    def get(self, name: str = "") -> Any:
+        detector = super().get(name)
+
+        def run(batch: object) -> Any:
+            raise self.error
+
+        detector.run = run  # type: ignore[method-assign]
+        return detector
+
+
+def job(points: np.ndarray, remaining: float = 30.0, **options: Any) -> Job:
+    body = json.dumps({"points": points.tolist(), "options": options}).encode()
+    return Job("DetectGrasps", "http", body, remaining, "application/json")
+
+
+def test_both_transports_give_the_same_grasps(
+    points: np.ndarray, rest: RestAsker, grpc_: GrpcAsker
+) -> None:
+    options = {"seed": 3, "top_k": 4, "debug": True}
+    said = json.loads(rest.send({"points": points.tolist(), "options": options}).body)
+    message = grasp_pb2.DetectGraspsRequest(points=points.tobytes(), options=options)
+    written = grasp_pb2.DetectGraspsResponse.FromString(grpc_.send(message).body)
+    assert len(said["grasps"]) == len(written.grasps) == 4
+    for one, other in zip(said["grasps"], written.grasps, strict=True):
+        for name, value in one.items():
+            np.testing.assert_array_equal(np.ravel(value), np.ravel(getattr(other, name)))
+    assert said["counts"] == dict(written.counts)
+    assert said["warnings"] == list(written.warnings)
+    np.testing.assert_array_equal(np.ravel(said["debug"]["points"]), written.debug.points)
+    scores = np.array([np.nan if score is None else score for score in said["debug"]["score"]])
+    np.testing.assert_array_equal(scores.astype(np.float32), written.debug.score)
+    assert said["debug"]["outcome"] == list(written.debug.outcome)
+
+
+def test_scores_over_both_transports(points: np.ndarray, rest: RestAsker, grpc_: GrpcAsker) -> None:
+    edges, poses = [[0, 1], [2, 2], [3, 0]], np.eye(4, dtype=int)[None].tolist()
+    said = rest.send({"points": points.tolist(), "edges": edges}, score=True)
+    message = grasp_pb2.ScoreGraspsRequest(
+        points=points.tobytes(),
+        edges=[{"approach_index": a, "contact_index": c} for a, c in edges],
+    )
+    written = grasp_pb2.ScoreGraspsResponse.FromString(grpc_.send(message).body)
+    assert said.facts.grasps == len(written.evaluations) == 3
+    for one, other in zip(json.loads(said.body)["evaluations"], written.evaluations, strict=True):
+        assert one["reason"] == (other.reason or None)
+        assert (one["grasp"] is None) == (not other.HasField("grasp"))
+    said = rest.send({"points": points.tolist(), "hand_poses": poses}, score=True)
+    message = grasp_pb2.ScoreGraspsRequest(
+        points=points.tobytes(), hand_poses=[{"T_cloud_hand": np.eye(4).ravel().tolist()}]
+    )
+    written = grasp_pb2.ScoreGraspsResponse.FromString(grpc_.send(message).body)
+    grasp = json.loads(said.body)["evaluations"][0]["grasp"]
+    assert grasp["score"] == written.evaluations[0].grasp.score
+
+
+def test_facts(points: np.ndarray) -> None:
+    asked = pickle.loads(pickle.dumps(job(points, top_k=3)))
+    answer: Answer = pickle.loads(pickle.dumps(Answerer(DummyCatalogue()).answer(asked)))
+    facts = answer.facts
+    assert (facts.model, facts.points, facts.grasps) == ("dummy", 60, 3)
+    assert list(facts.seconds) == ["decode", "prepare", "network", "finish", "encode"]
+    assert facts.counts["returned"] == 3
+    assert facts.traceback == ""
+
+
+def test_the_deadline_is_kept_between_stages(points: np.ndarray) -> None:
+    late = Answerer(DummyCatalogue(0.2)).answer(job(points, remaining=0.1))
+    assert late.error is not None
+    assert late.error.kind == "deadline-exceeded"
+    assert late.facts.points == 60  # known as far as it came
+    passed = Answerer(DummyCatalogue()).answer(job(points, remaining=-1.0))
+    assert passed.error is not None
+    assert passed.facts.seconds == {}
+
+
+def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
+    answerer = Answerer(FailingCatalogue(ZeroDivisionError("a secret")))
+    answer = answerer.answer(job(points, seed=7))
+    assert answer.error is not None
+    assert (answer.error.kind, answer.error.status) == ("detector-failed", 500)
+    assert "secret" not in answer.error.detail
+    assert "ZeroDivisionError: a secret" in answer.facts.traceback
+    assert json.loads(answer.facts.options) == {"seed": 7}
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+)
+def test_a_process_without_memory_says_so(points: np.ndarray, error: Exception) -> None:
+    with pytest.raises(MemoryError):
+        Answerer(FailingCatalogue(error)).answer(job(points))
+
+
+def test_catalogues() -> None:
+    catalogue = load_catalogue(Settings(backend="dummy"))
+    assert isinstance(catalogue.get(), DummyDetector)
+    (facts,) = describe(catalogue)
+    assert grasp_pb2.Model(**facts).name == "dummy"

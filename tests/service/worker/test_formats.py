@@ -1,0 +1,494 @@
+import io
+import struct
+import sys
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.worker.formats import read_file
+from edgegrasp_service.worker.request_cloud import decode_points
+
+POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
+MANY = 1000
+MIB = 2**20
+
+
+def npy(array: np.ndarray, **options: object) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return stream.getvalue()
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def ply(points: np.ndarray, encoding: str = "binary_little_endian", promised: int = -1) -> bytes:
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding, "<")
+    record = np.dtype([("x", order + "f4"), ("c", "u1"), ("y", order + "f4"), ("z", order + "f4")])
+    rows = np.zeros(len(points), record)
+    for column, axis in enumerate("xyz"):
+        rows[axis] = points[:, column]
+    count = promised if promised >= 0 else len(points)
+    header = (
+        f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {count}\nproperty float x\n"
+        "property uchar c\nproperty float y\nproperty float z\nelement face 1\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    )
+    if encoding == "ascii":
+        lines = [" ".join(repr(value.item()) for value in row) for row in rows]
+        return (header + "\n".join(lines) + "\n3 0 1 2\n").encode()
+    return header.encode() + rows.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
+
+
+def pcd(points: np.ndarray, encoding: str = "binary", promised: int = -1) -> bytes:
+    record = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("n", "<f4", 2), ("i", "<u1")])
+    rows = np.zeros(len(points), record)
+    for column, axis in enumerate("xyz"):
+        rows[axis] = points[:, column]
+    count = promised if promised >= 0 else len(points)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z n i\nSIZE 4 4 4 4 1\nTYPE F F F F U\n"
+        f"COUNT 1 1 1 2 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\n"
+        f"DATA {encoding}\n"
+    )
+    if encoding == "ascii":
+        lines = [f"{x!r} {y!r} {z!r} 0 0 0" for x, y, z in points.astype(float).tolist()]
+        return (header + "\n".join(lines) + "\n").encode()
+    return header.encode() + rows.tobytes()
+
+
+def xyz(points: np.ndarray) -> bytes:
+    rows = [f"{x!r} {y!r}\t{z!r}" for x, y, z in points.astype(float).tolist()]
+    return ("# x y z\n\n" + "\n".join(rows) + "\n").encode()
+
+
+GOOD_FILES = {
+    "npy": npy(POINTS),
+    "npy, column order": npy(np.asfortranarray(POINTS)),
+    "npy, big endian": npy(POINTS.astype(">f4")),
+    "npz": npz(points=POINTS, colors=POINTS),
+    "npz, one array": npz(anything=POINTS),
+    "ply": ply(POINTS),
+    "ply, big endian": ply(POINTS, "binary_big_endian"),
+    "ply, text": ply(POINTS, "ascii"),
+    "pcd": pcd(POINTS),
+    "pcd, text": pcd(POINTS, "ascii"),
+    "xyz": xyz(POINTS),
+}
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+def test_every_format_gives_the_same_points(name: str) -> None:
+    points = read_file(name[:3], GOOD_FILES[name], MANY).points
+    np.testing.assert_array_equal(np.asarray(points, dtype=np.float32), POINTS)
+    assert points.dtype.isnative
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd"])
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_files_written_by_open3d(suffix: str, text: bool, compressed: bool, tmp_path) -> None:
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    path = tmp_path / f"cloud.{suffix}"
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
+    open3d.io.write_point_cloud(path, cloud, write_ascii=text, compressed=compressed)
+    points = read_file(suffix, path.read_bytes(), MANY).points
+    # Open3D writes few digits of text.
+    np.testing.assert_allclose(points, POINTS, atol=1e-5 if text else 1e-7)
+
+
+def test_packed_and_listed_points_match() -> None:
+    np.testing.assert_array_equal(decode_points(POINTS.tobytes(), MANY), POINTS)
+    listed = decode_points(POINTS.tolist(), MANY)
+    np.testing.assert_array_equal(listed.astype(np.float32), POINTS)
+    assert decode_points(b"", MANY).shape == decode_points([], MANY).shape == (0, 3)
+    assert decode_points([[0, 0, 1]], MANY).dtype == np.float64
+
+
+@pytest.mark.parametrize("name", [name for name in GOOD_FILES if name != "xyz"])
+@given(data=st.data())
+def test_truncated_files_are_refused(name: str, data: st.DataObject) -> None:
+    whole = GOOD_FILES[name]
+    # Text may end inside its last number, and faces behind the vertices are not read.
+    needed = len(whole) - {"ply": 14, "ply, big endian": 14, "ply, text": 30, "pcd, text": 12}.get(
+        name, 1
+    )
+    cut = data.draw(st.integers(0, needed))
+    with pytest.raises(InvalidRequest) as caught:
+        read_file(name[:3], whole[:cut], MANY)
+    assert caught.value.field == "cloud"
+
+
+def promise(count: int, file_format: str) -> bytes:
+    if file_format == "ply":
+        return ply(POINTS, promised=count)
+    if file_format == "pcd":
+        return pcd(POINTS, promised=count)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": (count, 3)}
+    )
+    return header.getvalue() + POINTS.tobytes()
+
+
+@pytest.mark.parametrize("file_format", ["npy", "ply", "pcd"])
+@pytest.mark.parametrize("count", [42, 10**9, 10**17])
+def test_a_header_cannot_promise_more_than_there_is(file_format: str, count: int) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_file(file_format, promise(count, file_format), max_points=10**18)
+    assert "promises" in caught.value.value
+
+
+@pytest.mark.parametrize("name", GOOD_FILES)
+def test_too_many_points(name: str) -> None:
+    with pytest.raises(PayloadTooLarge) as caught:
+        read_file(name[:3], GOOD_FILES[name], max_points=39)
+    assert caught.value.value == "40 points"
+    assert "39" in caught.value.fix
+
+
+def test_a_bomb_that_lies_about_its_size_is_not_unpacked() -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(50_000_000))
+    lying = stream.getvalue().replace(struct.pack("<I", 50_000_000), struct.pack("<I", 100))
+    tracemalloc.start()
+    with pytest.raises(InvalidRequest, match=r"no whole \.npz file"):
+        read_file("npz", lying, MANY)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("data", "value"),
+    [
+        (npz(a=POINTS, b=POINTS), "a, b"),
+        (npz(), "no array points"),
+        (npz(points=POINTS, colours=POINTS), "colours"),
+    ],
+)
+def test_an_archive_must_say_which_array(data: bytes, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_file("npz", data, MANY)
+    assert value in caught.value.value
+    assert "points=points" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("points", "field", "value"),
+    [
+        ("abc", "points", "'abc'"),
+        (None, "points", "None"),
+        ([[0.0, 0.0, 0.0], [1.0, 2.0]], "points", "rows of different lengths"),
+        ([[0.0, 0.0, 0.0], ["a", 0.0, 0.0]], "points", "['a', 0.0, 0.0]"),
+        ([[0.0, 0.0, None]], "points", "[0.0, 0.0, None]"),
+        ([[True, False, True]], "points", "[True, False, True]"),
+        ([[10**400, 0, 0]], "points", "[1000000"),
+        ([{}], "points", "{}"),
+    ],
+)
+def test_lists_that_are_no_numbers(points: object, field: str, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_points(points, MANY)
+    assert caught.value.field == field
+    assert caught.value.value.startswith(value)
+
+
+def test_packed_bytes_must_be_whole_points() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_points(POINTS.tobytes()[:-5], MANY)
+    assert caught.value.value.startswith("475 bytes")
+
+
+def test_unknown_format_names_the_known_ones() -> None:
+    with pytest.raises(UnsupportedMediaType) as caught:
+        read_file("las", b"LASF", MANY)
+    assert caught.value.fix == "Send one of: npy, npz, ply, pcd, xyz."
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"element face 3\nproperty float x\n",
+        b"element vertex -3\nproperty float x\nproperty float y\nproperty float z\n",
+        b"element vertex 1\nproperty float x\nproperty float y\n",
+        b"element vertex 1\nproperty list uchar int x\nproperty float y\nproperty float z\n",
+        b"",
+    ],
+)
+def test_ply_headers_without_points(header: bytes) -> None:
+    data = b"ply\nformat binary_little_endian 1.0\n" + header + b"end_header\n" + bytes(100)
+    with pytest.raises(InvalidRequest) as caught:
+        read_file("ply", data, MANY)
+    assert "vert" in caught.value.value
+
+
+def test_integer_coordinates_keep_their_type() -> None:
+    header = b"ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += b"property int x\nproperty int y\nproperty int z\nend_header\n1 2 3\n"
+    assert read_file("ply", header, MANY).points.dtype == np.int32
+
+
+def test_compressed_pcd_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    body = struct.pack("<II", 4, 40 * 21) + bytes(4)
+    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    with pytest.raises(DecoderMissing) as caught:
+        read_file("pcd", data[0] + data[1] + body, MANY)
+    assert "uncompressed" in caught.value.fix
+
+
+@pytest.mark.parametrize("sizes", [(4, 10**9), (10**9, 840)])
+def test_compressed_pcd_with_false_sizes(sizes: tuple[int, int]) -> None:
+    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    with pytest.raises(InvalidRequest):
+        read_file("pcd", data[0] + data[1] + struct.pack("<II", *sizes) + bytes(4), MANY)
+
+
+NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
+COLORS = np.random.default_rng(3).integers(0, 256, (40, 3)).astype(np.uint8)
+IDS = np.arange(40, dtype=np.int32) % 5
+
+
+def test_what_stands_beside_points_in_an_npz_file() -> None:
+    arrays = {"normals": NORMALS, "colors": COLORS, "segment_ids": IDS, "view_ids": IDS}
+    cloud = read_file("npz", npz(points=POINTS, **arrays), MANY)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(getattr(cloud, name), array)
+    with pytest.raises(PayloadTooLarge) as caught:
+        read_file("npz", npz(points=POINTS, segment_ids=np.zeros(1001, np.int32)), MANY)
+    assert caught.value.field == "segment_ids"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_normals_and_colours_of_a_ply_file(encoding: str) -> None:
+    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+    kinds = ["float"] * 6 + ["uchar"] * 3
+    header = f"ply\nformat {encoding} 1.0\nelement vertex 40\n"
+    header += "".join(f"property {k} {n}\n" for k, n in zip(kinds, names, strict=True))
+    table = np.concatenate([POINTS, NORMALS, COLORS], axis=1)
+    if encoding == "ascii":
+        body = "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
+    else:
+        rows = [POINTS[i].tobytes() + NORMALS[i].tobytes() + COLORS[i].tobytes() for i in range(40)]
+        body = b"".join(rows)
+    cloud = read_file("ply", header.encode() + b"end_header\n" + body, MANY)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_array_equal(cloud.normals, NORMALS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+
+
+@pytest.mark.parametrize("kind", ["F", "U"])
+@pytest.mark.parametrize("height", [1, 4])
+def test_normals_and_colours_of_a_pcd_file(kind: str, height: int) -> None:
+    header = (
+        "VERSION 0.7\nFIELDS x y z normal_x normal_y normal_z rgb\nSIZE 4 4 4 4 4 4 4\n"
+        f"TYPE F F F F F F {kind}\nCOUNT 1 1 1 1 1 1 1\nWIDTH {40 // height}\nHEIGHT {height}\n"
+        "POINTS 40\nDATA binary\n"
+    )
+    packed = (COLORS.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(axis=1)
+    rows = np.concatenate([POINTS, NORMALS, packed.astype("<u4").view("<f4")[:, None]], axis=1)
+    cloud = read_file("pcd", header.encode() + rows.astype("<f4").tobytes(), MANY)
+    assert cloud.points.shape == ((40, 3) if height == 1 else (4, 10, 3))
+    np.testing.assert_array_equal(cloud.points.reshape(-1, 3), POINTS)
+    np.testing.assert_array_equal(cloud.normals, NORMALS)
+    np.testing.assert_array_equal(cloud.colors, COLORS)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz"])
+@pytest.mark.parametrize("compressed", [False, True])
+def test_normals_and_colours_written_by_open3d(suffix: str, compressed: bool, tmp_path) -> None:
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
+    cloud.normals = open3d.utility.Vector3dVector(NORMALS.astype(np.float64))
+    cloud.colors = open3d.utility.Vector3dVector(COLORS / 255)
+    path = tmp_path / f"cloud.{suffix}"
+    open3d.io.write_point_cloud(path, cloud, compressed=compressed)
+    found = read_file(suffix, path.read_bytes(), MANY)
+    np.testing.assert_allclose(found.points, POINTS, atol=1e-7)
+    if suffix == "xyz":
+        assert found.normals is found.colors is None
+        return
+    np.testing.assert_allclose(found.normals, NORMALS, atol=1e-6)
+    scale = 255 if found.colors.dtype.kind == "f" else 1
+    np.testing.assert_allclose(found.colors * scale, COLORS, atol=1.0)
+
+
+def test_organised_clouds() -> None:
+    organised = POINTS.reshape(5, 8, 3).copy()
+    organised[2, 3] = np.nan
+    rows = organised.astype(object)
+    rows[2, 3] = None
+    for points in (
+        read_file("npy", npy(organised), MANY).points,
+        read_file("npz", npz(points=organised), MANY).points,
+        decode_points(rows.tolist(), MANY),
+    ):
+        np.testing.assert_array_equal(np.asarray(points, np.float32), organised)
+    with pytest.raises(PayloadTooLarge):
+        read_file("npy", npy(organised), 39)
+    with pytest.raises(PayloadTooLarge):
+        decode_points(organised.tolist(), 39)
+
+
+@pytest.mark.parametrize(
+    ("data", "value"),
+    [
+        (b"", "0 bytes without a line"),
+        (b"# only\n", "without a line"),
+        (b"0 0 0\n0 0\n", "line 2 with 2 words"),
+        (b"0 0 0 1 0 0\n", "line 1 with 6 words"),
+        (b"0 0 a\n", "text among the numbers"),
+    ],
+)
+def test_bad_xyz_files(data: bytes, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_file("xyz", data, MANY)
+    assert value in caught.value.value
+
+
+# What headers say and no array can be.
+
+
+def npy_of(header: str, body: bytes = b"") -> bytes:
+    text = header.encode() + b"\n"
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(text)) + text + body
+
+
+@pytest.mark.parametrize(
+    ("descr", "shape", "value"),
+    [
+        ("'<f4'", "(True, 3)", "shape (True, 3)"),
+        ("'<f4'", "(-1, 3)", "shape (-1, 3)"),
+        ("'<f4'", "(99999999999999999999999999, 0, 3)", "shape (99999999999999999999999999, 0, 3)"),
+        ("'<f4'", "(1" + ", 1" * 99 + ")", "shape (1, 1"),
+        ("('<f4',(3,))", "(1,)", "dtype ('<f4', (3,))"),
+        ("'|O'", "(1, 3)", "dtype object"),
+    ],
+)
+def test_npy_headers_of_no_array(descr: str, shape: str, value: str) -> None:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
+    with pytest.raises(InvalidRequest) as caught:
+        read_file("npy", npy_of(header, bytes(12)), MANY)
+    assert caught.value.field == "cloud"
+    assert caught.value.value.startswith(value)
+
+
+def test_a_count_of_thousands_of_digits() -> None:
+    data = pcd(POINTS).replace(b"COUNT 1 1 1 2 1", b"COUNT 1 1 1 2 " + b"1" * 5000)
+    with pytest.raises(InvalidRequest) as caught:
+        read_file("pcd", data, MANY)
+    assert caught.value.value.endswith("COUNT 11111111")
+
+
+def test_a_comment_that_names_the_end_of_the_header() -> None:
+    for encoding in ("ascii", "binary_little_endian"):
+        data = ply(POINTS, encoding).replace(b"comment none", b"comment end_header is below")
+        points = read_file("ply", data, MANY).points
+        np.testing.assert_array_equal(np.asarray(points, np.float32), POINTS)
+
+
+def test_numbers_are_read_whole_or_not_at_all() -> None:
+    """The exponent comes last."""
+    written = b"0.12345678901234567890123456789012e-05 0 0\n"
+    assert read_file("xyz", written, 10).points[0, 0] == 0.12345678901234567890123456789012e-05
+    with pytest.raises(InvalidRequest, match="a word of 66 characters"):
+        read_file("xyz", b"0." + b"1" * 60 + b"e-05 0 0\n", 10)
+
+
+# What is small on the way in and large inside is refused before it is large.
+
+
+def npz_of_many_members() -> bytes:
+    entry = struct.Struct("<4s4B4HL2L5H2L")
+    entries = b"".join(
+        entry.pack(b"PK\1\2", 20, 3, 20, 0, *[0] * 4, 33, 0, 0, 6, *[0] * 6) + b"%06d" % number
+        for number in range(60_000)
+    )
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 60_000, 60_000, len(entries), 4, 0)
+    return b"PK\3\4" + entries + end
+
+
+def npz_of_zeros() -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(200 * MIB))
+    return stream.getvalue()
+
+
+def hidden_directory() -> bytes:
+    """Two ends of a directory in one, of which a reader may take either."""
+    data = bytearray(npz_of_many_members())
+    data[-22 + 4 : -22 + 8] = b"PK\5\6"
+    return bytes(data)
+
+
+def pcd_bomb() -> bytes:
+    count, size = 100_000, 12 + 8000
+    header = (
+        "VERSION 0.7\nFIELDS x y z a\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1000\n"
+        f"WIDTH {count}\nHEIGHT 1\nPOINTS {count}\nDATA binary_compressed\n"
+    )
+    packed = b"\0\0" + b"\xe0\xff\0" * (count * size // 264)
+    return header.encode() + struct.pack("<II", len(packed), count * size) + packed
+
+
+def npy_header(size: int) -> bytes:
+    return b"\x93NUMPY\2\0" + struct.pack("<I", size) + b"{" + b" " * (size - 1)
+
+
+def npy_promising(rows: int) -> bytes:
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, 3)}}\n".encode()
+    return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex {}\n"
+PLY += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+
+BOMBS: dict[str, tuple[str, bytes]] = {
+    "npz, ratio": ("npz", npz_of_zeros()),
+    "npz, members": ("npz", npz_of_many_members()),
+    "npz, two directories": ("npz", hidden_directory()),
+    "npy, shape": ("npy", npy_promising(999_999_999_999)),
+    "npy, header": ("npy", npy_header(8 * MIB)),
+    "ply, header": ("ply", b"ply\n" + b"\n" * (8 * MIB) + b"end_header\n"),
+    "ply, count": ("ply", PLY.format(1_999_999).encode() + b"0 0 0"),
+    "pcd, header": ("pcd", b"".join(b"%x\n" % n for n in range(MIB)) + b"DATA ascii\n"),
+    "pcd, compressed": ("pcd", pcd_bomb()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_in_files_are_refused_within_the_memory_of_the_body(name: str) -> None:
+    file_format, data = BOMBS[name]
+    tracemalloc.start()
+    try:
+        with pytest.raises((InvalidRequest, PayloadTooLarge)):
+            read_file(file_format, data, 2_000_000)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2 * len(data) + 16 * MIB, f"{peak / MIB:.1f} MiB for {len(data) / MIB:.1f} MiB"
+
+
+def test_that_measure_notices_what_is_unpacked() -> None:
+    """The other way round: a good file takes more than its compressed size."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, points=np.zeros((1_000_000, 3)))
+    tracemalloc.start()
+    try:
+        read_file("npz", stream.getvalue(), 2_000_000)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak > 2 * len(stream.getvalue()) + 16 * MIB

@@ -1,0 +1,311 @@
+import base64
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_service.errors import PayloadTooLarge
+from edgegrasp_service.worker.request_cloud import (
+    POINT_TYPES,
+    decode_array,
+    decode_cloud,
+    decode_points,
+    fuse_depth_images,
+    read_point_cloud2,
+)
+
+MANY = 100_000
+FX, FY, CX, CY = 60.0, 50.0, 15.5, 11.5
+
+
+def pose(seed: int) -> np.ndarray:
+    """A random camera pose, from the QR decomposition of random numbers."""
+    random = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    T_cloud_camera = np.eye(4)
+    T_cloud_camera[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    T_cloud_camera[:3, 3] = random.normal(size=3)
+    return T_cloud_camera
+
+
+def depth_of(shape: tuple[int, int] = (24, 32), seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.3, 0.9, shape)
+
+
+def image(depth: np.ndarray, T_cloud_camera: np.ndarray, encoding: str = "64FC1") -> dict:
+    dtype = {"64FC1": "<f8", "32FC1": "<f4", "16UC1": "<u2"}[encoding]
+    pixels = {"height": depth.shape[0], "width": depth.shape[1], "encoding": encoding}
+    return {
+        "depth": pixels | {"data": depth.astype(dtype).tobytes()},
+        "intrinsics": {"fx": FX, "fy": FY, "cx": CX, "cy": CY},
+        "T_cloud_camera": T_cloud_camera.tolist(),
+    }
+
+
+def test_points_project_back_onto_their_pixels() -> None:
+    depth, T_cloud_camera = depth_of(), pose(1)
+    cloud, cameras = fuse_depth_images([image(depth, T_cloud_camera)], MANY)
+    assert cloud.points.shape == (24, 32, 3)
+    homogeneous = np.concatenate([cloud.points, np.ones((24, 32, 1))], axis=-1)
+    x, y, z = np.moveaxis((homogeneous @ np.linalg.inv(T_cloud_camera).T)[..., :3], -1, 0)
+    np.testing.assert_allclose(z, depth, atol=1e-6)
+    row, column = np.indices(depth.shape)
+    np.testing.assert_allclose(FX * x / z + CX, column, atol=1e-4)
+    np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
+    np.testing.assert_array_equal(cameras, [T_cloud_camera[:3, 3]])
+
+
+def test_z_is_forward_and_y_down() -> None:
+    cloud, _ = fuse_depth_images([image(np.full((24, 32), 0.5), np.eye(4))], MANY)
+    assert (cloud.points[..., 2] == 0.5).all()
+    assert (cloud.points[0, :, 1] < 0).all()
+    assert (cloud.points[-1, :, 1] > 0).all()
+    assert (cloud.points[:, -1, 0] > 0).all()
+
+
+@pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
+def test_encodings_say_the_same(encoding: str) -> None:
+    millimetres = np.round(depth_of() * 1000)
+    expected, _ = fuse_depth_images([image(millimetres / 1000, pose(2))], MANY)
+    sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
+    packed, _ = fuse_depth_images([sent], MANY)
+    np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
+    sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
+    in_json, _ = fuse_depth_images([sent], MANY)
+    np.testing.assert_array_equal(in_json.points, packed.points)
+
+
+def test_rows_of_metres() -> None:
+    depth = depth_of((3, 4))
+    expected, _ = fuse_depth_images([image(depth, pose(3))], MANY)
+    rows = depth.tolist()
+    rows[1][2] = None
+    listed, _ = fuse_depth_images([image(depth, pose(3)) | {"depth": rows}], MANY)
+    assert np.isnan(listed.points[1, 2]).all()
+    expected.points[1, 2] = np.nan
+    np.testing.assert_array_equal(listed.points, expected.points)
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
+def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
+    depth = depth_of()
+    depth[5, 7] = nothing
+    cloud, _ = fuse_depth_images([image(depth, pose(4))], MANY)
+    checked = check_cloud(cloud)
+    assert len(checked.points) == 24 * 32 - 1
+    assert 5 * 32 + 7 not in checked.row
+
+
+def test_views_are_fused() -> None:
+    depths = [depth_of(seed=seed) for seed in range(3)]
+    poses = [pose(seed) for seed in range(3)]
+    depths[0][0, 0] = np.nan
+    images = [image(depth, at) for depth, at in zip(depths, poses, strict=True)]
+    sent = {"depth_images": images, "segment_ids": list(range(3 * 24 * 32))}
+    cloud, options = decode_cloud(sent, DetectOptions(), MANY)
+    np.testing.assert_allclose(options.viewpoint, [at[:3, 3] for at in poses])
+    assert parse_again(options) == options
+    checked = check_cloud(cloud)
+    np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
+    for view, single in enumerate(images):
+        alone, _ = fuse_depth_images([single], MANY)
+        seen = checked.points[checked.view_ids == view]
+        np.testing.assert_array_equal(seen, check_cloud(alone).points)
+
+
+def parse_again(options: DetectOptions) -> DetectOptions:
+    return DetectOptions.model_validate(options.model_dump())
+
+
+def test_one_view_is_one_viewpoint() -> None:
+    sent = {"depth_images": [image(depth_of(), pose(5))]}
+    _, options = decode_cloud(sent, DetectOptions(), MANY)
+    assert options.viewpoint == tuple(pose(5)[:3, 3].tolist())
+
+
+def test_pixels_of_all_images_are_counted() -> None:
+    images = [image(depth_of(), pose(0))] * 3
+    with pytest.raises(PayloadTooLarge) as caught:
+        fuse_depth_images(images, 2 * 24 * 32)
+    assert caught.value.field == "depth_images"
+
+
+@pytest.mark.parametrize(
+    ("images", "field", "value"),
+    [
+        (None, "depth_images", "None"),
+        ([], "depth_images", "0 images"),
+        ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
+        ([{}], "depth_images.0.depth", "nothing"),
+        ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
+        ([image(depth_of(), pose(0)) | {"depth": [[1], [1, 2]]}], "depth_images.0.depth", "length"),
+        ([image(depth_of(), pose(0)) | {"depth": [[]]}], "depth_images.0.depth", "(1, 0)"),
+        ([image(depth_of(), pose(0)) | {"depth": [["a"]]}], "depth_images.0.depth", "['a']"),
+        ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", "(("),
+        (
+            [image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "32FC1",
+                                                    "data": "no base64!"}}],
+            "depth_images.0.depth.data", "no base64",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_images(images: object, field: str, value: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        fuse_depth_images(images, MANY)
+    assert caught.value.field == field
+    assert value.replace("((", "") in caught.value.value
+
+
+# sensor_msgs/PointCloud2
+
+CODES = {kind: code for code, kind in POINT_TYPES.items()}
+
+
+def layout(rows: np.ndarray, padding: int = 0, big: bool = False) -> dict[str, Any]:
+    """A structured array (H, W) as a PointCloud2, with bytes after every row of points."""
+    record = rows.dtype.newbyteorder(">" if big else "<")
+    data = b"".join(row.astype(record).tobytes() + bytes(padding) for row in rows)
+    fields = [
+        {
+            "name": name,
+            "offset": int(record.fields[name][1]),
+            "datatype": CODES[rows.dtype[name].base.str[1:]],
+            "count": int(np.prod(rows.dtype[name].shape, dtype=int)),
+        }
+        for name in record.names
+    ]
+    height, width = rows.shape
+    step = record.itemsize
+    return {
+        "height": height,
+        "width": width,
+        "fields": fields,
+        "is_bigendian": big,
+        "point_step": step,
+        "row_step": width * step + padding,
+        "data": data,
+    }
+
+
+def cloud_of(shape: tuple[int, int], kind: str = "f4", extra: tuple[Any, ...] = ()) -> np.ndarray:
+    names = [("x", kind), ("intensity", "u2"), ("y", kind), ("z", kind), ("ring", "u1", 3), *extra]
+    rows = np.zeros(shape, np.dtype(names, align=True))
+    random = np.random.default_rng(0)
+    for name in rows.dtype.names:
+        if rows.dtype[name].kind == "f":
+            rows[name] = random.normal(size=shape)
+    return rows
+
+
+def xyz(rows: np.ndarray, names: tuple[str, ...] = ("x", "y", "z")) -> np.ndarray:
+    return np.stack([rows[name] for name in names], axis=-1)
+
+
+@settings(deadline=None)
+@given(
+    height=st.integers(1, 5),
+    width=st.integers(1, 7),
+    padding=st.integers(0, 9),
+    big=st.booleans(),
+    kind=st.sampled_from(["f4", "f8"]),
+    text=st.booleans(),
+)
+def test_every_layout_gives_the_points(
+    height: int, width: int, padding: int, big: bool, kind: str, text: bool
+) -> None:
+    rows = cloud_of((height, width), kind)
+    fields = layout(rows, padding, big)
+    if text:
+        fields["data"] = base64.b64encode(fields["data"]).decode()
+    cloud = read_point_cloud2(fields, MANY)
+    expected = xyz(rows) if height > 1 else xyz(rows)[0]
+    np.testing.assert_array_equal(cloud.points, expected)
+    assert cloud.points.dtype == np.dtype(kind)
+    assert cloud.normals is cloud.colors is None
+
+
+@pytest.mark.parametrize("kind", ["f4", "u4"])
+def test_normals_and_colours(kind: str) -> None:
+    names = ("normal_x", "normal_y", "normal_z")
+    rows = cloud_of((3, 4), extra=(*((name, "f4") for name in names), ("rgb", kind)))
+    packed = np.arange(12, dtype=np.uint32).reshape(3, 4) + 0x112200
+    rows["rgb"] = packed.view(kind)
+    for big in (False, True):
+        cloud = read_point_cloud2(layout(rows, big=big), MANY)
+        np.testing.assert_array_equal(cloud.normals, xyz(rows, names))
+        np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
+
+
+def test_no_points() -> None:
+    assert read_point_cloud2(layout(cloud_of((1, 0))), MANY).points.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"data": "no base64!"}, "point_cloud2.data"),
+        ({"data": None}, "point_cloud2.data"),
+        ({"dense": True}, "point_cloud2.dense"),
+        ({"fields": []}, "point_cloud2.fields"),
+        ({"width": 2**31}, "point_cloud2.width"),
+        ({"row_step": 2**30, "height": 1000}, "point_cloud2.data"),
+        ({"point_step": 0}, "point_cloud2.fields.0.offset"),
+    ],
+)
+def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_point_cloud2(layout(cloud_of((1, 4))) | changes, MANY)
+    assert caught.value.field == field
+    assert caught.value.fix
+
+
+@pytest.mark.parametrize("value", [None, 3, [], "text"])
+def test_what_is_no_layout(value: object) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_point_cloud2(value, MANY)
+    assert caught.value.field.startswith("point_cloud2")
+
+
+# Lists
+
+
+DEEP: list = []
+for _ in range(5000):
+    DEEP = [DEEP]
+
+
+@pytest.mark.parametrize(
+    "decode", [decode_points, lambda rows, most: decode_array("normals", rows, most)]
+)
+def test_one_long_text_does_not_give_all_elements_its_room(decode: Any) -> None:
+    rows = [["x" * 100_000, "", ""]] + [["", "", ""]] * 2000
+    tracemalloc.start()
+    with pytest.raises(InvalidRequest) as caught:
+        decode(rows, MANY)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5_000_000
+    assert caught.value.value.startswith("['xxx")
+
+
+def test_whole_number_too_large_beside_a_hole() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        decode_points([[[None, None, None], [0, 0, 10**400]]], 10)
+    assert caught.value.value.startswith("[[None, None, None]")
+
+
+@pytest.mark.parametrize("value", ["x" * 100_000, {"k" * 100_000: 1}, DEEP, 10**4000])
+def test_long_and_deep_values_are_told_briefly(value: object) -> None:
+    for name in ("seed", "up", "support", "collision", "x" * 100_000):
+        with pytest.raises(InvalidRequest) as caught:
+            parse_options({name: value})
+        assert len(caught.value.value) <= 80
+    with pytest.raises(InvalidRequest) as caught:
+        decode_points([value], 10)
+    assert len(caught.value.value) <= 80
