@@ -19,13 +19,14 @@ from edgegrasp_model.hand_description import (
     occlusion_fractions,
     without_support,
 )
+from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
-from .scenes import PANDA, SEED, TINY
+from .scenes import PANDA, SEED, TINY, random_hands
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 CAMERA = np.array([0.3, 0.2, 0.5], dtype=np.float32)
@@ -60,6 +61,16 @@ def look(
 def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
     with torch.inference_mode():
         return build_network(config).eval()(batch)
+
+
+def test_views_of_some_hands_are_those_of_all_taken() -> None:
+    points = np.random.default_rng(0).uniform(-0.1, 0.15, (300, 3)).astype(np.float32)
+    cloud, hands, rows = Cloud(points, points), random_hands(9, 0, 0.05), np.array([1, 4, 8])
+    taken = hand_views(cloud, hands, reach_of(PANDA)).take(rows)
+    direct = hand_views(cloud, hands[rows], reach_of(PANDA))
+    np.testing.assert_array_equal(taken.candidate, direct.candidate)
+    np.testing.assert_array_equal(taken.row, direct.row)
+    np.testing.assert_allclose(taken.position, direct.position, atol=1e-6)
 
 
 def test_points_are_those_between_and_around_the_fingers() -> None:
