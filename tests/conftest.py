@@ -1,4 +1,5 @@
 import contextlib
+import os
 import re
 import signal
 import subprocess
@@ -7,8 +8,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers share two cores
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
+
+# No busy machine fails a test, and every run tries the same examples; `make fuzz` tries new ones.
+settings.register_profile("tests", max_examples=20, deadline=None, derandomize=True)
+settings.register_profile(
+    "fuzz",
+    max_examples=1500,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+)
+settings.load_profile("tests")
 
 READY_LINE = re.compile(r"EdgeGrasp serves HTTP (\S+) gRPC (\S+)\n")
 

@@ -50,20 +50,6 @@ def test_every_grasp_of_the_reference_is_a_candidate(golden) -> None:
         assert len(found.contact) == len(edges)
 
 
-def test_balls_are_those_of_the_reference(golden) -> None:
-    rows = golden["approach_index"].astype(np.int64)
-    found = pipeline.candidates(golden["points"], golden["normals"], rows, TABLE)
-    batch = pipeline.balls(golden["points"], golden["normals"], rows, found)
-    approach, contact = golden["ball_edges"].T
-    order = np.lexsort((contact, np.searchsorted(rows, approach)))
-    approach, contact = approach[order], contact[order]
-    centred = golden["points"][contact] - golden["points"][approach]
-    np.testing.assert_allclose(batch.points.numpy(), centred, atol=1e-7)
-    edge = batch.points[batch.contact].numpy()
-    expected = golden["points"][found.contact] - golden["points"][rows[found.ball]]
-    np.testing.assert_allclose(edge, expected, atol=1e-7)
-
-
 def test_a_detection_ranks_what_it_scores() -> None:
     rng = np.random.default_rng(0)
     # A ball on a table: a closed surface, seen from above.

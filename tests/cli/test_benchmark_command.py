@@ -4,20 +4,16 @@ Tests that share a result are in one file, so that one process makes it once.
 """
 
 import csv
-import importlib
 import json
 import re
-import shutil
 import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 OWN_PLANNER = """
 from edgegrasp_sim.top_down import plan_top_down
@@ -43,9 +39,7 @@ def test_the_oracle_is_above_random_candidates(oracle: Path, edge_sample: Path) 
     assert ceiling["declutter_rate"]["value"] > baseline["declutter_rate"]["value"]
 
 
-def test_a_planner_of_one_s_own_needs_only_its_name(
-    benchmark: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_planner_of_one_s_own_needs_only_its_name(benchmark, tmp_path, monkeypatch) -> None:
     (tmp_path / "my_planner.py").write_text(OWN_PLANNER)
     monkeypatch.syspath_prepend(tmp_path)
     as_class = benchmark(tmp_path / "class", "my_planner:MyPlanner", rounds=1)
@@ -91,9 +85,7 @@ def test_a_recorded_attempt_comes_out_the_same(oracle: Path, run, tmp_path: Path
     assert picture.read_bytes()[1:4] == b"PNG"
 
 
-def test_wrong_replays_and_comparisons_end_with_a_sentence(
-    oracle: Path, benchmark: Callable, refused, tmp_path: Path
-) -> None:
+def test_wrong_replays_and_comparisons_end_with_a_sentence(oracle, benchmark, refused, tmp_path):
     assert "attempt is 99" in refused("replay", "attempt", oracle, "--attempt", 99)
     assert "round is 7" in refused("replay", "attempt", oracle, "--round", 7)
     assert "holds no benchmark" in refused("replay", "attempt", tmp_path)
@@ -102,9 +94,7 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(
     assert "differ in protocol" in refused("compare", oracle, tmp_path)
 
 
-def test_two_planners_are_compared_scene_by_scene(
-    oracle: Path, edge_sample: Path, run, tmp_path: Path
-) -> None:
+def test_two_planners_are_compared_scene_by_scene(oracle, edge_sample, run, tmp_path) -> None:
     output = run("compare", edge_sample, oracle, "--output", tmp_path / "compared.json")
     assert "2 scenes" in output
     compared = json.loads((tmp_path / "compared.json").read_text())
@@ -113,16 +103,6 @@ def test_two_planners_are_compared_scene_by_scene(
         assert compared[name]["difference"] == pytest.approx(ceiling - base)
         low, high = compared[name]["difference_95"]
         assert low <= compared[name]["difference"] <= high
-
-
-def test_both_transports_give_the_same_attempts(
-    dummy_server, benchmark: Callable, tmp_path: Path
-) -> None:
-    digests = {
-        benchmark(tmp_path / str(number), "server", "--server", address)["attempts_digest"]
-        for number, address in enumerate((dummy_server.http_url, dummy_server.grpc_address))
-    }
-    assert len(digests) == 1
 
 
 def test_a_server_killed_and_restarted_changes_nothing(
@@ -167,40 +147,3 @@ def test_a_server_that_asks_for_a_token_gets_it(
         assert known["attempts"] > 0
         where = ("--rounds", 1, "--seed", 0, "--workers", 1)
         assert "authorization: got nothing" in refused("benchmark", *where, *asked)
-
-
-@pytest.fixture
-def results(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(DOCS)
-    return importlib.import_module("make_results")
-
-
-def test_results_become_a_page(results: ModuleType, edge_sample: Path, tmp_path: Path) -> None:
-    found, kept = tmp_path / "found", tmp_path / "kept"
-    shutil.copytree(edge_sample, found / "edge-sample")
-    (found / "samples").mkdir()
-    shutil.copy(DOCS / "results" / "samples.json", found / "samples" / "experiment.json")
-    shutil.copy(DOCS / "results" / "samples.png", found / "samples" / "picture.png")
-    (found / "small").mkdir()
-    rows = [f"{step},0.001,0.5,{0.5 - step / 1000},0.8,0.9" for step in range(0, 200)]
-    head = "step,learning_rate,train_loss,validation_loss,accuracy,auroc"
-    (found / "small" / "log.csv").write_text("\n".join([head, *rows]) + "\n")
-
-    results.collect(found, kept)
-    page = results.page(kept)
-    (record,) = json.loads((kept / "benchmarks.json").read_text()).values()
-    assert f"| {100 * record['grasp_success_rate']['value']:.1f} [" in page
-    command = "$ edgegrasp benchmark --scene packed --protocol edgegrasp --planner edge-sample "
-    assert command in page
-    assert "| *EdgeGraspNet* (Edge Grasp Network, ICRA 2023) | edgegrasp | 64-4k |" in page
-    assert "\n| 32-2k | " in page
-    assert "\n| small | 199 | 0.301 | 0.8 | 0.9 |" in page
-    assert {path.name for path in kept.glob("*.png")} == {"samples.png", "curves.png"}
-    # What is found again replaces what was kept; what is not stays.
-    results.collect(found / "edge-sample", kept)
-    assert results.page(kept) == page
-
-
-def test_a_folder_without_results_is_refused(results: ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no results of benchmark"):
-        results.collect(tmp_path, tmp_path / "kept")

@@ -1,7 +1,6 @@
 """`edgegrasp detect` and `edgegrasp models`."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import httpx
@@ -62,9 +61,7 @@ def test_options_of_every_kind(transport: str, file: str, dummy_server, run) -> 
     assert document["debug"]["score"][-1] is None
 
 
-def test_flags_win_over_the_options_file(
-    file: str, dummy_server, run, refused, tmp_path: Path
-) -> None:
+def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_path) -> None:
     options = tmp_path / "options.json"
     options.write_text(json.dumps({"top_k": 4, "seed": 3, "collision": {"mode": "penalise"}}))
     asked = ("detect", file, "--server", dummy_server.grpc_address, "--json", "--options", options)
@@ -103,22 +100,13 @@ def test_bad_options(options: list[str], sentence: str, file: str, dummy_server,
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],
 )
-def test_bad_input_without_a_server(
-    name: str,
-    content: bytes | None,
-    flags: tuple[str, ...],
-    sentence: str,
-    refused: Callable[..., str],
-    tmp_path: Path,
-) -> None:
+def test_bad_input_without_a_server(name, content, flags, sentence, refused, tmp_path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     assert sentence in refused("detect", tmp_path / name, *flags)
 
 
-def test_a_device_that_is_not_there_is_named(
-    file: str, refused, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_device_that_is_not_there_is_named(file, refused, monkeypatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "edgegrasp detect: device: got 'cuda'" in refused("detect", file, "--device", "cuda")
     assert "Use auto, cpu, cuda" in refused("detect", file, "--device", "gpu")
@@ -141,15 +129,7 @@ def pem(tmp_path: Path) -> dict[str, str]:
     return {name: str(tmp_path / f"{name}.pem") for name in ("ca", "own")}
 
 
-def test_a_server_with_tls_and_tokens(
-    file: str,
-    pem: dict[str, str],
-    run: Callable[..., str],
-    refused: Callable[..., str],
-    tmp_path: Path,
-    start_server,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_server, monkeypatch):
     token = tmp_path / "token"
     token.write_text("user-token-0123456789\n")
     certificates = ("--tls-certificate", pem["own"], "--tls-key", pem["own"])

@@ -24,16 +24,16 @@ def data(run: Callable[..., str], tmp_path_factory: pytest.TempPathFactory) -> P
     return folder
 
 
-def test_generate_train_serve_and_benchmark_one_after_the_other(
-    data: Path, run: Callable[..., str], tmp_path: Path
-) -> None:
+def test_generate_train_serve_and_benchmark_one_after_the_other(data, run, tmp_path) -> None:
     assert "0 scenes made, 4 kept" in run("generate-data", data, *VIEWS)
     amount = ("--steps", 4, "--views-per-step", 2, "--validation-share", 0.3)
-    training = ("train", data, "--run", tmp_path, *amount)
+    training = ("train", data, "--run", tmp_path, *amount, "--crop-radius", 0.06)
     assert "paused at step 2" in run(*training, "--until", 2)
     assert "AUROC" in run(*training)
     weights = tmp_path / "edgegrasp-plus.safetensors"
-    assert load_checkpoint(weights)[1].training["steps"] == 4
+    _, metadata = load_checkpoint(weights)
+    assert metadata.training["steps"] == 4
+    assert metadata.network == replace(recipe("edgegrasp-plus").network, crop_radius=0.06)
     assert (tmp_path / "edgegrasp-plus.md").is_file()
 
     result = tmp_path / "result"
@@ -41,36 +41,14 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(
     output = run("benchmark", *ONE_ROUND, *own, "--no-report", "--output", result)
     assert "GSR" in output
     planner = json.loads((result / "manifest.json").read_text())["run"]["planner"]
-    assert planner["digest"] == load_checkpoint(weights)[1].digest
+    assert planner["digest"] == metadata.digest
     assert planner["options"]["num_candidates"] == 200
     summary = json.loads((result / "summary.json").read_text())
     with (result / "attempts.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == summary["attempts"]
 
 
-def test_balls_may_be_as_large_as_the_scene(
-    data: Path, run: Callable[..., str], tmp_path: Path
-) -> None:
-    network = ("--model", "edgegrasp-small", "--crop-radius", 0.5)
-    amount = ("--steps", 1, "--views-per-step", 1, "--balls-per-view", 1)
-    amount = (*amount, "--validation-share", 0.3)
-    run("train", data, "--run", tmp_path, *network, *amount)
-    _, metadata = load_checkpoint(tmp_path / "edgegrasp-small.safetensors")
-    assert metadata.network == replace(recipe("edgegrasp-small").network, crop_radius=0.5)
-
-
-def test_the_authors_checkpoint_becomes_one_file(
-    shared_dir: Path, run: Callable[..., str], tmp_path: Path
-) -> None:
-    weights = tmp_path / "vn-edgegrasp.safetensors"
-    run("import-checkpoint", shared_dir / "reference" / "vn_edge_grasp", weights)
-    _, metadata = load_checkpoint(weights)
-    assert metadata.name == metadata.network.architecture == "vn-edgegrasp"
-
-
-def test_an_experiment_writes_figures_and_goes_on_where_it_was(
-    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_experiment_writes_figures_and_goes_on_where_it_was(run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(experiments, "BASELINES", ("edge-sample",))
     output = run("experiment", "baselines", *ONE_ROUND, "--output", tmp_path)
     first = json.loads((tmp_path / "experiment.json").read_text())
@@ -116,9 +94,7 @@ PROTOCOLS = "edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn"
         (("benchmark", "--server", "127.0.0.1:1"), "UNAVAILABLE"),
     ],
 )
-def test_wrong_arguments_end_with_a_sentence(
-    words: tuple[str, ...], message: str, data: Path, refused, tmp_path: Path, monkeypatch
-) -> None:
+def test_wrong_arguments_end_with_a_sentence(words, message, data, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = {"DATA": data, "FOLDER": tmp_path}
     assert message in refused(*(places.get(word, word) for word in words))

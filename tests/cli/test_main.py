@@ -56,9 +56,7 @@ def test_unknown_command() -> None:
         ("edgegrasp_cli.serve", ["serve"], "service"),
     ],
 )
-def test_a_missing_package_names_the_extra(
-    missing: str, words: list[str], extra: str, refused, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_names_the_extra(missing, words, extra, refused, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
     assert f"pip install 'edgegrasp[{extra}]'" in refused(*words)
 
@@ -71,9 +69,7 @@ def test_the_command_line_is_an_extra() -> None:
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])
-def test_a_recorded_request_is_answered_again(
-    transport: str, run, refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path, monkeypatch):
     def body(model: str, seconds: float) -> bytes:
         if transport == "http":
             return json.dumps({"model": model, "seconds": {"total": seconds}}).encode()

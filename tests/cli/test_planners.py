@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from edgegrasp_cli.planners.baselines import (
-    OwnCandidates,
     PaperCandidates,
     clean_cloud,
     paper_grasps,
@@ -103,9 +102,7 @@ MOST_KEPT = 1500  # candidates that the reference kept of a scene
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_random_candidates_and_their_clouds_are_the_reference_s(
-    shared_dir: Path, name: str
-) -> None:
+def test_random_candidates_and_their_clouds_are_the_reference_s(shared_dir, name) -> None:
     golden = np.load(shared_dir / "reference" / "golden" / f"{name}.npz")
     edges, kept = golden["ball_edges"].astype(np.int64), golden["edge_rows"]
     theirs = Cloud(golden["points"], golden["normals"])
@@ -140,16 +137,6 @@ def test_random_candidates_follow_the_seed_and_stay_above_the_table() -> None:
     assert not np.array_equal(poses, sampler(observation, np.random.default_rng(1)))
     few = replace(observation, cloud=observation.cloud[:5], view_ids=observation.view_ids[:5])
     assert len(sampler(few, np.random.default_rng(0))) == 0
-
-
-def test_our_own_candidates_are_those_of_a_detection() -> None:
-    observation = seen_under("edgegrasp")
-    options = {"collision": "avoid", "num_approach_points": 16, "num_candidates": 300}
-    sampler = OwnCandidates(PAPER, options)
-    poses = sampler(observation, np.random.default_rng(0))
-    assert 0 < len(poses) <= 300
-    assert np.array_equal(poses, sampler(observation, np.random.default_rng(0)))
-    assert (poses[:, 2, 2] < 1e-5 - 1.0).any()  # top-down grasps are among them
 
 
 FEW = {"num_approach_points": 8, "num_candidates": 100}
@@ -192,9 +179,7 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
         pass
 
 
-def test_another_package_may_name_its_planner(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_package_may_name_its_planner(tmp_path, monkeypatch) -> None:
     about = tmp_path / "their_package-0.1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 0.1\n")

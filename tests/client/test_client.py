@@ -6,14 +6,12 @@ from typing import Any
 
 import grpc
 import numpy as np
-import pytest
 
 import edgegrasp_client
 from edgegrasp_client import (
     AsyncGraspClient,
     Detection,
     GraspClient,
-    InvalidRequestError,
 )
 
 
@@ -33,22 +31,9 @@ def test_both_transports_give_the_same_values(dummy_server, make_client, cloud) 
     assert (by_grpc.counts, by_grpc.model) == (by_rest.counts, "dummy")
     assert by_grpc.warnings == by_rest.warnings != []
     assert by_grpc.seconds.keys() == by_rest.seconds.keys() >= {"total"}
-
-
-def test_typed_results(client, cloud) -> None:
-    grasp = client.detect(cloud).grasps[0]
-    for name, shape in (
-        ("T_cloud_hand", (4, 4)),
-        ("T_cloud_tcp", (4, 4)),
-        ("approach_point", (3,)),
-        ("contact_point", (3,)),
-        ("approach_direction", (3,)),
-    ):
-        array = getattr(grasp, name)
-        assert (array.shape, array.dtype) == (shape, np.float32)
-    assert isinstance(grasp.score, float)
-    assert isinstance(grasp.collision_free, bool)
-    np.testing.assert_allclose(grasp.T_cloud_tcp[:3, 3], grasp.contact_point)
+    grasp = by_grpc.grasps[0]
+    assert grasp.T_cloud_hand.shape == grasp.T_cloud_tcp.shape == (4, 4)
+    assert grasp.T_cloud_hand.dtype == grasp.contact_point.dtype == np.float32
 
 
 def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
@@ -119,66 +104,6 @@ def test_every_option_goes_through(client, cloud) -> None:
 def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
     options = dict.fromkeys(ALL_OPTIONS)
     assert_same(client.detect(cloud, **options), client.detect(cloud))
-
-
-@pytest.mark.parametrize(
-    ("options", "field"),
-    [
-        ({"sead": 1}, "options.sead"),
-        ({"seed": -1}, "options.seed"),
-        ({"seed": 2**70}, "options.seed"),
-        ({"seed": "first"}, "options.seed"),
-        ({"viewpoint": [np.nan, 0.0, 0.0]}, "options.viewpoint"),
-        ({"viewpoint": [0.0, 0.0]}, "options.viewpoint"),
-        ({"viewpoint": [[0, 0, 1], [0, 0]]}, "options.viewpoint"),
-        ({"viewpoint": 3.0}, "options.viewpoint"),
-        ({"workspace": {"min": [0, 0, 0], "max": [1, 1, 1], "mid": 3}}, "options.workspace.mid"),
-        ({"workspace": [1, 2]}, "options.workspace"),
-        ({"support": {"kind": "ransac", "distance": 0.0}}, "options.support.distance"),
-        ({"support": {"kind": "cylinder"}}, "options.support"),
-        ({"approach_region": {"include": [{"kind": "cube"}]}}, "options.approach_region.include.0"),
-        ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "options.approach_region"),
-        (
-            {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}},
-            "options.contact_region.include.0.indices.1",
-        ),
-        ({"approach_direction": {"preset": "up"}}, "options.approach_direction.preset"),
-        ({"collision": "dodge"}, "options.collision"),
-        ({"gripper": {"max_opening": 0.1}}, "options.gripper.tip_z"),
-        ({"gripper": [7]}, "options.gripper"),
-        ({"suppression": {"rotation": -1.0}}, "options.suppression.rotation"),
-    ],
-)
-def test_bad_options(options: dict[str, Any], field: str, client, cloud) -> None:
-    with pytest.raises(InvalidRequestError) as caught:
-        client.detect(cloud, **options)
-    error = caught.value
-    assert error.field.startswith(field)
-    assert error.value
-    assert error.fix
-    assert str(error) == f"{error.field}: got {error.value}. {error.fix}"
-
-
-@pytest.mark.parametrize(
-    ("given", "value"),
-    [
-        (np.zeros((40, 2), np.float32), "shape (40, 2)"),
-        (np.zeros((40, 3), np.int64), "dtype int64"),
-        (np.full((40, 3), np.nan), "40 points with NaN"),
-        (np.full((40, 3), 1e300), "40 points with NaN or infinity"),
-        (np.zeros((0, 3)), "no points"),
-        (np.zeros((3, 3)), "3 points for num_approach_points"),
-        (np.zeros((40, 3), dtype=object), "dtype object"),
-        ([[0.0, 0.0, 0.0]], "a list"),
-        ("cloud.las", "'cloud.las'"),
-        ("absent.npy", "absent.npy (No such file or directory)"),
-    ],
-)
-def test_bad_clouds(given: Any, value: str, client) -> None:
-    with pytest.raises(InvalidRequestError) as caught:
-        client.detect(given)
-    assert caught.value.field == "cloud"
-    assert value in caught.value.value
 
 
 def test_models_and_readiness(either_client) -> None:

@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -57,7 +57,6 @@ def grasp(pose: np.ndarray, score: float = 0.9, width: float = 0.06) -> Grasp:
     return Grasp(**fields | {"approach_direction": pose[:3, 2]})
 
 
-@settings(max_examples=100, deadline=None)
 @given(quaternion=quaternions)
 def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ...]) -> None:
     rotation = Rotation.from_quat(quaternion)
@@ -77,7 +76,6 @@ def test_a_quaternion_is_xyzw() -> None:
         matrix_from_quaternion([0, 0, 0, 0])
 
 
-@settings(max_examples=50, deadline=None)
 @given(pose=poses(), frame=st.sampled_from(FRAMES))
 def test_frames_round_trip(pose: np.ndarray, frame: HandFrame) -> None:
     np.testing.assert_allclose(from_frame(to_frame(pose, frame), frame), pose, atol=1e-12)
@@ -120,7 +118,6 @@ def test_axes_that_make_no_frame_are_refused(axes: tuple[str, str]) -> None:
         HandFrame(*axes)
 
 
-@settings(max_examples=50, deadline=None)
 @given(pose=poses(), T_hand_link=poses())
 def test_moveit_grasps_round_trip(pose: np.ndarray, T_hand_link: np.ndarray) -> None:
     message = moveit_grasp(grasp(pose), "camera", T_hand_link=T_hand_link)
@@ -169,15 +166,12 @@ def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
     }
 
 
-@settings(max_examples=50, deadline=None)
 @given(
     cases=st.lists(st.tuples(poses(), st.floats(0, 1), st.floats(0, 0.1)), max_size=3),
     T_object_cloud=poses(),
     T_hand_gripper=poses(),
 )
-def test_isaac_grasps_round_trip(
-    cases: list[Any], T_object_cloud: np.ndarray, T_hand_gripper: np.ndarray
-) -> None:
+def test_isaac_grasps_round_trip(cases, T_object_cloud, T_hand_gripper) -> None:
     grasps = [grasp(*case) for case in cases]
     text = isaac_grasps(
         grasps,
@@ -218,55 +212,29 @@ def test_an_isaac_file_says_what_the_format_asks_for() -> None:
     )
 
 
-def test_no_grasps_are_an_isaac_file_too() -> None:
-    assert read_isaac_grasps(isaac_grasps([], object_frame="a", gripper_frame="b")) == []
-
-
 def test_isaac_files_say_which_extra_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'edgegrasp\[yaml\]'"):
         read_isaac_grasps("format: isaac_grasp")
 
 
-def test_a_file_of_the_grasp_editor_is_read() -> None:
-    text = """
-# Made by hand.
+def test_an_isaac_file_of_the_grasp_editor_is_read() -> None:
+    (read,) = read_isaac_grasps(
+        """
 format: isaac_grasp
 format_version: 1.0
-
-object_frame: /World/mug # the mug
-gripper_frame: '/World/panda_hand'
-
+object_frame: /World/mug
+gripper_frame: /World/panda_hand
 grasps:
-  "grasp_0":
+  by hand:
     confidence: 1
-    position: [-0.04346, 0.06759, 0.19895]
+    position: [1, 2.5, -3.0e-1]
     orientation: {w: 0.0, xyz: [2.0, 0.0, 0.0]}
-    cspace_position:
-      panda_finger_joint1: 0.00943
-    pregrasp_cspace_position:
-      panda_finger_joint1: 0.04
-  other:
-    confidence: 0.5
-    position:
-    - 1
-    - 2.5
-    - -3e-1
-    orientation:
-      w: 1.0
-      xyz:
-        - 0.0
-        - 0.0
-        - 0.0
 """
-    first, second = read_isaac_grasps(text)
-    assert (first.name, first.confidence) == ("grasp_0", 1.0)
-    np.testing.assert_allclose(first.T_object_gripper[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
-    np.testing.assert_allclose(first.T_object_gripper[:3, 3], [-0.04346, 0.06759, 0.19895])
-    assert first.cspace_position == {"panda_finger_joint1": 0.00943}
-    assert first.pregrasp_cspace_position == {"panda_finger_joint1": 0.04}
-    np.testing.assert_allclose(second.T_object_gripper[:3, 3], [1, 2.5, -0.3])
-    assert second.cspace_position == {}
+    )
+    assert (read.name, read.confidence, read.cspace_position) == ("by hand", 1.0, {})
+    np.testing.assert_allclose(read.T_object_gripper[:3, :3], np.diag([1, -1, -1]), atol=1e-12)
+    np.testing.assert_allclose(read.T_object_gripper[:3, 3], [1, 2.5, -0.3])
 
 
 @pytest.mark.parametrize(
@@ -274,16 +242,13 @@ grasps:
     [
         (("format: isaac_grasp", "format: other"), "Give isaac_grasp, 1.0"),
         (("format_version: 1.0", "format_version: 2.0"), "Give isaac_grasp, 1.0"),
-        (("format: isaac_grasp", "- format"), "line 2"),
         (("  grasp_0:", "- grasp_0:"), "grasps: got a list"),
         (("    confidence: 0.5", "    confidence 0.5"), "line 8"),
         (("    confidence: 0.5\n", ""), "grasps.grasp_0: KeyError"),
         (("    confidence: 0.5", "    confidence: high"), "grasps.grasp_0: ValueError"),
         (("xyz: [0.0, 0.0, 0.0]", "xyz: [0.0, 0.0]"), "grasps.grasp_0: ValueError"),
-        (("xyz: [0.0, 0.0, 0.0]", "xyz: [0.0, 0.0, 0.0"), "line 12"),
         (("w: 1.0", "w: 0.0"), "not all zero"),
         (("[0.25, -0.5, 1.0]", "[0.25, -0.5]"), "grasps.grasp_0: ValueError"),
-        (("{panda_finger_joint1: 0.0, ", "[{"), "line 12"),
     ],
 )
 def test_what_is_no_isaac_file_is_refused(edit: tuple[str, str], message: str) -> None:

@@ -1,11 +1,8 @@
 """What may be sent besides an array of points, and scoring: the same over both transports."""
 
-import base64
-import json
 from types import SimpleNamespace
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
@@ -81,36 +78,6 @@ def test_depth_images(client) -> None:
     views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
     ids = np.arange(1200)
     assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
-    with pytest.raises(InvalidRequestError) as caught:
-        client.detect(depth_images=views, view_ids=ids)
-    assert caught.value.field == "view_ids"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "field"),
-    [
-        ({}, "cloud"),
-        ({"cloud": np.zeros((40, 3)), "depth_images": [depth_image()]}, "cloud"),
-        ({"depth_images": []}, ""),
-        ({"depth_images": [3]}, "depth_images.0"),
-        ({"depth_images": [depth_image(more=1)]}, "depth_images.0"),
-        ({"depth_images": [depth_image(depth=[[1.0]])]}, "depth_images.0.depth"),
-        ({"depth_images": [depth_image(depth=np.zeros((3, 4), int))]}, "depth_images.0.depth"),
-        ({"depth_images": [depth_image(depth=np.zeros(4))]}, "depth_images.0.depth"),
-        ({"depth_images": [depth_image(intrinsics={"fx": 1.0})]}, "depth_images.0.intrinsics"),
-        ({"depth_images": [depth_image(T_cloud_camera=1)]}, "depth_images.0.T_cloud_camera"),
-        ({"cloud": np.zeros((40, 3)), "normals": np.zeros((40, 2))}, "normals"),
-        ({"cloud": np.zeros((40, 3)), "normals": [[0, 0, 1]]}, "normals"),
-        ({"cloud": np.zeros((40, 3)), "segment_ids": np.zeros(40)}, "segment_ids"),
-        ({"cloud": np.zeros((40, 3)), "view_ids": np.full(40, 2**40)}, "view_ids"),
-    ],
-)
-def test_bad_inputs(arguments: dict[str, Any], field: str, client) -> None:
-    with pytest.raises(InvalidRequestError) as caught:
-        client.detect(**arguments)
-    assert caught.value.field == field or not field
-    assert caught.value.value
-    assert caught.value.fix
 
 
 def test_edges_are_scored_in_their_order(either_client, cloud) -> None:
@@ -144,29 +111,6 @@ def test_scoring_over_any_cloud(client, cloud) -> None:
     assert client.score(depth_images=[depth_image()], edges=edges).evaluations
 
 
-@pytest.mark.parametrize(
-    ("given", "field"),
-    [
-        ({}, "edges"),
-        ({"edges": np.zeros((1, 2), int), "hand_poses": np.eye(4)[None]}, "edges"),
-        ({"edges": [[0, 1]]}, "edges"),
-        ({"edges": np.zeros((3, 3), int)}, "edges"),
-        ({"edges": np.zeros((3, 2))}, "edges"),
-        ({"edges": np.array([[0, 500]])}, "edges"),
-        ({"edges": np.zeros((0, 2), int)}, "edges"),
-        ({"hand_poses": np.eye(4)}, "hand_poses"),
-        ({"hand_poses": np.full((2, 4, 4), np.nan)}, "hand_poses"),
-        ({"edges": np.array([[0, 1]]), "seed": -1}, "options.seed"),
-    ],
-)
-def test_bad_scoring(given: dict[str, Any], field: str, client, cloud) -> None:
-    with pytest.raises(InvalidRequestError) as caught:
-        client.score(cloud, **given)
-    error = caught.value
-    assert error.field in (field, "hand_poses" if field == "edges" else field)
-    assert error.fix
-
-
 def test_debug(client, cloud) -> None:
     assert client.detect(cloud).debug is None
     debug = client.detect(cloud, debug=True).debug
@@ -189,35 +133,6 @@ def test_options_too_long_for_an_address(client, cloud) -> None:
         "contact_region": {"include": [{"kind": "indices", "indices": indices}] * 10},
     }
     assert contacts(client.detect(cloud, **options)) == contacts(client.detect(cloud))
-
-
-def test_json_bodies(dummy_server, cloud) -> None:
-    """What a client of REST without numpy sends."""
-    url = f"{dummy_server.http_url}/v1/grasps"
-    message = vars(ros_message(cloud))
-    ros = {name: message[name] for name in ("height", "width", "is_bigendian", "point_step")}
-    ros |= {"row_step": message["row_step"], "data": base64.b64encode(message["data"]).decode()}
-    ros["fields"] = [vars(field) for field in message["fields"]]
-    image = depth_image() | {"T_cloud_camera": np.eye(4).tolist()}
-    image["depth"] = image["depth"].tolist()
-    ids = list(range(500))
-    bodies = [
-        {"points": cloud.tolist(), "segment_ids": ids, "normals": cloud.tolist()},
-        {"points": cloud.reshape(20, 25, 3).tolist(), "colors": cloud.tolist()},
-        {"point_cloud2": ros, "segment_ids": ids},
-        {"depth_images": [image], "options": {"top_k": 3}},
-    ]
-    for body in bodies:
-        assert httpx.post(url, json=body).json()["grasps"]
-    body = bodies[0] | {"edges": [[0, 1], [2, 2]]}
-    scored = httpx.post(f"{url}:score", json=body).json()
-    assert [evaluation["reason"] for evaluation in scored["evaluations"]] == [None, "too-short"]
-    assert scored["evaluations"][1]["grasp"] is None
-    form = {name: (None, json.dumps(value)) for name, value in body.items() if name != "points"}
-    form["cloud"] = ("cloud.xyz", "\n".join(" ".join(map(repr, row)) for row in cloud.tolist()))
-    assert httpx.post(f"{url}:score", files=form).json()["evaluations"] == scored["evaluations"]
-    answer = httpx.post(f"{url}:score", content=b"", headers={"content-type": "application/x-npy"})
-    assert answer.status_code == 415
 
 
 def test_a_file_and_its_own_normals_are_not_sent_twice(client, cloud, tmp_path) -> None:

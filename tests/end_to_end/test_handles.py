@@ -73,8 +73,7 @@ def shipped() -> GraspDetector:
     return ModelCatalogue.load().get()
 
 
-@pytest.mark.parametrize("tool", [mug(), hammer()], ids=lambda tool: tool.name)
-@pytest.mark.parametrize("yaw", [0.0, 0.7])
+@pytest.mark.parametrize(("tool", "yaw"), [(mug(), 0.7), (hammer(), 0.0)], ids=["mug", "hammer"])
 def test_restricted_to_the_handle_every_grasp_is_on_it_and_the_best_holds(
     tool: Tool, yaw: float, shipped: GraspDetector, tmp_path: Path
 ) -> None:

@@ -20,7 +20,7 @@ from edgegrasp_model.networks.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from edgegrasp_model.networks.config import EDGEGRASP, HAND, VN_EDGEGRASP, CheckpointMetadata
+from edgegrasp_model.networks.config import EDGEGRASP, HAND, CheckpointMetadata
 from edgegrasp_model.networks.import_checkpoint import import_checkpoint
 
 CONFIG = replace(HAND, crop_radius=0.04)
@@ -138,9 +138,7 @@ def test_damaged_weights_are_refused(path: Path, value: float) -> None:
         load_checkpoint(path)
 
 
-def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(
-    path: Path,
-) -> None:
+def test_a_network_that_computes_something_else_than_when_it_was_written_is_refused(path) -> None:
     loaded, read = load_checkpoint(path)
     check_reference_logits(loaded, read)
     check_reference_logits(loaded, replace(read, reference_logits=()))  # of older files
@@ -152,16 +150,6 @@ def write_layout(directory: Path, number: int = 1, **weights: object) -> None:
     """Files in the authors' layout, without a tensor unless one is given."""
     for part in PARTS:
         torch.save(weights.get(part, {}), directory / f"{part}-ckpt-{number}.pt")
-
-
-def test_the_authors_vn_checkpoint_becomes_ours(shared_dir: Path, tmp_path: Path) -> None:
-    network, metadata = import_checkpoint(shared_dir / "reference" / "vn_edge_grasp")
-    assert (metadata.name, metadata.network) == ("vn-edgegrasp", VN_EDGEGRASP)
-    assert metadata.training["checkpoint"] == 105
-    save_checkpoint(tmp_path / "vn.safetensors", network, metadata)
-    loaded, _ = load_checkpoint(tmp_path / "vn.safetensors")
-    for name, value in network.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name
 
 
 def test_radius_voxel_and_gripper_of_an_import_are_noted(shared_dir: Path) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp_model.errors import InvalidRequest
@@ -18,14 +18,6 @@ from edgegrasp_model.scene.cloud import (
 from .scenes import SEED
 
 GOOD = np.random.default_rng(0).uniform(0.0, 0.3, (12, 3)).astype(np.float32)
-
-
-def test_a_bare_array_is_a_cloud_of_its_points_in_float32() -> None:
-    checked = check_cloud(GOOD.astype(np.float64))
-    assert checked.points.dtype == np.float32
-    np.testing.assert_array_equal(checked.points, GOOD)
-    assert checked.row.tolist() == list(range(12))
-    assert checked.normals is checked.segment_ids is checked.view_ids is None
 
 
 def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them() -> None:
@@ -70,9 +62,7 @@ def test_holes_of_an_organised_cloud_are_dropped_with_all_that_belongs_to_them()
         (CloudInput(GOOD, view_ids=[0] * 12), "view_ids", "a list"),
     ],
 )
-def test_a_bad_cloud_is_refused_by_field_value_and_fix(
-    sent: object, field: str, value: str
-) -> None:
+def test_a_bad_cloud_is_refused_by_field_value_and_fix(sent, field, value) -> None:
     with pytest.raises(InvalidRequest) as caught:
         check_cloud(sent, num_approach_points=6)
     assert caught.value.field == field
@@ -89,11 +79,8 @@ def sphere(count: int = 2000, radius: float = 0.05) -> np.ndarray:
     return (radius * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, SEED), size=st.floats(0.002, 0.1))
-def test_voxels_are_means_of_the_points_in_them_whatever_their_order(
-    seed: int, size: float
-) -> None:
+def test_voxels_are_means_of_the_points_in_them_whatever_their_order(seed, size) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.2, 0.2, (300, 3)).astype(np.float32)
     voxels = voxel_means(points, size)

@@ -20,7 +20,7 @@ from edgegrasp_model.scene.cloud import CloudInput
 from .oracles import any_point_in_boxes, signed_distance_to_boxes
 from .scenes import box_on_table, detector
 
-CASES = 100  # for each seed
+CASES = 75  # for each seed
 ROWS = 1500  # of the cloud
 TOLERANCE = 2e-5  # metres, of float32 poses half a metre from the origin
 VOXEL_DIAGONAL = 0.0045 * math.sqrt(3)
@@ -155,7 +155,7 @@ class Draw:
         }
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_grasp_satisfies_every_constraint(seed: int) -> None:
     cloud, segments = box_on_table(ROWS // 3), np.repeat([0, 1, 2], ROWS // 3)  # its faces
     sent, draw = CloudInput(cloud, segment_ids=segments), Draw(seed)

@@ -163,9 +163,7 @@ GOOD = np.eye(4)[None]
         ({"hand_poses": GOOD @ np.diag([1, 1, -1, 1])}, "hand_poses", "pose 0"),
     ],
 )
-def test_what_is_no_edge_and_no_pose_is_refused(
-    given: dict[str, object], field: str, value: str
-) -> None:
+def test_what_is_no_edge_and_no_pose_is_refused(given, field, value) -> None:
     with pytest.raises(InvalidRequest) as caught:
         detector().score(box_on_table(500), ask(), **given)
     assert caught.value.field == field

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
-from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_model.hand_description import (
     BEHIND,
     DEEP,
@@ -18,7 +17,6 @@ from edgegrasp_model.hand_description import (
     DepthMap,
     describe_hands,
     occlusion_fractions,
-    probes,
     without_support,
 )
 from edgegrasp_model.hand_view import hand_views, reach_of
@@ -104,11 +102,8 @@ def test_too_many_points_are_thinned_evenly() -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, SEED))
-def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(
-    mirrored: bool, seed: int
-) -> None:
+def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(mirrored, seed) -> None:
     cloud, candidates = scene(seed)
     rng = np.random.default_rng(seed)
     turn, shift = Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3)
@@ -229,12 +224,3 @@ def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
     unknown = occlusion_fractions(plate(), hand[None], None, UP, PANDA)
     assert len(unknown) == len(parts)
     assert not np.any(unknown)
-
-
-@pytest.mark.parametrize("name", gripper_names())
-def test_probes_lie_where_they_are_said_to(name: str) -> None:
-    gripper = load_gripper(name)
-    tips_right, tips_left, *_, hand = probes(gripper)
-    assert (tips_right[:, 1] > gripper.max_opening / 2).all()
-    np.testing.assert_allclose(tips_left * (1, -1, 1), tips_right, atol=1e-7)
-    assert (hand[:, 2] < gripper.tip_z).all()

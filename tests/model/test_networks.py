@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F  # noqa: N812
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND, VN_EDGEGRASP
-from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
-from edgegrasp_model.networks.layers import PackedLinear, ball_chunks, by_chunks
+from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND
+from edgegrasp_model.networks.layers import PackedLinear
 
 from .scenes import SEED, TINY, RandomScene
 
@@ -34,54 +33,20 @@ def random(seed: int, *shape: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def as_written_in_the_paper(network: EdgeGraspNet, batch: BallBatch) -> torch.Tensor:
-    """The same network neighbour by neighbour and grasp by grasp, with none of the savings."""
-
-    def linear(layer, values):
-        return F.linear(values, layer.weight, layer.bias)
-
-    def convolve(conv, features):
-        outputs = []
-        for i, neighbors in enumerate(batch.neighbors):
-            offset = batch.points[neighbors] - batch.points[i]  # (k, 3)
-            hidden = linear(conv.hidden, torch.cat((features[neighbors], offset), dim=1)).relu()
-            outputs.append(linear(conv.output, hidden).max(0).values)
-        return torch.stack(outputs).relu()
-
-    f1 = convolve(network.conv1, torch.cat((batch.points, batch.normals), dim=1))
-    f2 = convolve(network.conv2, f1)
-    f3 = convolve(network.conv3, f2)
-    local = torch.cat((f1, f2, f3), dim=1)
-    logits = []
-    for contact, approach, depth in zip(batch.contact, batch.approach, batch.depth, strict=True):
-        in_ball = local[batch.ball_of_point == batch.ball_of_point[contact]]
-        pooled = network.ball_feature.mlp_1(in_ball).max(0).values
-        joined = torch.cat((in_ball, pooled.expand(len(in_ball), -1)), dim=1)
-        hidden = linear(network.ball_feature.join, joined).relu()
-        ball = network.ball_feature.mlp_2(hidden).max(0).values
-        grasp = torch.cat((batch.points[contact], batch.normals[contact], depth[None], approach))
-        hidden = linear(network.join, torch.cat((grasp, f3[contact], ball))).relu()
-        logits.append(network.classifier(hidden)[0])
-    return torch.stack(logits)
-
-
-@pytest.mark.parametrize(
-    ("config", "count"),
-    [(EDGEGRASP, 3_048_993), (VN_EDGEGRASP, 1_702_268), (EDGEGRASP_SMALL, 385_185)],
-)
-def test_parameter_counts(config, count):
-    assert sum(parameter.numel() for parameter in build_network(config).parameters()) == count
-
-
-def test_the_savings_change_no_score():
-    network, batch = build_network(TINY["edgegrasp"]).double(), RandomScene.of_seed(1).batch()
-    expected = as_written_in_the_paper(network, batch).detach()
-    assert expected.std() > 1e-4
-    torch.testing.assert_close(scores(network, batch), expected, rtol=0, atol=1e-12)
+@settings(max_examples=8)
+@given(seed=st.integers(0, SEED))
+def test_vn_scores_are_invariant_under_rotation_and_translation(seed):
+    rng, scene = np.random.default_rng(seed), RandomScene.of_seed(seed)
+    moved = scene.turned(Rotation.random(rng=rng).as_matrix(), rng.uniform(-1, 1, 3))
+    # In double precision no two vectors of a random cloud come within rounding of a tie.
+    network = build_network(TINY["vn-edgegrasp"]).double()
+    expected, found = scores(network, scene.batch()), scores(network, moved.batch())
+    assert expected.std() > 1e-6
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
 
 
 @architectures
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, SEED))
 def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, seed):
     network, scene = build_network(TINY[architecture]).double(), RandomScene.of_seed(seed)
@@ -138,19 +103,6 @@ def test_gradients_reach_every_parameter(architecture):
         assert parameter.grad.abs().max() > 0, name
 
 
-def test_gradients_are_those_of_finite_differences():
-    network, batch = build_network(TINY["edgegrasp"]).double(), RandomScene.of_seed(1).batch()
-    network(batch).sum().backward()
-    weight = network.conv1.hidden.weight
-    step = random(1, *weight.shape).double() * 1e-6
-    with torch.no_grad():
-        weight += step
-        above = network(batch).sum()
-        weight -= 2 * step
-        below = network(batch).sum()
-    torch.testing.assert_close((weight.grad * step).sum(), (above - below) / 2, rtol=1e-4, atol=0)
-
-
 def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone():
     config, state = TINY["edgegrasp"], torch.random.get_rng_state()
     first, again = build_network(config), build_network(config)
@@ -164,20 +116,6 @@ def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone():
 def test_a_batch_without_grasps_has_no_scores(architecture):
     empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
     assert scores(build_network(TINY[architecture]), empty.batch(torch.float32)).shape == (0,)
-
-
-@has_onednn
-@libraries
-@pytest.mark.parametrize("outputs", [1, 24])
-def test_a_product_is_the_linear_layer_whatever_the_library(monkeypatch, onednn, outputs):
-    monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
-    weight, bias, values = random(1, outputs, 40), random(2, outputs), random(3, 70, 40)
-    own = weight[:, 3:30]  # a part of a matrix, as shared layers have
-    expected = F.linear(values[:, 3:30], own, bias)
-    for rectified in (False, True):
-        with torch.inference_mode():
-            found = PackedLinear(own, bias, rectified=rectified)(values[:, 3:30])
-        torch.testing.assert_close(found, expected.relu() if rectified else expected)
 
 
 @has_onednn
@@ -198,29 +136,6 @@ def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, thre
                     assert torch.equal(torch.roll(moved, -shift, dims=0), whole)
     finally:
         torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize("gradients", [False, True])
-def test_a_layer_by_pieces_is_the_layer(gradients):
-    mlp, values = layers.mlp((6, 16, 16, 3)), random(1, 75, 6)
-    with torch.set_grad_enabled(gradients):
-        found = by_chunks(mlp, values, rows=32)
-    torch.testing.assert_close(found, mlp(values))
-    assert found.requires_grad == gradients
-
-
-@pytest.mark.parametrize("rows", [3, 16, 1000])
-def test_pieces_hold_every_row_and_the_maxima_are_those_of_the_balls(rows):
-    batch = RandomScene.of_seed(1).batch(torch.float32)
-    values = random(1, len(batch.points), 5)
-    expected = torch.stack([ball.amax(0) for ball in torch.split(values, batch.ball_sizes)])
-    with torch.no_grad():
-        pieces, found = ball_chunks(values, batch, rows), layers.BallMaximum(batch.num_balls)
-        for piece in pieces:
-            assert len(piece.values) == len(piece.ball_of_point) == sum(piece.sizes) == rows
-            found.add(piece.values, piece)
-    assert torch.equal(torch.cat([piece.values for piece in pieces])[: len(values)], values)
-    assert torch.equal(found.result(), expected)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from edgegrasp_model.errors import InvalidRequest
@@ -49,7 +49,6 @@ def test_shapes_hold_what_they_should(shape: object, within: tuple, outside: tup
     assert inside_shape(shape, points).tolist() == [True, False]
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, SEED))
 def test_rows_hold_a_voxel_by_half_of_its_points_however_they_are_named(seed: int) -> None:
     chosen = np.random.default_rng(seed).random(40) < 0.5

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -27,7 +27,6 @@ def scene(rng: np.random.Generator, table: int = 2000, things: int = 1000) -> np
     return points + rng.normal(0, 0.001, points.shape)
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, SEED), share=st.floats(0.3, 0.9))
 def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -41,12 +40,6 @@ def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     normal = turn.apply([0, 0, 1])
     assert np.dot(plane.normal, normal) > np.cos(0.01)
     assert abs(plane.heights(shift[None] + 0.05 * normal)[0]) < 0.001
-
-
-def test_the_same_seed_finds_the_same_plane() -> None:
-    points, rngs = scene(np.random.default_rng(0)), [np.random.default_rng(5) for _ in range(2)]
-    one, again = (find_support_plane(points, RansacPlane(), (0, 0, 1), rng) for rng in rngs)
-    assert one == again
 
 
 @pytest.mark.parametrize(
@@ -77,17 +70,11 @@ def test_a_handful_of_points_or_one_point_many_times_is_no_plane(count: int) -> 
     assert find_support_plane(same, RansacPlane(), (0, 0, 1), rng) is None
 
 
-def test_heights_are_over_the_plane() -> None:
-    plane = SupportPlane(normal=(0.0, 0.6, 0.8), offset=0.5)
-    np.testing.assert_allclose(plane.heights(np.array([[9.0, 0.0, 0.0], [0, 3, 4]])), [-0.5, 4.5])
-
-
 def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
     """The points as a camera sees them whose depths are wrong by a factor."""
     return (camera + factor * (points - camera)).astype(np.float32)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, SEED),
     factor=st.floats(0.9, 1.1),

@@ -3,6 +3,9 @@
 import os
 import subprocess
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "system_packages.sh"
 VENV_CHECK = "import ensurepip, venv"
@@ -14,7 +17,7 @@ def stand_in(folder: Path, name: str, body: str) -> None:
     path.chmod(0o755)
 
 
-def machine(folder: Path, *, lacks: str, user: int, apt: bool = True) -> dict[str, str]:
+def machine(folder: Path, *, lacks: str, user: int = 0, apt: bool = True) -> dict[str, str]:
     """A folder of stand-ins as PATH; the interpreter fails where a bash pattern matches."""
     stand_in(
         folder,
@@ -34,37 +37,30 @@ def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_says_nothing_when_nothing_is_missing(tmp_path: Path) -> None:
-    done = run(machine(tmp_path, lacks="none", user=0))
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert not (tmp_path / "apt.log").exists()
-
-
-def test_root_installs_exactly_what_is_missing_without_questions(tmp_path: Path) -> None:
-    done = run(machine(tmp_path, lacks=f'*"{VENV_CHECK}"*|*libusb*', user=0))
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "apt.log").read_text().splitlines() == [
-        "noninteractive update -q",
-        "noninteractive install -q -y --no-install-recommends python3.11-venv libusb-1.0-0",
-    ]
-
-
-def test_another_user_is_told_the_command(tmp_path: Path) -> None:
-    done = run(machine(tmp_path, lacks="*libGL.so.1*|*libEGL*", user=1000))
-    assert done.returncode == 1
-    assert "sudo apt-get update && sudo apt-get install" in done.stderr
-    assert "libgl1 libegl1" in done.stderr
-    assert not (tmp_path / "apt.log").exists()
-
-
-def test_without_apt_the_packages_are_named_and_set_up_goes_on(tmp_path: Path) -> None:
-    done = run(machine(tmp_path, lacks="*libgomp*", user=0, apt=False))
-    assert done.returncode == 0
-    assert "libgomp1" in done.stdout
-    assert "warning" in done.stderr
-
-
-def test_an_old_python_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    done = run(machine(tmp_path, lacks="*version_info*3,*11*", user=0))
-    assert done.returncode == 1
-    assert "make PYTHON=" in done.stderr
+@pytest.mark.parametrize(
+    ("lacks", "machine_is", "code", "told"),
+    [
+        ("none", {}, 0, ""),
+        (f'*"{VENV_CHECK}"*|*libusb*', {}, 0, ""),
+        ("*libGL.so.1*|*libEGL*", {"user": 1000}, 1, "sudo apt-get update && sudo apt-get install"),
+        ("*libGL.so.1*|*libEGL*", {"user": 1000}, 1, "libgl1 libegl1"),
+        ("*libgomp*", {"apt": False}, 0, "warning"),
+        ("*libgomp*", {"apt": False}, 0, "libgomp1"),
+        ("*version_info*3,*11*", {}, 1, "make PYTHON="),
+    ],
+)
+def test_what_is_missing_is_installed_by_root_and_told_to_others(
+    tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, told: str
+) -> None:
+    done = run(machine(tmp_path, lacks=lacks, **machine_is))
+    assert done.returncode == code, done.stderr
+    assert told in done.stdout + done.stderr
+    installed = tmp_path / "apt.log"
+    assert installed.exists() == (VENV_CHECK in lacks)
+    if installed.exists():
+        assert installed.read_text().splitlines() == [
+            "noninteractive update -q",
+            "noninteractive install -q -y --no-install-recommends python3.11-venv libusb-1.0-0",
+        ]
+    elif lacks == "none":
+        assert done.stdout + done.stderr == ""

@@ -66,35 +66,6 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     assert attempts_digest(rounds) == digest
 
 
-def test_an_interrupted_run_goes_on_and_changes_nothing(
-    alone: tuple[BenchmarkConfig, str], tmp_path: Path
-) -> None:
-    config, digest = alone
-    folder = ResultFolder(tmp_path)
-    facts = manifest(config, {"name": "top-down"})
-    folder.open(facts)
-
-    def stop_after_two(done: object) -> None:
-        told.append(done)
-        if len(told) == 2:
-            raise KeyboardInterrupt
-
-    told: list[object] = []
-    with pytest.raises(KeyboardInterrupt):
-        run_benchmark(config, make_planner, folder=folder, on_round=stop_after_two)
-    assert len(folder.rounds()) == 2
-
-    folder.open(facts)
-    again: list[object] = []
-    rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
-    assert len(again) == 2
-    assert attempts_digest(rounds) == digest
-    assert attempts_digest(folder.rounds()) == digest
-
-    with pytest.raises(ValueError, match="different planner"):
-        folder.open(manifest(config, {"name": "other"}))
-
-
 def test_the_manifest_holds_what_decides_the_figures() -> None:
     config = BenchmarkConfig(SceneKind.PACKED, 2, protocol=TWO_OBJECTS)
     facts = json.loads(json.dumps(manifest(config, {"name": "top-down"})))
@@ -122,9 +93,7 @@ def test_wrong_settings_are_refused(tmp_path: Path) -> None:
     assert available_cores() >= 1
 
 
-def test_a_killed_run_goes_on_and_changes_nothing(
-    alone: tuple[BenchmarkConfig, str], tmp_path: Path
-) -> None:
+def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     config, digest = alone
     folder = ResultFolder(tmp_path)
     folder.open(manifest(config, {"name": "top-down"}))
@@ -143,6 +112,8 @@ def test_a_killed_run_goes_on_and_changes_nothing(
     rounds = run_benchmark(config, make_planner, folder=folder, on_round=again.append)
     assert len(again) == 4 - kept
     assert attempts_digest(rounds) == attempts_digest(folder.rounds()) == digest
+    with pytest.raises(ValueError, match="different planner"):
+        folder.open(manifest(config, {"name": "other"}))
 
 
 # Starting a Ray cluster leaves sockets and processes to the garbage collector.
@@ -180,9 +151,7 @@ def test_errors_on_a_cluster_are_those_of_a_process_here(
         run_benchmark(alone[0], make_planner, ray="local")
 
 
-def test_a_missing_ray_or_cluster_is_named(
-    alone: tuple[BenchmarkConfig, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:
     config, _ = alone
     with pytest.raises(ValueError, match="differ between the machines"):
         RoundRunner(config, make_planner, digest="another digest")

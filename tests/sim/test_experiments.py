@@ -4,16 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from edgegrasp_sim.experiments import (
-    EXPERIMENTS,
-    Case,
-    cases_of,
-    experiment_figure,
-    experiment_table,
-)
+from edgegrasp_sim.experiments import EXPERIMENTS, Case, cases_of
 from edgegrasp_sim.objects import FAMILIES, SceneKind
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.report import published
 
 PAPER = load_protocol("edgegrasp")
 
@@ -63,57 +56,3 @@ def test_families_have_folders_of_their_own_and_keep_their_size(tmp_path: Path) 
     found = cases("families", tmp_path)
     assert {case.objects for case in found} == {tmp_path / "objects" / name for name in FAMILIES}
     assert all(case.protocol.scene.pile_scale == (1.0, 1.0) for case in found)
-
-
-def rate(value: float | None) -> dict[str, object]:
-    interval = None if value is None else [max(0.0, value - 0.1), min(1.0, value + 0.1)]
-    return {"value": value, "wilson_95": interval}
-
-
-def result(group: str, value: object, scene: str, model: str, gsr: float | None) -> dict:
-    planner = {"name": "in-process", "model": model}
-    return {
-        "group": group, "value": value, "scene": scene, "planner": planner,
-        "grasp_success_rate": rate(gsr), "declutter_rate": rate(0.5),
-    }  # fmt: skip
-
-
-def test_tables_put_scenes_and_models_side_by_side() -> None:
-    results = {
-        "cases": [
-            result("noise (mm)", 0.0, "packed", "a", 0.9),
-            result("noise (mm)", 0.0, "pile", "a", 0.8),
-            result("noise (mm)", 0.5, "packed", "a", None),
-            result("noise (mm)", 0.0, "packed", "b", 1.0),
-            result("view", "giga", "packed", "a", 0.7),
-        ]
-    }
-    noise, view = experiment_table(results).split("\n\n")
-    lines = noise.splitlines()
-    assert lines[0].startswith("| noise (mm) | packed, a: GSR | DR | pile, a: GSR | DR | packed, b")
-    assert lines[2].startswith("| 0 | 90.0 [80.0, 100.0] | 50.0 [40.0, 60.0] | 80.0 [")
-    assert lines[3] == "| 0.5 | none | 50.0 [40.0, 60.0] |  |  |  |  |"
-    assert "| giga | 70.0 [60.0, 80.0] |" in view
-    figure = experiment_figure(results)
-    assert [axes.get_xlabel() for axes in figure.axes] == ["noise (mm)"] * 2 + ["view"] * 2
-    curves = [line for line in figure.axes[0].containers if line.get_label()]
-    assert [line.get_label() for line in curves] == ["packed, a", "pile, a", "packed, b"]
-
-
-def test_baselines_name_their_planner_in_the_rows() -> None:
-    rows = [
-        {**result("planner", name, "pile", "", 0.4), "planner": {"name": name}}
-        for name in ("edge-sample", "oracle")
-    ]
-    table = experiment_table({"cases": rows})
-    assert table.splitlines()[0] == "| planner | pile: GSR | DR |"
-    assert "| oracle | 40.0 [" in table
-    experiment_figure({"cases": rows})
-
-
-def test_published_figures_are_found_by_protocol_and_scene() -> None:
-    rows = published("edgegrasp", "packed")
-    methods = [row["method"] for row in rows if row.get("samples") == "64-4k"]
-    assert methods == ["EdgeGraspNet", "VN-EdgeGraspNet"]
-    assert published("edgegrasp-fused", "pile") == published("edgegrasp", "pile") != []
-    assert published("giga", "packed") == []

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim.benchmark import BenchmarkConfig, run_benchmark
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import (
     FAMILIES,
@@ -21,7 +20,6 @@ from edgegrasp_sim.objects import (
     write_family,
 )
 from edgegrasp_sim.scene import add_table, load_object
-from edgegrasp_sim.top_down import plan_top_down
 
 MARGIN = 0.006  # metres that the engine's boxes are wider than what is in them
 
@@ -130,16 +128,6 @@ def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_pa
     assert not list(cache.glob(".unfinished*"))
 
 
-def test_rounds_run_on_a_folder_of_meshes(meshes: Path, cache: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "packed" / "test"
-    folder.mkdir(parents=True)
-    (folder / "ring.obj").write_bytes((meshes / "ring.obj").read_bytes())
-    config = BenchmarkConfig(SceneKind.PACKED, 1, objects=tmp_path)
-    (done,) = run_benchmark(config, lambda: plan_top_down)
-    assert set(done.objects) == {"ring"}
-    assert done.attempts
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -148,9 +136,7 @@ def test_rounds_run_on_a_folder_of_meshes(meshes: Path, cache: Path, tmp_path: P
         ("v 0 0 zero\nf 1 2 3\n", "cannot be read"),
     ],
 )
-def test_a_file_without_a_solid_is_refused(
-    cache: Path, tmp_path: Path, content: str, message: str
-) -> None:
+def test_a_file_without_a_solid_is_refused(cache, tmp_path, content, message) -> None:
     pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
     (tmp_path / "thing.obj").write_text(content)
     with pytest.raises(ValueError, match=rf"thing\.obj.*({message})"):
@@ -165,9 +151,7 @@ def test_two_meshes_of_one_name_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("package", ["coacd", "trimesh"])
-def test_a_missing_package_is_named(
-    meshes: Path, cache: Path, package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named(meshes, cache, package, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(RuntimeError, match=rf"{package} is not .*edgegrasp\[meshes\]"):
         ObjectSet.from_folder(meshes, SceneKind.PILE)

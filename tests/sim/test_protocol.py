@@ -19,18 +19,6 @@ def test_variants_differ_from_the_paper_s_protocol_in_one_thing() -> None:
     assert replace(memory, name="edgegrasp", source=paper.source, planning=planning) == paper
 
 
-def test_protocols_have_the_constants_of_their_sources() -> None:
-    paper, giga, vgn, robot = map(load_protocol, ("edgegrasp", "giga", "vgn", "robot"))
-    assert (paper.rounds, paper.seeds) == (100, (0, 1, 2, 3, 4))
-    assert (paper.planning.num_approach_points, paper.planning.num_candidates) == (64, 4000)
-    assert giga.noise.gamma_shape > 0 == paper.noise.gamma_shape
-    assert (giga.planning.table, giga.version) == ("seen", 3)
-    assert vgn.camera.views == 6
-    assert [robot.num_objects(index) for index in range(3)] == [8, 10, 8]
-    assert (robot.planning.selection, robot.planning.min_score) == ("highest", 0.9)
-    assert robot.planning.table == "ransac"
-
-
 def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)

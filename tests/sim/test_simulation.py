@@ -2,13 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.camera import WORKSPACE, look_at
 from edgegrasp_sim.engine import ASSETS, World
 from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
-from edgegrasp_sim.poses import quaternion_xyzw, require_pose, translation
+from edgegrasp_sim.poses import require_pose, translation
 from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.validate import measure_agreement
@@ -41,9 +40,7 @@ def grasps_near(simulation: ClutterSimulation, number: int) -> list[np.ndarray]:
     ]
 
 
-def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(
-    simulation: ClutterSimulation,
-) -> None:
+def test_a_grasp_that_holds_nothing_says_so_and_moves_nothing(simulation) -> None:
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     before = simulation.placements
     result = simulation.try_grasp(top_down(0.15, 0.15, 0.15))  # in the air
@@ -124,9 +121,7 @@ def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimu
     assert simulation.execute_grasp(grasps[0]).opening == last.opening
 
 
-def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(
-    simulation: ClutterSimulation,
-) -> None:
+def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation) -> None:
     simulation.reset("pile", np.random.default_rng(5))
     steps = 0
 
@@ -249,23 +244,10 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
 @pytest.mark.parametrize(
     ("kind", "to_the_end"), [(SceneKind.PACKED, True), (SceneKind.PILE, False)]
 )
-def test_outcomes_agree_with_the_reference_simulator(
-    shared_dir: Path, kind: SceneKind, to_the_end: bool
-) -> None:
+def test_outcomes_agree_with_the_reference_simulator(shared_dir, kind, to_the_end) -> None:
     counts = measure_agreement(shared_dir, kind, most=20, to_the_end=to_the_end)
     assert [tried for _, tried in counts] == [20] * 4
     assert sum(agreed for agreed, _ in counts) / 80 >= LEAST_AGREEMENT[kind]
-
-
-def test_quaternions_are_those_of_the_rotation() -> None:
-    turns = Rotation.random(100, rng=np.random.default_rng(0))
-    halves = Rotation.from_rotvec(np.pi * np.eye(3))
-    for rotation in Rotation.concatenate([turns, halves]):
-        T = np.eye(4)
-        T[:3, :3] = rotation.as_matrix()
-        quaternion = quaternion_xyzw(T)
-        assert np.linalg.norm(quaternion) == pytest.approx(1.0)
-        assert abs(np.dot(quaternion, rotation.as_quat())) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

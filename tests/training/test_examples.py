@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from edgegrasp_training.examples import (
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import LabelledView
 
-MakeView = Callable[[int], LabelledView]
 Networks = dict[str, NetworkConfig]
 
 
@@ -41,9 +39,7 @@ def grasps_of(view: LabelledView, config: NetworkConfig, *, camera: bool = True)
     return tried_grasps(view, config, load_gripper(), viewpoint_known=camera)
 
 
-def test_packed_balls_hold_each_tried_grasp_and_its_contact(
-    made_up_view: MakeView, balls: NetworkConfig
-) -> None:
+def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, balls) -> None:
     view = made_up_view(1)
     grasps = grasps_of(view, balls)
     batch, label, weight = pack_balls(grasps, grasps.balls(), balls)
@@ -60,9 +56,7 @@ def test_packed_balls_hold_each_tried_grasp_and_its_contact(
     assert 0 < len(some.label) < len(label)
 
 
-def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(
-    made_up_view: MakeView, balls: NetworkConfig
-) -> None:
+def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(made_up_view, balls) -> None:
     view = replace(made_up_view(1), camera_position=np.array([0.5, -0.3, 0.6], np.float32))
     grasps = grasps_of(view, balls)
     np.testing.assert_allclose(grasps.turn @ grasps.turn.T, np.eye(3), atol=1e-6)
@@ -72,9 +66,7 @@ def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(
     assert (grasps.turn @ UP)[2] == pytest.approx(1)
 
 
-def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
-    made_up_view: MakeView, hands: NetworkConfig
-) -> None:
+def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(made_up_view, hands):
     view = made_up_view(1)
     grasps = grasps_of(view, hands)
     batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
@@ -99,9 +91,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(
     assert (varied.points[~there] == 0).all()
 
 
-def test_a_hand_whose_camera_is_not_known_is_told_of_none(
-    made_up_view: MakeView, hands: NetworkConfig
-) -> None:
+def test_a_hand_whose_camera_is_not_known_is_told_of_none(made_up_view, hands) -> None:
     view = made_up_view(1)
     known = grasps_of(view, hands).seen
     unknown = grasps_of(view, hands, camera=False).seen
@@ -113,9 +103,7 @@ def test_a_hand_whose_camera_is_not_known_is_told_of_none(
     assert (unknown.description[:, camera] == 0).all()
 
 
-def test_augmentation_turns_points_normals_and_approach_alike(
-    made_up_view: MakeView, balls: NetworkConfig
-) -> None:
+def test_augmentation_turns_points_normals_and_approach_alike(made_up_view, balls) -> None:
     grasps = grasps_of(made_up_view(2), balls)
     batch = pack_balls(grasps, grasps.balls(), balls).batch
     other = turned(batch, random_turn("any", np.random.default_rng(0)))
@@ -144,9 +132,7 @@ def test_random_turns_are_any_or_upright_or_none() -> None:
     np.testing.assert_array_equal(random_turn("none", rng), np.eye(3))
 
 
-def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(
-    made_up_view: MakeView, balls: NetworkConfig
-) -> None:
+def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, balls) -> None:
     view = made_up_view(1)
     firm = np.where(view.success == 1, np.arange(len(view.success)) % 2, view.success)
     shaken = grasps_of(replace(view, firm=firm.astype(np.int8)), balls).label

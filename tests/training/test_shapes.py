@@ -9,7 +9,6 @@ from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import ObjectModel, ObjectSet
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.shapes import (
-    DRAWN_NAMES,
     HOLLOW,
     HOLLOW_NAMES,
     LONGEST,
@@ -20,7 +19,6 @@ from edgegrasp_training.shapes import (
     PLAIN_WIDTH,
     STRETCH,
     THINNEST,
-    any_made_object,
     drawn_shape,
     made_object,
     revolved,
@@ -44,6 +42,22 @@ def _volume(obj: str) -> float:
     return float((np.cross(a, b) * c).sum() / 6)
 
 
+@pytest.mark.parametrize("index", range(0, NUM_DRAWN, 13))
+def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
+    shape = drawn_shape(index)
+    extents = np.ptp(_surface(shape)[0], axis=0)
+    share = _volume(shape) / extents.prod()
+    if index < NUM_FREE:
+        assert 0.0 < share < 4.0  # parts overlap
+        assert extents.min() > 0.999 * THINNEST - 1e-5
+        assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
+    else:  # stands on a shelf
+        assert 0.4 < share < 1.001
+        assert 0.86 * PLAIN_WIDTH[0] < extents[:2].min()  # a hexagon is less wide one way
+        assert extents[:2].max() < PLAIN_WIDTH[1] + 1e-5
+        assert PLAIN_HEIGHT[0] - 1e-5 < extents[2] < PLAIN_HEIGHT[1] + 1e-5
+
+
 @pytest.mark.parametrize("name", HOLLOW)
 def test_hollow_shapes_are_closed_and_face_outwards(name: str) -> None:
     profile = HOLLOW[name]
@@ -52,46 +66,12 @@ def test_hollow_shapes_are_closed_and_face_outwards(name: str) -> None:
     assert 0.05 * full < _volume(revolved(profile)) < 0.9 * full
 
 
-@pytest.mark.parametrize("index", range(0, NUM_FREE, 13))
-def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
-    shape = drawn_shape(index)
-    points, _ = _surface(shape)
-    extents = np.ptp(points, axis=0)
-    assert 0.0 < _volume(shape) < 4.0 * extents.prod()  # parts overlap
-    assert extents.min() > 0.999 * THINNEST - 1e-5
-    assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
-
-
-@pytest.mark.parametrize("index", range(NUM_FREE, NUM_DRAWN, 13))
-def test_plain_shapes_are_closed_and_stand_on_a_shelf(index: int) -> None:
-    shape = drawn_shape(index)
-    width, depth, height = np.ptp(_surface(shape)[0], axis=0)
-    assert 0.4 * width * depth * height < _volume(shape) < 1.001 * width * depth * height
-    assert 0.86 * PLAIN_WIDTH[0] < min(width, depth)  # a hexagon is less wide one way
-    assert max(width, depth) < PLAIN_WIDTH[1] + 1e-5
-    assert PLAIN_HEIGHT[0] - 1e-5 < height < PLAIN_HEIGHT[1] + 1e-5
-
-
 def test_drawn_shapes_differ_and_stay_the_same() -> None:
     assert len({drawn_shape(index) for index in range(NUM_DRAWN)}) == NUM_DRAWN
     assert drawn_shape(7) == drawn_shape(7)
     for index in (-1, NUM_DRAWN):
         with pytest.raises(IndexError, match=f"{index} of {NUM_DRAWN}"):
             drawn_shape(index)
-
-
-def test_the_digest_of_a_made_object_is_that_of_its_own_files(tmp_path: Path) -> None:
-    alone = made_object("made-torus", tmp_path / "alone").digest
-    for name in (*HOLLOW_NAMES, *DRAWN_NAMES[:3]):
-        made_object(name, tmp_path / "all")
-    assert made_object("made-torus", tmp_path / "all").digest == alone
-
-
-def test_made_objects_come_of_both_sorts(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    names = {any_made_object(tmp_path, rng).name for _ in range(30)}
-    assert names & set(HOLLOW_NAMES)
-    assert names & set(DRAWN_NAMES)
 
 
 @pytest.fixture
@@ -106,9 +86,7 @@ def _extents(model: ObjectModel) -> np.ndarray:
         return high - low
 
 
-def test_a_stretched_object_is_longer_by_each_factor(
-    shapes: tuple[ObjectModel, ...], tmp_path: Path
-) -> None:
+def test_a_stretched_object_is_longer_by_each_factor(shapes, tmp_path) -> None:
     bowl = next(model for model in shapes if model.name == "made-bowl")
     longer = stretched(bowl, (1.3, 0.8, 2.0), tmp_path / "stretched")
     assert longer.name == "made-bowl"
@@ -132,9 +110,7 @@ def test_objects_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
         stretched(ObjectModel("box", path), (1.0, 1.0, 1.0), tmp_path)
 
 
-def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(
-    shapes: tuple[ObjectModel, ...], tmp_path: Path
-) -> None:
+def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_path) -> None:
     plain = ObjectSet("plain", shapes[:4])
 
     def descriptions(folder: str, seed: int) -> dict[str, str]:

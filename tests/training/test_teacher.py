@@ -41,9 +41,7 @@ def teacher(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Teacher:
     return Teacher(weights, 0.04, tmp_path_factory.mktemp("taught"))
 
 
-def test_a_teacher_scores_candidates_above_the_table(
-    made_up_view: MakeView, networks: Networks, views: list[Path], teacher: Teacher
-) -> None:
+def test_a_teacher_scores_candidates_above_the_table(made_up_view, networks, views, teacher):
     view, gripper = made_up_view(0), load_gripper()
     labels = teacher.soft_labels(views[0])
     balls, count = np.unique(labels.approach_index, return_counts=True)
@@ -96,9 +94,7 @@ def test_soft_labels_are_kept_and_made_anew_for_a_changed_view(
     np.testing.assert_array_equal(fresh.chance, first.chance)
 
 
-def test_a_view_without_points_teaches_nothing(
-    made_up_view: MakeView, teacher: Teacher, tmp_path: Path
-) -> None:
+def test_a_view_without_points_teaches_nothing(made_up_view, teacher, tmp_path) -> None:
     view = made_up_view(0)
     none = np.empty(0, np.int64)
     empty = replace(
@@ -145,27 +141,7 @@ def test_loss_falls_with_a_teacher_who_is_named_in_card_and_checkpoint(
     assert digest in card
 
 
-def test_pausing_and_resuming_with_a_teacher_is_the_same_as_going_through(
-    make_trainer: MakeTrainer, teacher: Teacher, tmp_path: Path
-) -> None:
-    def run(folder: str, until: int) -> Trainer:
-        made = make_trainer(
-            tmp_path / folder, "balls", teacher=teacher, schedule="cosine", rotations="none"
-        )
-        made.run(lambda step, loss: None, until=until)
-        return made
-
-    through = run("through", 12)
-    run("paused", 7)
-    resumed = run("paused", 12)
-    assert resumed.step == through.step == 12
-    for name, weight in through.network.state_dict().items():
-        torch.testing.assert_close(weight, resumed.network.state_dict()[name], rtol=0, atol=0)
-
-
-def test_only_hands_teach_and_only_balls_are_taught(
-    make_trainer: MakeTrainer, networks: Networks, teacher: Teacher, tmp_path: Path
-) -> None:
+def test_only_hands_teach_and_only_balls_are_taught(make_trainer, networks, teacher, tmp_path):
     metadata = CheckpointMetadata("tiny", networks["balls"], voxel_size=0.0045, gripper="panda")
     save_checkpoint(tmp_path / "tiny.safetensors", build_network(networks["balls"]), metadata)
     with pytest.raises(ValueError, match="teacher: got a network of architecture 'edgegrasp'"):

@@ -1,5 +1,4 @@
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +19,8 @@ from edgegrasp_training.recipes import (
     recipe,
 )
 from edgegrasp_training.training import Trainer, TrainingOptions
-from edgegrasp_training.views import LabelledView, find_views, split_by_scene
+from edgegrasp_training.views import find_views, split_by_scene
 
-MakeView = Callable[[int], LabelledView]
-MakeTrainer = Callable[..., Trainer]
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
 
 
@@ -36,9 +33,7 @@ def same_weights(one: Trainer, other: Trainer) -> bool:
     return all(torch.equal(value, state[name]) for name, value in one.network.state_dict().items())
 
 
-def test_loss_falls_and_the_best_network_is_kept_with_a_card(
-    make_trainer: MakeTrainer, tmp_path: Path
-) -> None:
+def test_loss_falls_and_the_best_network_is_kept_with_a_card(make_trainer, tmp_path) -> None:
     run = make_trainer(tmp_path)
     before = run.evaluate()
     run.run(ignore)
@@ -70,9 +65,7 @@ def test_loss_falls_in_a_few_steps_on_the_views_that_come_with_the_project(tmp_p
 
 
 @pytest.mark.parametrize("network", ["balls", "hands"])
-def test_pausing_and_resuming_is_the_same_as_going_through(
-    make_trainer: MakeTrainer, tmp_path: Path, network: str
-) -> None:
+def test_pausing_and_resuming_is_the_same_as_going_through(make_trainer, tmp_path, network) -> None:
     through = make_trainer(tmp_path / "through", network)
     through.run(ignore, until=14)
     make_trainer(tmp_path / "paused", network).run(ignore, until=9)
@@ -87,9 +80,7 @@ def test_pausing_and_resuming_is_the_same_as_going_through(
 
 
 @pytest.mark.parametrize("network", ["balls", "vn", "hands"])
-def test_mixed_precision_steps_are_nearly_those_in_full(
-    make_trainer: MakeTrainer, tmp_path: Path, network: str
-) -> None:
+def test_mixed_precision_steps_are_nearly_those_in_full(make_trainer, tmp_path, network) -> None:
     losses: dict[bool, list[float]] = {False: [], True: []}
     for mixed, kept in losses.items():
         run = make_trainer(tmp_path / str(mixed), network, mixed_precision=mixed)
@@ -99,9 +90,7 @@ def test_mixed_precision_steps_are_nearly_those_in_full(
     np.testing.assert_allclose(losses[True], losses[False], rtol=0.05)
 
 
-def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(
-    make_trainer: MakeTrainer, tmp_path: Path
-) -> None:
+def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(make_trainer, tmp_path):
     run = make_trainer(tmp_path, "balls", steps=8, evaluate_every=4, schedule="cosine")
     run.run(ignore)
     rates = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)[:, 1]
@@ -109,9 +98,7 @@ def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(
     np.testing.assert_allclose(rates, [half, last], rtol=1e-3)
 
 
-def test_a_view_without_labels_is_passed_over(
-    made_up_view: MakeView, make_trainer: MakeTrainer, views: list[Path], tmp_path: Path
-) -> None:
+def test_a_view_without_labels_is_passed_over(made_up_view, make_trainer, views, tmp_path) -> None:
     view, path = made_up_view(3), tmp_path / "packed_99_0.npz"
     replace(view, success=np.full_like(view.success, -1)).save(path)
     run = make_trainer(tmp_path / "run", "balls", train=[path, views[0]])
@@ -127,9 +114,7 @@ def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
 
 
 @pytest.mark.parametrize("name", ["balls", "vn"])
-def test_a_network_trained_in_other_units_scores_the_same_in_metres(
-    made_up_view: MakeView, networks: dict[str, NetworkConfig], name: str
-) -> None:
+def test_a_network_trained_in_other_units_scores_the_same_in_metres(made_up_view, networks, name):
     config = networks[name]
     grasps = tried_grasps(made_up_view(1), config, load_gripper())
     batch = pack_balls(grasps, grasps.balls(), config).batch
@@ -153,9 +138,7 @@ def test_a_network_trained_in_other_units_scores_the_same_in_metres(
 
 
 @pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
-def test_scores_of_an_untrained_network_of_full_depth_differ(
-    made_up_view: MakeView, architecture: str
-) -> None:
+def test_scores_of_an_untrained_network_of_full_depth_differ(made_up_view, architecture) -> None:
     config = NetworkConfig(
         architecture, (32, 32, 32), (32, 32, 32), (64, 64), (64, 32, 16), crop_radius=0.04
     )
