@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from edgegrasp_service.call import Call
+from edgegrasp_service.observability import Call
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job
 

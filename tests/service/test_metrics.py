@@ -16,8 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient
-from edgegrasp_service.call import Call
-from edgegrasp_service.observability import Metrics
+from edgegrasp_service.observability import Call, Metrics
 
 DASHBOARD = Path(__file__).parents[2] / "docker" / "grafana" / "edgegrasp.json"
 

@@ -24,10 +24,10 @@ from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.errors import AddressInUse, Cancelled, NotReady, Overloaded, Problem, report
 from edgegrasp_service.front.problems import abort, error_detail
 from edgegrasp_service.front.service import STOPPING, GraspService, Reloader, check_headers
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.worker.job import Method
 
 logger = logging.getLogger(__name__)

@@ -13,11 +13,10 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
-from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.problems import problem_response
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import Metrics
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
 from edgegrasp_service.schemas import (
     TIMEOUT,
     DetectionBody,

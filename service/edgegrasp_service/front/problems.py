@@ -16,8 +16,8 @@ from google.rpc.status_pb2 import Status  # type: ignore[import-untyped]
 from starlette.responses import Response
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.call import REQUEST_ID_HEADER, current_call
 from edgegrasp_service.errors import Problem
+from edgegrasp_service.observability import REQUEST_ID_HEADER, current_call
 from edgegrasp_service.schemas import KIND_PREFIX
 
 CHALLENGE = 'Bearer realm="edgegrasp"'

@@ -9,7 +9,6 @@ from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.call import CALL, REQUEST_ID_HEADER, Call
 from edgegrasp_service.errors import (
     Cancelled,
     HeadersTooLarge,
@@ -21,6 +20,7 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front.admission import Admission, Ticket
+from edgegrasp_service.observability import CALL, REQUEST_ID_HEADER, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job, Method, Transport

@@ -19,7 +19,7 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import SECRETS, Settings
 from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.pipe import (
+from edgegrasp_service.worker.process import (
     HEADER,
     LOST,
     Failed,
