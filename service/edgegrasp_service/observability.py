@@ -11,16 +11,14 @@ import re
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
-from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import choose_encoder
-from prometheus_client.registry import Collector
 
 from edgegrasp_service.errors import STATUS, InvalidSettings, Problem
 from edgegrasp_service.settings import Settings, one_line
@@ -70,6 +68,13 @@ class Call:
     def end_stage(self, name: str) -> None:
         """Note that a stage ended now, which began where the one before it ended."""
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
+
+    def end(self) -> None:
+        """Note that it ended now, and with which code, unless its transport said so."""
+        self.seconds = time.monotonic() - self.start
+        if not self.code:
+            answered = "499" if self.transport == "http" else "OK"
+            self.code = answered if self.problem is None else self.problem.code
 
 
 CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task
@@ -242,6 +247,7 @@ def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
 OTHER = "other"
 SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 FEW = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+MODEL_LABELS = ("name", "digest", "architecture", "default", "device")
 MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
 
 _CODES = {"OK", "UNKNOWN", "499"} | {code for code, _ in STATUS.values()}
@@ -253,9 +259,13 @@ class Metrics:
 
     Args:
         methods: Values of the label `method`; any other counts as "other".
+        models: Gives facts of the loaded weights.
     """
 
-    def __init__(self, methods: Sequence[str]) -> None:
+    def __init__(
+        self, methods: Iterable[str], models: Callable[[], Sequence[dict[str, Any]]]
+    ) -> None:
+        self._models = models
         self.registry = CollectorRegistry()
         self._methods = frozenset(methods)
         ProcessCollector(registry=self.registry)
@@ -267,6 +277,9 @@ class Metrics:
         self._grasps = self._histogram("grasps_returned", "grasps of a detection", FEW)
         self._results = self._counter("stream_results", "results sent on streams", ("code",))
         self._workers = self._counter("workers_replaced", "worker processes that died")
+        self._model_info = Gauge(
+            "edgegrasp_model_info", "loaded weights", MODEL_LABELS, registry=self.registry
+        )
         self._reloads = self._counter("reloads", "weights loaded anew", ("outcome",))
 
     def count_call(self, call: Call) -> None:
@@ -297,16 +310,16 @@ class Metrics:
         """Show a number that is asked for when metrics are read."""
         Gauge(f"edgegrasp_{name}", meaning, registry=self.registry).set_function(value)
 
-    def describe_models(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
-        """Show the loaded weights, whichever they are when metrics are read."""
-        self.registry.register(_ModelCollector(models))
-
     def page(self, accept: str) -> tuple[bytes, str]:
         """All metrics as text, and its content type.
 
         Args:
             accept: The header of that name; OpenMetrics to whom asks for it.
         """
+        self._model_info.clear()
+        for facts in self._models():
+            shown = facts | {"default": str(facts.get("default", False)).lower()}
+            self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
         encoder, content_type = choose_encoder(accept)
         return encoder(self.registry), content_type
 
@@ -319,20 +332,6 @@ class Metrics:
         return Histogram(
             f"edgegrasp_{name}", meaning, labels, buckets=buckets, registry=self.registry
         )
-
-
-class _ModelCollector(Collector):
-    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
-        self._models = models
-
-    def collect(self) -> Iterator[GaugeMetricFamily]:
-        labels = ("name", "digest", "architecture", "default", "device")
-        family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
-        for model in self._models():
-            default = str(model.get("default", False)).lower()
-            facts = [str((model | {"default": default}).get(label, "")) for label in labels]
-            family.add_metric(facts, 1.0)
-        yield family
 
 
 # Traces: a span for each request, and one for each of its stages inside it

@@ -63,7 +63,8 @@ class Server:
     ) -> None:
         self._settings = settings
         self._tls = load_tls(settings)
-        self.metrics = Metrics(sorted({*GRPC_METHODS.values(), *HTTP_METHODS.values()}))
+        methods = {*GRPC_METHODS.values(), *HTTP_METHODS.values()}
+        self.metrics = Metrics(methods, lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.worker_replaced)
         self._recorder: Recorder | None = None
         if settings.record_folder is not None:
@@ -75,16 +76,13 @@ class Server:
             (self.metrics.count_call, log_call, *observers),
             None if self._recorder is None else self._recorder.record,
         )
-        self.reloader = Reloader(
-            self.service, lambda: load_tokens(settings), self._tls, self.metrics.reloaded
-        )
+        self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         self._watch()
         self.http_url = ""
         self.grpc_address = ""
 
     def _watch(self) -> None:
         service, admission, watch = self.service, self.service.admission, self.metrics.watch
-        self.metrics.describe_models(lambda: self.pool.models)
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
         watch("requests_active", "requests that workers have", lambda: self.pool.busy)
@@ -156,8 +154,7 @@ class Server:
         self.service.stopping.set()
         await grpc_server.stop_serving()
         await asyncio.sleep(min(NOTICE_SECONDS, self._settings.grace_seconds))
-        if not await self.service.drain(end - clock()):
-            logger.warning("grace is over: requests in flight are given up")
+        await self.service.drain(end - clock())
 
     def _http_server(self) -> "_HttpServer":
         tls = self._tls

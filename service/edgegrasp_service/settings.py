@@ -1,10 +1,7 @@
 """Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
-import difflib
-import json
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -23,11 +20,9 @@ from edgegrasp_service.errors import InvalidSettings
 MIB = 2**20
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
+CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
 # No one may see these, nor give them as flags, which every user of a machine can see.
 SECRETS = ("tokens", "admin_tokens")
-CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
-
-Origins = dict[str, str]  # setting: "default", the file's name, a variable or a flag
 
 
 class Settings(BaseSettings):
@@ -37,7 +32,7 @@ class Settings(BaseSettings):
     """
 
     model_config = SettingsConfigDict(
-        env_prefix="EDGEGRASP_", env_ignore_empty=True, extra="forbid", frozen=True
+        env_prefix=PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
     )
 
     host: str = Field(default="127.0.0.1", description="address both transports bind to")
@@ -67,7 +62,6 @@ class Settings(BaseSettings):
     max_points: int = Field(
         default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
     )
-    # Bounds.
     max_voxels: int = Field(
         default=300_000, ge=1, description="most points in a cloud, after downsampling"
     )
@@ -196,37 +190,26 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
 
     Args:
         config: The file; None: the one EDGEGRASP_CONFIG names, if it does.
-        given: Settings by name; in messages they are flags.
+        given: Settings by name.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.
     """
-    return load_settings_and_origins(config, **given)[0]
-
-
-def load_settings_and_origins(
-    config: Path | None = None, **given: object
-) -> tuple[Settings, Origins]:
-    """As `load_settings`, and where each setting came from; raises as it does."""
-    origins = dict.fromkeys(Settings.model_fields, "default")
+    named = os.environ.get(CONFIG_VARIABLE)
+    path = config or (Path(named) if named else None)
+    sources = {"a flag": given}
     try:
-        path = config or _config_of_environment()
-        from_file = _read_file(path) if path else {}
-        from_environment = _read_environment()
-        _refuse_unknown(given, Settings.model_fields, lambda name: f"--{name.replace('_', '-')}")
-        origins |= dict.fromkeys(from_file, str(path))
-        origins |= {name: PREFIX + name.upper() for name in from_environment}
-        origins |= {name: f"--{name.replace('_', '-')}" for name in given}
-        return Settings(**{**from_file, **from_environment, **given}), origins
+        sources["the environment"] = _read_environment()
+        if path is not None:
+            sources[str(path)] = _read_file(path)
+        merged: dict[str, Any] = {}
+        for fields in reversed(sources.values()):
+            merged |= fields
+        return Settings(**merged)
     except ValidationError as error:
-        raise InvalidSettings(_sentence(error, origins)) from None
+        raise InvalidSettings(_sentence(error, sources)) from None
     except SettingsError as error:
         raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
-
-
-def _config_of_environment() -> Path | None:
-    path = os.environ.get(CONFIG_VARIABLE, "")
-    return Path(path) if path else None
 
 
 def _read_file(path: Path) -> dict[str, Any]:
@@ -237,12 +220,13 @@ def _read_file(path: Path) -> dict[str, Any]:
         fields = TomlConfigSettingsSource(Settings, path).toml_data
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise InvalidSettings(f"config: {path}: {error}.") from None
-    _refuse_unknown(fields, Settings.model_fields, lambda name: f"{path}: {name}")
     return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
 
 
 def _located(name: str, value: Any, folder: Path) -> Any:
-    if "Path" not in str(Settings.model_fields[name].annotation):
+    if name not in Settings.model_fields or "Path" not in str(
+        Settings.model_fields[name].annotation
+    ):
         return value
     if isinstance(value, list):
         return [folder / part if isinstance(part, str) else part for part in value]
@@ -250,39 +234,26 @@ def _located(name: str, value: Any, folder: Path) -> Any:
 
 
 def _read_environment() -> dict[str, Any]:
-    ours = [
-        name.upper()
-        for name, value in os.environ.items()
-        if name.upper().startswith(PREFIX) and value
-    ]
-    known = [CONFIG_VARIABLE, *(PREFIX + name.upper() for name in Settings.model_fields)]
-    _refuse_unknown(
-        [name for name in ours if not name.startswith(CLIENT_PREFIX)], known, lambda name: name
-    )
+    """The settings in EDGEGRASP_* variables, and names that are none."""
+    names = [name.upper() for name, value in os.environ.items() if value]
+    ours = {name.removeprefix(PREFIX).lower(): name for name in names if name.startswith(PREFIX)}
+    for name, variable in ours.items():
+        known = name in Settings.model_fields or variable == CONFIG_VARIABLE
+        if not known and not variable.startswith(CLIENT_PREFIX):
+            raise InvalidSettings(f"{one_line(variable)}: no such setting.")
     return EnvSettingsSource(Settings)()
 
 
-def _refuse_unknown(
-    names: Iterable[str], known: Iterable[str], label: Callable[[str], str]
-) -> None:
-    choices = list(known)
-    for name in names:
-        if name not in choices:
-            nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
-            shown = label(nearest).rpartition(": ")[2]
-            raise InvalidSettings(
-                f"{one_line(label(name))}: no such setting. Did you mean {shown}?"
-            )
-
-
-def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
-    """The first thing wrong; never the value of a secret."""
+def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str:
+    """The first thing wrong and where it is set; never the value of a secret."""
     first = error.errors(include_url=False)[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
         return f"{message}."
     name = str(first["loc"][0])
-    origin = origins.get(name, "default")
+    origin = next(source for source, fields in sources.items() if name in fields)
+    if first["type"] == "extra_forbidden":
+        return f"{one_line(name)}: no such setting. It comes from {origin}."
     got = "a secret" if name in SECRETS else repr(first["input"])
     path = ".".join(str(part) for part in first["loc"])
     return f"{path}: got {got}. {message}. It comes from {origin}."
@@ -291,28 +262,3 @@ def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
 def one_line(text: str) -> str:
     """A text from outside as it may stand in a message."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def config_text(settings: Settings, origins: Origins) -> str:
-    """Settings as a TOML file that gives the same ones, secrets left out."""
-    lines = ["# EdgeGrasp settings in effect, and where each comes from; secrets are left out."]
-    for name in Settings.model_fields:
-        value = getattr(settings, name)
-        if name in SECRETS:
-            lines.append(f"# {name}: {len(value) or 'none'}{', hidden' * bool(value)}")
-        elif value is None:
-            lines.append(f"# {name}: none")
-        else:
-            lines.append(f"{name} = {_toml(value)}")
-        lines[-1] += f"  # {one_line(origins[name])}"
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, tuple):
-        return f"[{', '.join(_toml(part) for part in value)}]"
-    if isinstance(value, int | float):
-        return repr(value)
-    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -137,7 +137,7 @@ async def test_hostile_callers_add_no_labels(serve, cloud: np.ndarray) -> None:
 
 @given(st.lists(st.tuples(st.text(), st.text()), max_size=50))
 def test_labels_are_bounded_whatever_they_are_told(told: list[tuple[str, str]]) -> None:
-    metrics = Metrics(["DetectGrasps"])
+    metrics = Metrics(["DetectGrasps"], lambda: [])
     for method, code in told:
         metrics.count_call(Call("http", method, code=code))
         metrics.count_call(Call("grpc", method, code=code, in_stream=True))
