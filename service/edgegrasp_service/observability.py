@@ -1,7 +1,6 @@
 """What is known of a request, and what is logged, counted and traced of it."""
 
 import contextlib
-import http
 import json
 import logging
 import logging.handlers
@@ -11,7 +10,7 @@ import re
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,7 +19,7 @@ from typing import Any, TextIO
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
-from edgegrasp_service.errors import STATUS, InvalidSettings, Problem
+from edgegrasp_service.errors import InvalidSettings, Problem
 from edgegrasp_service.settings import Settings, one_line
 from edgegrasp_service.worker.job import Facts, Transport
 
@@ -244,30 +243,22 @@ def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
 
 # Metrics: every label has few values, whatever callers send
 
-OTHER = "other"
 SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 FEW = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 MODEL_LABELS = ("name", "digest", "architecture", "default", "device")
 MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
-
-_CODES = {"OK", "UNKNOWN", "499"} | {code for code, _ in STATUS.values()}
-_CODES |= {str(status.value) for status in http.HTTPStatus}
 
 
 class Metrics:
     """Counts, gauges and histograms of one server.
 
     Args:
-        methods: Values of the label `method`; any other counts as "other".
         models: Gives facts of the loaded weights.
     """
 
-    def __init__(
-        self, methods: Iterable[str], models: Callable[[], Sequence[dict[str, Any]]]
-    ) -> None:
+    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
         self._models = models
         self.registry = CollectorRegistry()
-        self._methods = frozenset(methods)
         ProcessCollector(registry=self.registry)
         calls = ("transport", "method")
         self._requests = self._counter("requests", "requests answered", (*calls, "code"))
@@ -284,14 +275,12 @@ class Metrics:
 
     def count_call(self, call: Call) -> None:
         """Count a call that has ended; a request of a stream as a result of it."""
-        code = call.code if call.code in _CODES else OTHER
         if call.in_stream:
-            self._results.labels(code).inc()
+            self._results.labels(call.code).inc()
         else:
-            method = call.method if call.method in self._methods else OTHER
-            self._requests.labels(call.transport, method, code).inc()
+            self._requests.labels(call.transport, call.method, call.code).inc()
             if not call.long:
-                self._seconds.labels(call.transport, method).observe(call.seconds)
+                self._seconds.labels(call.transport, call.method).observe(call.seconds)
         for stage, seconds in call.stages.items():
             self._stages.labels(stage).observe(seconds)
         if call.problem is None and call.method.startswith("DetectGrasps") and call.facts.model:

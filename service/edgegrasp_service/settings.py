@@ -3,7 +3,7 @@
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SecretStr, ValidationError, model_validator
 from pydantic_settings import (
@@ -24,6 +24,12 @@ CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
 # No one may see these, nor give them as flags, which every user of a machine can see.
 SECRETS = ("tokens", "admin_tokens")
 
+Port = Annotated[int, Field(ge=0, le=65535)]
+Count = Annotated[int, Field(ge=1)]
+Size = Annotated[int, Field(ge=MIB)]  # bytes
+Wait = Annotated[float, Field(ge=0.0, le=3600.0)]  # seconds
+Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
+
 
 class Settings(BaseSettings):
     """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`.
@@ -35,133 +41,113 @@ class Settings(BaseSettings):
         env_prefix=PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
     )
 
-    host: str = Field(default="127.0.0.1", description="address both transports bind to")
-    http_port: int = Field(default=8000, ge=0, le=65535, description="0: any free port")
-    grpc_port: int = Field(default=50051, ge=0, le=65535, description="0: any free port")
+    host: str = Field("127.0.0.1", description="address both transports bind to")
+    http_port: Port = Field(8000, description="0: any free port")
+    grpc_port: Port = Field(50051, description="0: any free port")
     backend: Literal["weights", "dummy"] = Field(
-        default="weights", description="dummy: made-up grasps, for load tests without weights"
+        "weights", description="dummy: made-up grasps, for load tests without weights"
     )
-    dummy_seconds: float = Field(
-        default=0.0, ge=0.0, le=3600.0, description="service time of the dummy backend, seconds"
-    )
+    dummy_seconds: Wait = Field(0.0, description="service time of the dummy backend, seconds")
     weights: tuple[Path, ...] = Field(
-        default=(), description="weights files or folders of them, besides those that ship"
+        (), description="weights files or folders of them, besides those that ship"
     )
     grippers: tuple[Path, ...] = Field(
-        default=(), description="gripper files (.toml), named by their stem in requests"
+        (), description="gripper files (.toml), named by their stem in requests"
     )
-    default_model: str = Field(default="", description="weights used when a request names none")
+    default_model: str = Field("", description="weights used when a request names none")
     device: str = Field(
-        default="cpu",
+        "cpu",
         pattern=r"^(auto|cpu|cuda(:\d+)?)$",
         description="where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu",
     )
     max_body_bytes: int = Field(
-        default=32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
+        32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
     )
-    max_points: int = Field(
-        default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
+    max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
+    max_voxels: Count = Field(300_000, description="most points in a cloud, after downsampling")
+    max_approach_points: Count = Field(
+        256, le=256, description="most approach points a request may ask for"
     )
-    max_voxels: int = Field(
-        default=300_000, ge=1, description="most points in a cloud, after downsampling"
-    )
-    max_approach_points: int = Field(
-        default=256, ge=1, le=256, description="most approach points a request may ask for"
-    )
-    max_candidates: int = Field(
-        default=16_000, ge=1, le=16_000, description="most candidates a request may ask for"
+    max_candidates: Count = Field(
+        16_000, le=16_000, description="most candidates a request may ask for"
     )
     workers: int = Field(
-        default=0,
-        ge=0,
-        le=1024,
-        description="processes that detect, each with one thread; 0: one a core",
+        0, ge=0, le=1024, description="processes that detect, each with one thread; 0: one a core"
     )
     max_worker_bytes: int = Field(
-        default=3 * 1024 * MIB,
+        3 * 1024 * MIB,
         ge=64 * MIB,
         description="memory a worker may take for its request; one that needs more is replaced",
     )
     max_queue_length: int = Field(
-        default=32, ge=0, le=65536, description="most requests in the server beside those at work"
+        32, ge=0, le=65536, description="most requests in the server beside those at work"
     )
-    max_held_bytes: int = Field(
-        default=512 * MIB,
-        ge=MIB,
+    max_held_bytes: Size = Field(
+        512 * MIB,
         description="most bytes of bodies held at a time; who comes then waits to be read",
     )
-    max_streams: int = Field(
-        default=16, ge=1, le=1024, description="most gRPC streams open at a time"
+    max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
+    max_stream_requests: Count = Field(
+        4, le=1024, description="most requests of one stream read ahead"
     )
-    max_stream_requests: int = Field(
-        default=4, ge=1, le=1024, description="most requests of one stream read ahead"
-    )
-    max_connections: int = Field(
-        default=512, ge=1, le=65536, description="most HTTP connections open at a time"
+    max_connections: Count = Field(
+        512, le=65536, description="most HTTP connections open at a time"
     )
     max_request_seconds: float = Field(
-        default=120.0,
+        120.0,
         gt=0.0,
         le=86400.0,
         description="longest a request may take, where the caller sets no shorter deadline",
     )
-    read_seconds: float = Field(
-        default=10.0,
-        gt=0.0,
-        le=3600.0,
+    read_seconds: Timeout = Field(
+        10.0,
         description="time for a gRPC message, or for an HTTP body at min_bytes_per_second and more",
     )
-    write_seconds: float = Field(
-        default=10.0,
-        gt=0.0,
-        le=3600.0,
-        description="time for an answer to be taken, and more at min_bytes_per_second",
+    write_seconds: Timeout = Field(
+        10.0, description="time for an answer to be taken, and more at min_bytes_per_second"
     )
-    min_bytes_per_second: int = Field(
-        default=50_000, ge=1, description="slowest that bodies and answers may be sent"
+    min_bytes_per_second: Count = Field(
+        50_000, description="slowest that bodies and answers may be sent"
     )
     record_folder: Path | None = Field(
-        default=None, description="folder that requests and answers are recorded in; none: not"
+        None, description="folder that requests and answers are recorded in; none: not"
     )
-    record_bytes: int = Field(
-        default=1024 * MIB, ge=MIB, description="most bytes recorded; the oldest are deleted"
+    record_bytes: Size = Field(
+        1024 * MIB, description="most bytes recorded; the oldest are deleted"
     )
     max_header_bytes: int = Field(
-        default=32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
+        32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
     tls_certificate: Path | None = Field(
-        default=None, description="PEM file: the server's certificate and those between it and a CA"
+        None, description="PEM file: the server's certificate and those between it and a CA"
     )
-    tls_key: Path | None = Field(default=None, description="PEM file: key of the certificate")
+    tls_key: Path | None = Field(None, description="PEM file: key of the certificate")
     tls_client_ca: Path | None = Field(
-        default=None, description="PEM file: CAs of clients, which must then show a certificate"
+        None, description="PEM file: CAs of clients, which must then show a certificate"
     )
     tokens: tuple[SecretStr, ...] = Field(
-        default=(), description="bearer tokens, one of which a request must carry; none: no need"
+        (), description="bearer tokens, one of which a request must carry; none: no need"
     )
-    token_file: Path | None = Field(default=None, description="file of further tokens, one a line")
+    token_file: Path | None = Field(None, description="file of further tokens, one a line")
     admin_tokens: tuple[SecretStr, ...] = Field(
-        default=(), description="tokens that may reload weights too; none: SIGHUP only"
+        (), description="tokens that may reload weights too; none: SIGHUP only"
     )
     admin_token_file: Path | None = Field(
-        default=None, description="file of further admin tokens, one a line"
+        None, description="file of further admin tokens, one a line"
     )
-    grace_seconds: float = Field(
-        default=10.0,
-        ge=0.0,
-        le=3600.0,
-        description="time for requests in flight when stopping, seconds",
+    grace_seconds: Wait = Field(
+        10.0, description="time for requests in flight when stopping, seconds"
     )
     otlp_endpoint: str = Field(
-        default="",
+        "",
         pattern=r"^(https?://[^@\s]+)?$",  # no password: it would be printed
         description="URL that traces are posted to, e.g. http://127.0.0.1:4318/v1/traces",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="least severe records logged"
+        "info", description="least severe records logged"
     )
     log_format: Literal["auto", "json", "text"] = Field(
-        default="auto", description="auto: text on a terminal, JSON lines elsewhere"
+        "auto", description="auto: text on a terminal, JSON lines elsewhere"
     )
 
     @model_validator(mode="after")

@@ -11,7 +11,7 @@ import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -38,6 +38,7 @@ from edgegrasp_service.errors import (
     NotReady,
     Overloaded,
     Problem,
+    RequestTimeout,
     report,
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
@@ -51,12 +52,6 @@ HEALTH = health.SERVICE_NAME
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
-# Values of the label `method`.
-METHODS = {
-    **{f"/{SERVICE.full_name}/{name}": name for name in SERVICE.methods_by_name},
-    **{f"/{HEALTH}/{name}": f"Health{name}" for name in ("Check", "Watch")},
-    **{f"/{name}/ServerReflectionInfo": "Reflection" for name in REFLECTION},
-}
 LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
 SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
 SMALL_READS = 8  # messages of health checks and reflection read at a time
@@ -145,10 +140,10 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
 
     Args:
         service: Told of every call.
-        behaviours: What each path does.
+        behaviours: The name of the method of each path, and what it does.
     """
 
-    def __init__(self, service: GraspService, behaviours: dict[str, Behaviour]) -> None:
+    def __init__(self, service: GraspService, behaviours: dict[str, tuple[str, Behaviour]]) -> None:
         self._service = service
         self._behaviours = behaviours
 
@@ -164,8 +159,8 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
     async def _handle(self, path: str, context: Any) -> None:
         metadata = context.invocation_metadata() or ()
         headers = {name: value for name, value in metadata if isinstance(value, str)}
-        method, peer = METHODS.get(path, "other"), _address(context.peer())
-        with self._service.call("grpc", method, headers, peer) as call:
+        method, behave = self._behaviours.get(path, ("other", _unimplemented))
+        with self._service.call("grpc", method, headers, _address(context.peer())) as call:
             call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
             if (remaining := context.time_remaining()) is not None:
                 call.limit(remaining)
@@ -177,9 +172,9 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
                     self._service.authorize(call, headers.get("authorization"))
                 if call.long:
                     await context.send_initial_metadata(name)
-                await self._behaviours.get(path, _unimplemented)(context)
+                await behave(context)
             except Cancelled:
-                raise asyncio.CancelledError from None  # nobody is there to be told
+                raise asyncio.CancelledError from None  # what is not taken holds up an error too
             except EdgeGraspError as error:
                 await _abort(context, report(error))
             except aio.AbortError:
@@ -201,17 +196,23 @@ class _Methods:
         self._small_reads = asyncio.Semaphore(SMALL_READS)
         self._streams = 0
 
-    def behaviours(self) -> dict[str, Behaviour]:
-        """By the methods' paths."""
+    def behaviours(self) -> dict[str, tuple[str, Behaviour]]:
+        """By the methods' paths; and what each is called in metrics and the log."""
+        ours: dict[str, Behaviour] = {
+            "DetectGrasps": partial(self._answer, "DetectGrasps"),
+            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
+            "DetectGraspsStream": self._stream,
+            "ListModels": self._list_models,
+            "ReloadModels": self._reload_models,
+        }
         return {
-            f"/{SERVICE.full_name}/DetectGrasps": partial(self._answer, "DetectGrasps"),
-            f"/{SERVICE.full_name}/ScoreGrasps": partial(self._answer, "ScoreGrasps"),
-            f"/{SERVICE.full_name}/DetectGraspsStream": self._stream,
-            f"/{SERVICE.full_name}/ListModels": self._list_models,
-            f"/{SERVICE.full_name}/ReloadModels": self._reload_models,
-            f"/{HEALTH}/Check": self._check_health,
-            f"/{HEALTH}/Watch": self._watch_health,
-            **{f"/{name}/ServerReflectionInfo": self._reflect for name in REFLECTION},
+            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
+            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
+            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
+            **{
+                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
+                for name in REFLECTION
+            },
         }
 
     async def _answer(self, method: Method, context: Any) -> None:
@@ -280,7 +281,8 @@ class _Methods:
                 data = await context.read()
             return None if data is EOF else kind.FromString(data)
         except TimeoutError:
-            raise Cancelled("The message did not arrive.") from None
+            value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
+            raise RequestTimeout("request", value, "Send it at once.") from None
         except DecodeError:
             raise _no_message(data) from None
 
@@ -353,13 +355,6 @@ def _details(problem: Problem) -> list[AnyMessage]:
 # Streams: requests of one at work side by side, answered in their order
 
 
-class _Ahead(NamedTuple):
-    """A request of the stream that is not answered yet."""
-
-    request_id: bytes
-    work: asyncio.Task[bytes | Problem]
-
-
 async def answer_stream(service: GraspService, stream: Call, context: Any) -> AsyncIterator[bytes]:
     """Answer the requests of one stream.
 
@@ -378,33 +373,30 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
         NotReady: The server is stopping; what was read is answered before.
         InvalidRequest: A message is no DetectGraspsStreamRequest.
     """
-    ahead: deque[_Ahead] = deque()
+    ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
     stopping = asyncio.create_task(service.stopping.wait())
     reading: asyncio.Task[Any] | None = asyncio.create_task(_next_envelope(context))
     try:
         while reading or ahead:
+            waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
             if reading and len(ahead) < service.settings.max_stream_requests:
-                waiting = {reading, stopping} | ({ahead[0].work} if ahead else set())
-            else:
-                waiting = {ahead[0].work}
+                waiting |= {reading, stopping}
             await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            if ahead and ahead[0].work.done():
-                request_id, work = ahead.popleft()
-                yield _response(request_id, work.result())
+            if ahead and ahead[0].done():
+                yield ahead.popleft().result()
             elif reading and reading.done():
                 request = reading.result()
                 if request is not None:
-                    work = asyncio.create_task(_answer(service, stream, request))
-                    ahead.append(_Ahead(request.request_id, work))
+                    ahead.append(asyncio.create_task(_answer(service, stream, request)))
                 last = request is None or stopping.done()
                 reading = None if last else asyncio.create_task(_next_envelope(context))
-            elif stopping.done() and reading:
+            elif reading:  # the server is stopping
                 reading.cancel()
                 reading = None
         if stopping.done():
             raise NotReady(STOPPING)
     finally:
-        for task in (stopping, reading, *(request.work for request in ahead)):
+        for task in (stopping, reading, *ahead):
             if task is not None:
                 task.cancel()
 
@@ -422,20 +414,22 @@ async def _next_envelope(context: Any) -> Any:
     return envelope
 
 
-async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes | Problem:
-    """A serialized DetectGraspsResponse, or why there is none."""
+async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes:
+    """A serialized DetectGraspsStreamResponse."""
+    request_id: str = envelope.request_id.decode()
     call = Call(
-        "grpc", stream.method, envelope.request_id.decode(), stream.peer, stream.token,
+        "grpc", stream.method, request_id, stream.peer, stream.token,
         traceparent=stream.traceparent, in_stream=True,
     )  # fmt: skip
-    answers: list[bytes | Problem] = []
     body: bytes = envelope.request
+    detection = b""
 
     async def read() -> bytes:
         return body
 
     async def write(answer: Answer) -> None:
-        answers.append(answer.error or answer.body)
+        nonlocal detection
+        detection = answer.body
 
     try:
         with service.observe(call):
@@ -445,11 +439,17 @@ async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes |
             await service.answer(
                 call, Job("DetectGrasps", "grpc", b"", 0.0), len(body), read, write
             )
-        return answers[0]
     except Exception as error:
         if not isinstance(error, EdgeGraspError):
             logger.exception("a request of a stream failed")
-        return report(error)
+    response = _ResponseEnvelope(request_id=envelope.request_id)
+    if (problem := call.problem) is None:
+        response.detection = detection
+    else:
+        number, detail = grpc.StatusCode[problem.code].value[0], _error_detail(problem)
+        told = grasp_pb2.StreamError(code=number, message=problem.detail, detail=detail)
+        response.error = told.SerializeToString()
+    return _serialized(response)
 
 
 def _check(envelope: Any) -> None:
@@ -461,18 +461,6 @@ def _check(envelope: Any) -> None:
     if envelope.ByteSize() != size:
         fix = "Send the fields of this server's .proto file only."
         raise InvalidRequest("request", "a field that this server does not know", fix)
-
-
-def _response(request_id: bytes, answer: bytes | Problem) -> bytes:
-    if isinstance(answer, bytes):
-        envelope = _ResponseEnvelope(request_id=request_id, detection=answer)
-    else:
-        number = grpc.StatusCode[answer.code].value[0]
-        detail = _error_detail(answer)
-        error = grasp_pb2.StreamError(code=number, message=answer.detail, detail=detail)
-        envelope = _ResponseEnvelope(request_id=request_id, error=error.SerializeToString())
-    data: bytes = envelope.SerializeToString()
-    return data
 
 
 def _envelope(name: str, **fields: int) -> Any:

@@ -31,7 +31,6 @@ from edgegrasp_service.schemas import (
 from edgegrasp_service.worker.job import Answer, Job, Method
 
 ASSETS = "/docs/assets"
-PIECE = 2**18  # bytes of an answer given to the connection at a time
 CHALLENGE = 'Bearer realm="edgegrasp"'
 
 # Values of the label `method`: the gRPC method's name where there is one.
@@ -228,13 +227,10 @@ class _GraspResponse(Response):
                 response = _problem_response(call, answer.error)
             else:
                 response = Response(answer.body, media_type="application/json")
-            body = bytes(response.body)
             start = {"type": "http.response.start", "status": response.status_code}
             await send({**start, "headers": response.raw_headers})
-            for begin in range(0, len(body), PIECE):
-                piece = body[begin : begin + PIECE]
-                await send({"type": "http.response.body", "body": piece, "more_body": True})
-            await send({"type": "http.response.body"})
+            await send({"type": "http.response.body", "body": response.body, "more_body": True})
+            await send({"type": "http.response.body"})  # once the client has taken most of it
 
         try:
             await service.answer(

@@ -304,7 +304,7 @@ class Reloader:
             try:
                 tokens = load_tokens(service.settings)
                 certificates = None if self._tls is None else self._tls.read()
-                await service.pool.reload()
+                await service.pool.start()
             except Exception as error:
                 self._reloaded(False)
                 known = isinstance(error, EdgeGraspError)

@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -94,7 +94,7 @@ class WorkerPool:
         return pages * resource.getpagesize()
 
     async def start(self) -> None:
-        """Load, and start the workers.
+        """Load, and start the workers; those of a start before end when they have answered.
 
         Raises:
             EdgeGraspError: Weights cannot be used.
@@ -111,7 +111,7 @@ class WorkerPool:
         old_nursery, old_workers = self._nursery, self._workers
         self._nursery, self._workers, self._idle = nursery, set(workers), []
         self.models = workers[0].models
-        nursery.watch(lambda: self._spawn(self._renew(nursery)))
+        nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._free(worker)
         if old_nursery is not None:
@@ -119,10 +119,6 @@ class WorkerPool:
         for worker in old_workers:
             if worker.answer is None:  # the others finish what they have begun
                 worker.close()
-
-    async def reload(self) -> None:
-        """Load anew; jobs that come after that meet what was loaded. Raises as `start`."""
-        await self.start()
 
     async def run(
         self, job: Job, deadline: float, begun: Callable[[], None] = lambda: None
@@ -192,33 +188,30 @@ class WorkerPool:
             logger.warning("worker %d died and is replaced", worker.pid)
             self._workers.discard(worker)
             self._replaced()
-            self._spawn(self._replace(worker.nursery))
+            self._spawn(self._until_done(worker.nursery, lambda: self._replace(worker.nursery)))
 
     async def _replace(self, nursery: "_Nursery") -> None:
-        while nursery is self._nursery:
-            worker = _Worker(self, nursery)
-            try:
-                await worker.start()
-            except (EdgeGraspError, OSError) as error:
-                logger.error("a worker cannot be replaced yet: %s", error)
-                await asyncio.sleep(RETRY_SECONDS)
-            else:
-                if nursery is not self._nursery:
-                    worker.close()
-                    return
-                self._workers.add(worker)
-                self._free(worker)
-                return
+        worker = _Worker(self, nursery)
+        await worker.start()
+        if nursery is not self._nursery:
+            worker.close()
+            return
+        self._workers.add(worker)
+        self._free(worker)
 
-    async def _renew(self, lost: "_Nursery") -> None:
-        """The nursery died: start anew, while the workers that it left go on."""
-        logger.error("the process that workers fork from died; weights are loaded again")
-        while lost is self._nursery:
+    async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
+        """Start again what died of a nursery, until that succeeds or there is a newer nursery."""
+        while nursery is self._nursery:
             try:
-                await self.start()
+                return await start()
             except (EdgeGraspError, OSError) as error:
-                logger.error("weights cannot be loaded again yet: %s", error)
+                logger.error("what died cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
+
+    def _nursery_lost(self, nursery: "_Nursery") -> None:
+        """Load again, while the workers that it left go on."""
+        logger.error("the process that workers fork from died; weights are loaded again")
+        self._spawn(self._until_done(nursery, self.start))
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -249,7 +242,7 @@ class _Nursery:
         nursery = cls(process, control)
         try:
             send(control, Start(settings.model_dump(mode="json", exclude=set(SECRETS))))
-            answer = await _in_thread(lambda: receive(control))
+            answer = await _in_thread(lambda: receive(control.recv_into))
         except BaseException:
             nursery.close()
             raise

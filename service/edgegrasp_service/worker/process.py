@@ -39,7 +39,7 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
     pool = socket.socket(fileno=0)
-    if (told := receive(pool)) is None:
+    if (told := receive(pool.recv_into)) is None:
         return
     settings = Settings(**told.settings)
     try:
@@ -96,7 +96,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         return
     _limit_memory(settings.max_worker_bytes)
     send(pool, Ready(os.getpid(), models))
-    while (job := receive(pool)) is not None:
+    while (job := receive(pool.recv_into)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
             answer: Answer = answerer.answer(job)
@@ -152,12 +152,12 @@ def send(to: socket.socket, message: object) -> None:
     to.sendall(body)
 
 
-def receive(source: socket.socket) -> Any:
-    """The next message; None: the other side has closed."""
-    if not (head := _read(source, HEADER.size)):
+def receive(read_into: Callable[[memoryview], int]) -> Any:
+    """The next message of a socket or a file; None: it has ended."""
+    if not (head := _read(read_into, HEADER.size)):
         return None
     length, body_length = HEADER.unpack(head)
-    return unpack(_read(source, length), bytes(_read(source, body_length)))
+    return unpack(_read(read_into, length), bytes(_read(read_into, body_length)))
 
 
 def pack(message: object) -> tuple[bytes, bytes]:
@@ -183,11 +183,11 @@ def _plain(value: Any) -> Any:
     return "" if isinstance(value, bytes) else vars(value)
 
 
-def _read(source: socket.socket, size: int) -> bytearray:
-    """So many bytes; empty where the other side closes before."""
+def _read(read_into: Callable[[memoryview], int], size: int) -> bytearray:
+    """So many bytes; empty where there are not so many any more."""
     data = bytearray(size)
     view, done = memoryview(data), 0
     with contextlib.suppress(ConnectionError):
-        while done < size and (count := source.recv_into(view[done:])):
+        while done < size and (count := read_into(view[done:])):
             done += count
     return data if done == size else bytearray()
