@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, TextIO
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
@@ -69,11 +70,12 @@ class Call:
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
 
     def end(self) -> None:
-        """Note that it ended now, and with which code, unless its transport said so."""
+        """Note that it ended now, and with which code."""
         self.seconds = time.monotonic() - self.start
-        if not self.code:
-            answered = "499" if self.transport == "http" else "OK"
-            self.code = answered if self.problem is None else self.problem.code
+        if self.transport == "http":
+            self.code = self.code or "499"  # the caller went away; as nginx logs it
+        else:
+            self.code = "OK" if self.problem is None else self.problem.code
 
 
 CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task
@@ -260,18 +262,23 @@ class Metrics:
         self._models = models
         self.registry = CollectorRegistry()
         ProcessCollector(registry=self.registry)
+        counter = partial(Counter, namespace="edgegrasp", registry=self.registry)
+        histogram = partial(Histogram, namespace="edgegrasp", registry=self.registry)
+        self._gauge = partial(Gauge, namespace="edgegrasp", registry=self.registry)
         calls = ("transport", "method")
-        self._requests = self._counter("requests", "requests answered", (*calls, "code"))
-        self._seconds = self._histogram("request_seconds", "from headers to answer", SECONDS, calls)
-        self._stages = self._histogram("stage_seconds", "stages of a request", SECONDS, ("stage",))
-        self._candidates = self._histogram("candidates", "candidates of a detection", MANY)
-        self._grasps = self._histogram("grasps_returned", "grasps of a detection", FEW)
-        self._results = self._counter("stream_results", "results sent on streams", ("code",))
-        self._workers = self._counter("workers_replaced", "worker processes that died")
-        self._model_info = Gauge(
-            "edgegrasp_model_info", "loaded weights", MODEL_LABELS, registry=self.registry
+        self._requests = counter("requests", "requests answered", (*calls, "code"))
+        self._seconds = histogram(
+            "request_seconds", "from headers to answer", calls, buckets=SECONDS
         )
-        self._reloads = self._counter("reloads", "weights loaded anew", ("outcome",))
+        self._stages = histogram(
+            "stage_seconds", "stages of a request", ("stage",), buckets=SECONDS
+        )
+        self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
+        self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
+        self._results = counter("stream_results", "results sent on streams", ("code",))
+        self._workers = counter("workers_replaced", "worker processes that died")
+        self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
+        self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
     def count_call(self, call: Call) -> None:
         """Count a call that has ended; a request of a stream as a result of it."""
@@ -297,7 +304,7 @@ class Metrics:
 
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Show a number that is asked for when metrics are read."""
-        Gauge(f"edgegrasp_{name}", meaning, registry=self.registry).set_function(value)
+        self._gauge(name, meaning).set_function(value)
 
     def page(self, accept: str) -> tuple[bytes, str]:
         """All metrics as text, and its content type.
@@ -311,16 +318,6 @@ class Metrics:
             self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
         encoder, content_type = choose_encoder(accept)
         return encoder(self.registry), content_type
-
-    def _counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
-        return Counter(f"edgegrasp_{name}", meaning, labels, registry=self.registry)
-
-    def _histogram(
-        self, name: str, meaning: str, buckets: Sequence[float], labels: Sequence[str] = ()
-    ) -> Histogram:
-        return Histogram(
-            f"edgegrasp_{name}", meaning, labels, buckets=buckets, registry=self.registry
-        )
 
 
 # Traces: a span for each request, and one for each of its stages inside it

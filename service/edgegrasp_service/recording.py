@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from edgegrasp_service.observability import Call
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.process import limits, pack, receive
@@ -29,7 +28,7 @@ class Recorder:
         self._most = most
         self._thread = ThreadPoolExecutor(1, "recorder")
 
-    def record(self, call: Call, job: Job, answer: Answer) -> None:
+    def record(self, job: Job, answer: Answer) -> None:
         """Write one request and its answer, soon."""
         self._thread.submit(self._write, datetime.now(UTC), job, answer)
 

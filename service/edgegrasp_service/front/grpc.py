@@ -313,7 +313,7 @@ def _address(peer: str) -> str:
 async def _abort(context: Any, problem: Problem) -> NoReturn:
     """End a gRPC call with an error: ours and those of google.rpc, and the request's id."""
     call = current_call()
-    call.problem, call.code = problem, problem.code
+    call.problem = problem
     code = grpc.StatusCode[problem.code]
     status = Status(code=code.value[0], message=problem.detail, details=_details(problem))
     trailing = (

@@ -120,7 +120,6 @@ class HttpProtocol(HttpToolsProtocol):
             self._header_timer = self.loop.call_later(seconds, self._headers_late)
 
     def _headers_late(self) -> None:
-        self._header_timer = None
         if not self.transport.is_closing():
             value = f"not whole in {self._settings.read_seconds:g} s"
             self._refuse(RequestTimeout("headers", value, "Send them at once."))

@@ -36,12 +36,7 @@ MAX_HEADERS = 64
 T = TypeVar("T")
 
 Observer = Callable[[Call], None]
-Recorder = Callable[[Call, Job, Answer], None]
-
-
-async def just(work: Coroutine[Any, Any, Answer]) -> Answer:
-    """Wait for a worker's answer, come what may."""
-    return await work
+Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
@@ -147,7 +142,7 @@ class GraspService:
         size: int,
         read: Callable[[], Awaitable[bytes]],
         write: Callable[[Answer], Awaitable[None]],
-        wait: Callable[[Coroutine[Any, Any, Answer]], Awaitable[Answer]] = just,
+        wait: Callable[[Coroutine[Any, Any, Answer]], Awaitable[Answer]] | None = None,
     ) -> None:
         """Admit a request, read its body, have a worker answer it, and send the answer.
 
@@ -157,7 +152,7 @@ class GraspService:
             size: Bytes that the body may have.
             read: Gives the body, once there is room for it.
             write: Sends the answer, which may be an error.
-            wait: Waits for the answer; what it raises in between ends the work.
+            wait: Waits for the answer, and ends the work where it raises; None: just wait.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
@@ -186,7 +181,8 @@ class GraspService:
                 ticket.at_work = True
 
             try:
-                answer = await wait(self.pool.run(job, call.deadline, begun))
+                work = self.pool.run(job, call.deadline, begun)
+                answer = await (wait(work) if wait else work)
             finally:
                 if began:
                     self.admission.worked(time.monotonic() - began)
@@ -196,7 +192,7 @@ class GraspService:
             call.bytes_out = len(answer.body)
             self.admission.resize(ticket, call.bytes_out)
             if self._record is not None:
-                self._record(call, job, answer)
+                self._record(job, answer)
             del job
             await self.send(write(answer), call.bytes_out)
             call.end_stage("write")

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.process import (
     HEADER,
     LOST,
-    Failed,
     Ready,
     Start,
     pack,
@@ -69,8 +67,8 @@ class WorkerPool:
         self.size = worker_count(settings)
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
-        self._idle: list[_Worker] = []  # the last one in is the first one out: its caches are warm
-        self._waiting: deque[asyncio.Future[_Worker]] = deque()
+        # The last one in is the first one out: its caches are warm.
+        self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closed = False
 
@@ -109,7 +107,9 @@ class WorkerPool:
                 worker.close()
             raise
         old_nursery, old_workers = self._nursery, self._workers
-        self._nursery, self._workers, self._idle = nursery, set(workers), []
+        self._nursery, self._workers = nursery, set(workers)
+        while not self._idle.empty():
+            self._idle.get_nowait()
         self.models = workers[0].models
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
@@ -157,33 +157,20 @@ class WorkerPool:
             self._nursery.close()
 
     async def _take(self) -> "_Worker":
-        if self._idle:
-            return self._idle.pop()
-        waiting: asyncio.Future[_Worker] = asyncio.get_running_loop().create_future()
-        self._waiting.append(waiting)
-        try:
-            return await waiting
-        except asyncio.CancelledError:
-            if waiting.done() and not waiting.cancelled():  # it was this one's turn just now
-                self._free(waiting.result())
-            raise
+        while True:
+            worker = await self._idle.get()
+            if worker in self._workers:  # and not dead
+                return worker
 
     def _free(self, worker: "_Worker") -> None:
         """A worker has nothing to do: the next job, or the end where there are newer ones."""
-        if worker not in self._workers:
+        if worker in self._workers:
+            self._idle.put_nowait(worker)
+        else:
             worker.close()
-            return
-        while self._waiting:
-            waiting = self._waiting.popleft()
-            if not waiting.done():
-                waiting.set_result(worker)
-                return
-        self._idle.append(worker)
 
     def _lost(self, worker: "_Worker") -> None:
         """A worker died: start another in its place."""
-        if worker in self._idle:
-            self._idle.remove(worker)
         if worker in self._workers and not self._closed:
             logger.warning("worker %d died and is replaced", worker.pid)
             self._workers.discard(worker)
@@ -242,14 +229,15 @@ class _Nursery:
         nursery = cls(process, control)
         try:
             send(control, Start(settings.model_dump(mode="json", exclude=set(SECRETS))))
-            answer = await _in_thread(lambda: receive(control.recv_into))
+            answer = await asyncio.to_thread(receive, control.recv_into)
         except BaseException:
             nursery.close()
             raise
-        if not isinstance(answer, Ready):
+        if answer is None or answer.failure:
             nursery.close()
-            reason = answer.reason if answer else "the process that loads weights died"
-            raise InvalidSettings(reason)
+            raise InvalidSettings(
+                answer.failure if answer else "the process that loads weights died"
+            )
         control.setblocking(False)
         return nursery
 
@@ -281,10 +269,6 @@ class _Nursery:
         self._process.kill()
         self._process.wait()
         self._control.close()
-
-
-async def _in_thread(work: Callable[[], Any]) -> Any:
-    return await asyncio.get_running_loop().run_in_executor(None, work)
 
 
 class _Worker(asyncio.Protocol):
@@ -355,11 +339,11 @@ class _Worker(asyncio.Protocol):
         self._take(message)
 
     def _take(self, message: object) -> None:
-        if isinstance(message, Ready):
+        if isinstance(message, Ready) and message.failure:
+            self._ready.set_exception(InvalidSettings(message.failure))
+        elif isinstance(message, Ready):
             self.pid, self.models = message.pid, message.models
             self._ready.set_result(None)
-        elif isinstance(message, Failed):
-            self._ready.set_exception(InvalidSettings(message.reason))
         elif isinstance(message, Answer) and self.answer is not None:
             answer, self.answer = self.answer, None
             if self._killing is not None:

@@ -46,7 +46,7 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
         start = _prepare(settings, load)
         send(pool, Ready(os.getpid(), []))
     except EdgeGraspError as error:
-        send(pool, Failed(str(error)))
+        send(pool, Ready(os.getpid(), [], str(error)))
         return
     gc.collect()
     gc.freeze()  # collecting would write to pages that are shared
@@ -92,7 +92,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
     try:
         answerer, models = start()
     except EdgeGraspError as error:
-        send(pool, Failed(str(error)))
+        send(pool, Ready(os.getpid(), [], str(error)))
         return
     _limit_memory(settings.max_worker_bytes)
     send(pool, Ready(os.getpid(), models))
@@ -133,16 +133,10 @@ class Ready:
 
     pid: int
     models: list[dict[str, Any]]  # as `answer.describe` gives them; of workers
+    failure: str = ""  # why there is none after all
 
 
-@dataclass(frozen=True)
-class Failed:
-    """Why there will be no worker."""
-
-    reason: str
-
-
-MESSAGES = {kind.__name__: kind for kind in (Start, Ready, Failed, Job, Answer)}
+MESSAGES = {kind.__name__: kind for kind in (Start, Ready, Job, Answer)}
 
 
 def send(to: socket.socket, message: object) -> None:
