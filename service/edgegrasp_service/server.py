@@ -224,9 +224,14 @@ async def _serve_until_signalled(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
-    # Of a terminal that was closed it says that nobody is left to stop this.
-    at_a_terminal = sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
-    hang_up = stop.set if at_a_terminal else server.reloader.reload_soon
+    terminal = _at_a_terminal()
+
+    def hang_up() -> None:
+        if terminal and not _at_a_terminal():  # it was closed, with nobody left to stop this
+            stop.set()
+        else:
+            server.reloader.reload_soon()
+
     loop.add_signal_handler(signal.SIGHUP, hang_up)
 
     def opened() -> None:
@@ -237,6 +242,10 @@ async def _serve_until_signalled(
         write_line(sys.stdout, line)
 
     await server.serve(stop, opened, ready)
+
+
+def _at_a_terminal() -> bool:
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
 
 
 def warn(settings: Settings) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import pty
+import signal
 import socket
 import subprocess
 import sys
@@ -275,7 +276,11 @@ def test_a_closed_terminal_stops_what_was_started_in_it() -> None:
     os.close(inside)
     try:
         assert process.stdout is not None
-        assert process.stdout.readline()  # it is ready
+        url = process.stdout.readline().split()[3]
+        process.send_signal(signal.SIGHUP)  # with the terminal there: a reload
+        with httpx.Client(base_url=url) as http:
+            while 'reloads_total{outcome="succeeded"} 1.0' not in http.get("/metrics").text:
+                threading.Event().wait(0.05)
         os.close(terminal)
         assert process.wait(timeout=30) == 0
     finally:
