@@ -17,7 +17,7 @@ def serve(
         typer.Option(help="TOML file with settings, named as here with _ for -.", metavar="FILE"),
     ] = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the settings in effect as TOML, and stop.")
+        bool, typer.Option("--print-config", help="Print the settings in effect as JSON, and stop.")
     ] = False,
     *,
     settings: dict[str, Any],
@@ -30,13 +30,11 @@ def serve(
     """
     # gRPC's own lines are no JSON, and a pipe that nobody reads would stop it: no lines.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
-    from edgegrasp_service.settings import load_settings_and_origins
+    from edgegrasp_service.settings import load_settings
 
-    loaded, origins = load_settings_and_origins(config, **settings)
+    loaded = load_settings(config, **settings)
     if print_config:
-        from edgegrasp_service.settings import config_text
-
-        print(config_text(loaded, origins), end="")
+        print(loaded.model_dump_json(indent=2, exclude=set(SECRETS)))
         return
     from edgegrasp_service.server import run
 

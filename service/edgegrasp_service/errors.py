@@ -1,24 +1,4 @@
-"""Errors of the service, and the one table that gives every error its status.
-
-EdgeGraspError                (edgegrasp_model.errors)
-  + ServiceError
-      + PayloadTooLarge       a body or a cloud over the server's limits
-      + UnsupportedMediaType  a body in a format the server does not read
-      + DecoderMissing        a format whose reader is not installed
-      + Unauthenticated       no token, or none that the server knows
-      + PermissionDenied      a token that is good for less than this
-      + HeadersTooLarge       HTTP headers or gRPC metadata over the server's limits
-      + ReloadFailed          new weights cannot be used; the old ones still serve
-      + NotReady              weights are still loading, or the server is stopping
-      + Overloaded            as many requests as the server takes are in it already
-      + RequestTimeout        a body that arrives too slowly
-      + DeadlineExceeded      the caller's deadline passed before there was an answer
-      + Cancelled             the caller is gone; nobody reads this
-      + WorkerLost            the process that worked on the request died, and is replaced
-      + DetectorFailed        the detector failed on a good request
-      + InvalidSettings       start-up: a setting is wrong
-      + AddressInUse          start-up: a port cannot be bound
-"""
+"""Errors of the service, and the one table that gives every error its status."""
 
 import re
 from dataclasses import dataclass

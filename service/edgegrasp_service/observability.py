@@ -1,26 +1,92 @@
-"""What is told of requests: a log line, counts for Prometheus, and OpenTelemetry spans."""
+"""What is known of a request, and what is logged, counted and traced of it."""
 
 import contextlib
-import http
 import json
 import logging
 import logging.handlers
 import os
 import queue
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+import uuid
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, TextIO
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
-from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.exposition import choose_encoder
-from prometheus_client.registry import Collector
 
-from edgegrasp_service.call import CALL, Call
-from edgegrasp_service.errors import STATUS, InvalidSettings
+from edgegrasp_service.errors import InvalidSettings, Problem
 from edgegrasp_service.settings import Settings, one_line
+from edgegrasp_service.worker.job import Facts, Transport
+
+REQUEST_ID_HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC metadata of both
+
+_USABLE_ID = re.compile(r"[\w.:+/=@-]{1,128}", re.ASCII)
+
+
+@dataclass
+class Call:
+    """One request, or one stream of them."""
+
+    transport: Transport
+    method: str  # the gRPC method's name, for either transport
+    request_id: str = ""  # the caller's own where it is usable, or else a new one
+    peer: str = ""  # address without port
+    token: str = ""  # name of the token it came with
+    is_admin: bool = False
+    traceparent: str = ""  # W3C trace context, as sent
+    long: bool = False  # a stream, whose duration says nothing
+    in_stream: bool = False  # one request of a stream
+    start: float = field(default_factory=time.monotonic)  # as the event loop's clock
+    deadline: float = float("inf")
+    bytes_in: int = 0
+    bytes_out: int = 0
+    code: str = ""  # it ended with: a gRPC code or an HTTP status
+    problem: Problem | None = None
+    facts: Facts = field(default_factory=Facts)
+    stages: dict[str, float] = field(default_factory=dict)  # seconds of each, in order
+    seconds: float = 0.0  # from its start to its end
+
+    def __post_init__(self) -> None:
+        if not _USABLE_ID.fullmatch(self.request_id):
+            self.request_id = uuid.uuid4().hex
+
+    @property
+    def client(self) -> str:
+        """Whom its requests count for."""
+        return self.token or self.peer
+
+    def limit(self, timeout: float) -> None:
+        """Bring the deadline forward to `timeout` seconds after the start, if it is later."""
+        self.deadline = min(self.deadline, self.start + timeout)
+
+    def end_stage(self, name: str) -> None:
+        """Note that a stage ended now, which began where the one before it ended."""
+        self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
+
+    def end(self) -> None:
+        """Note that it ended now, and with which code."""
+        self.seconds = time.monotonic() - self.start
+        if self.transport == "http":
+            self.code = self.code or "499"  # the caller went away; as nginx logs it
+        else:
+            self.code = "OK" if self.problem is None else self.problem.code
+
+
+CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task
+
+
+def current_call() -> Call:
+    """The call that the running task works on."""
+    call = CALL.get()
+    assert call is not None, "outside of the middleware"
+    return call
+
 
 # Logs: JSON lines or text; a thread writes them, so that no log can hold up a request
 
@@ -179,46 +245,49 @@ def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
 
 # Metrics: every label has few values, whatever callers send
 
-OTHER = "other"
 SECONDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 FEW = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
+MODEL_LABELS = ("name", "digest", "architecture", "default", "device")
 MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
-
-_CODES = {"OK", "UNKNOWN", "499"} | {code for code, _ in STATUS.values()}
-_CODES |= {str(status.value) for status in http.HTTPStatus}
 
 
 class Metrics:
     """Counts, gauges and histograms of one server.
 
     Args:
-        methods: Values of the label `method`; any other counts as "other".
+        models: Gives facts of the loaded weights.
     """
 
-    def __init__(self, methods: Sequence[str]) -> None:
+    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
+        self._models = models
         self.registry = CollectorRegistry()
-        self._methods = frozenset(methods)
         ProcessCollector(registry=self.registry)
+        counter = partial(Counter, namespace="edgegrasp", registry=self.registry)
+        histogram = partial(Histogram, namespace="edgegrasp", registry=self.registry)
+        self._gauge = partial(Gauge, namespace="edgegrasp", registry=self.registry)
         calls = ("transport", "method")
-        self._requests = self._counter("requests", "requests answered", (*calls, "code"))
-        self._seconds = self._histogram("request_seconds", "from headers to answer", SECONDS, calls)
-        self._stages = self._histogram("stage_seconds", "stages of a request", SECONDS, ("stage",))
-        self._candidates = self._histogram("candidates", "candidates of a detection", MANY)
-        self._grasps = self._histogram("grasps_returned", "grasps of a detection", FEW)
-        self._results = self._counter("stream_results", "results sent on streams", ("code",))
-        self._workers = self._counter("workers_replaced", "worker processes that died")
-        self._reloads = self._counter("reloads", "weights loaded anew", ("outcome",))
+        self._requests = counter("requests", "requests answered", (*calls, "code"))
+        self._seconds = histogram(
+            "request_seconds", "from headers to answer", calls, buckets=SECONDS
+        )
+        self._stages = histogram(
+            "stage_seconds", "stages of a request", ("stage",), buckets=SECONDS
+        )
+        self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
+        self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
+        self._results = counter("stream_results", "results sent on streams", ("code",))
+        self._workers = counter("workers_replaced", "worker processes that died")
+        self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
+        self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
     def count_call(self, call: Call) -> None:
         """Count a call that has ended; a request of a stream as a result of it."""
-        code = call.code if call.code in _CODES else OTHER
         if call.in_stream:
-            self._results.labels(code).inc()
+            self._results.labels(call.code).inc()
         else:
-            method = call.method if call.method in self._methods else OTHER
-            self._requests.labels(call.transport, method, code).inc()
+            self._requests.labels(call.transport, call.method, call.code).inc()
             if not call.long:
-                self._seconds.labels(call.transport, method).observe(call.seconds)
+                self._seconds.labels(call.transport, call.method).observe(call.seconds)
         for stage, seconds in call.stages.items():
             self._stages.labels(stage).observe(seconds)
         if call.problem is None and call.method.startswith("DetectGrasps") and call.facts.model:
@@ -235,11 +304,7 @@ class Metrics:
 
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Show a number that is asked for when metrics are read."""
-        Gauge(f"edgegrasp_{name}", meaning, registry=self.registry).set_function(value)
-
-    def describe_models(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
-        """Show the loaded weights, whichever they are when metrics are read."""
-        self.registry.register(_ModelCollector(models))
+        self._gauge(name, meaning).set_function(value)
 
     def page(self, accept: str) -> tuple[bytes, str]:
         """All metrics as text, and its content type.
@@ -247,32 +312,12 @@ class Metrics:
         Args:
             accept: The header of that name; OpenMetrics to whom asks for it.
         """
+        self._model_info.clear()
+        for facts in self._models():
+            shown = facts | {"default": str(facts.get("default", False)).lower()}
+            self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
         encoder, content_type = choose_encoder(accept)
         return encoder(self.registry), content_type
-
-    def _counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
-        return Counter(f"edgegrasp_{name}", meaning, labels, registry=self.registry)
-
-    def _histogram(
-        self, name: str, meaning: str, buckets: Sequence[float], labels: Sequence[str] = ()
-    ) -> Histogram:
-        return Histogram(
-            f"edgegrasp_{name}", meaning, labels, buckets=buckets, registry=self.registry
-        )
-
-
-class _ModelCollector(Collector):
-    def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
-        self._models = models
-
-    def collect(self) -> Iterator[GaugeMetricFamily]:
-        labels = ("name", "digest", "architecture", "default", "device")
-        family = GaugeMetricFamily("edgegrasp_model_info", "loaded weights", labels=labels)
-        for model in self._models():
-            default = str(model.get("default", False)).lower()
-            facts = [str((model | {"default": default}).get(label, "")) for label in labels]
-            family.add_metric(facts, 1.0)
-        yield family
 
 
 # Traces: a span for each request, and one for each of its stages inside it

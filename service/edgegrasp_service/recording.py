@@ -1,24 +1,21 @@
 """Requests and their answers in a folder, for the day a robot misses: recorded, and replayed."""
 
-import dataclasses
-import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from edgegrasp_service.call import Call
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job
+from edgegrasp_service.worker.process import limits, pack, receive
 
 logger = logging.getLogger(__name__)
 
 
 class Recorder:
-    """Writes each request as NAME.job, its body, NAME.json, what is known of it, and NAME.answer.
-
-    NAME is the time and the request's id, so that names sort by time.
+    """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
     Args:
         folder: Made if it is not there.
@@ -31,42 +28,27 @@ class Recorder:
         self._most = most
         self._thread = ThreadPoolExecutor(1, "recorder")
 
-    def record(self, call: Call, job: Job, answer: Answer) -> None:
+    def record(self, job: Job, answer: Answer) -> None:
         """Write one request and its answer, soon."""
-        self._thread.submit(self._write, datetime.now(UTC), call.peer, job, answer)
+        self._thread.submit(self._write, datetime.now(UTC), job, answer)
 
     def close(self) -> None:
         """Write what is left."""
         self._thread.shutdown()
 
-    def _write(self, time: datetime, peer: str, job: Job, answer: Answer) -> None:
-        letters = [letter if letter.isalnum() else "_" for letter in job.request_id]
-        path = self._folder / f"{time:%Y%m%dT%H%M%S%fZ}-{''.join(letters)}"
-        known = {
-            "time": time.isoformat(),
-            "peer": peer,
-            "job": dataclasses.asdict(dataclasses.replace(job, body=b"")) | {"body": ""},
-            "facts": dataclasses.asdict(answer.facts),
-            "error": None if answer.error is None else dataclasses.asdict(answer.error),
-        }
+    def _write(self, time: datetime, job: Job, answer: Answer) -> None:
+        name = "".join(letter if letter.isalnum() else "_" for letter in job.request_id)
+        path = self._folder / f"{time:%Y%m%dT%H%M%S%fZ}-{name}.job"
         try:
-            path.with_name(f"{path.name}.job").write_bytes(job.body)
-            path.with_name(f"{path.name}.answer").write_bytes(answer.body)
-            path.with_name(f"{path.name}.json").write_text(json.dumps(known, indent=2))
-            self._delete_oldest()
+            with path.open("wb") as file:
+                file.writelines((*pack(job), *pack(answer)))
+            files = sorted(self._folder.glob("*.job"))
+            sizes = [path.stat().st_size for path in files]
+            while sum(sizes) > self._most:
+                files.pop(0).unlink(missing_ok=True)
+                sizes.pop(0)
         except OSError as error:
             logger.warning("%s is not recorded: %s", job.request_id, error)
-
-    def _delete_oldest(self) -> None:
-        files = sorted(self._folder.iterdir())
-        sizes = {path: path.stat().st_size for path in files}
-        total = sum(sizes.values())
-        for path in files:
-            if total <= self._most:
-                return
-            if path.suffix in (".job", ".answer", ".json"):
-                path.unlink(missing_ok=True)
-                total -= sizes[path]
 
 
 class Replay(NamedTuple):
@@ -81,18 +63,20 @@ def replay(path: Path, settings: Settings) -> Replay:
     """Answer a recorded request again, in this process.
 
     Args:
-        path: NAME.job, NAME.json or NAME.answer.
+        path: The file.
         settings: Weights and limits.
 
     Raises:
-        OSError: A file of the recording cannot be read.
+        OSError: The file cannot be read.
+        ValueError: It is no recording.
         EdgeGraspError: Weights cannot be used.
     """
     from edgegrasp_service.worker.answer import Answerer, load_catalogue
-    from edgegrasp_service.worker.process import limits
 
-    known = json.loads(path.with_suffix(".json").read_text())
-    fields = known["job"] | {"body": path.with_suffix(".job").read_bytes()}
-    job = Job(**fields | {"remaining": settings.max_request_seconds})
+    with path.open("rb") as file:
+        job, recorded = receive(file.readinto), receive(file.readinto)
+    if not isinstance(job, Job) or not isinstance(recorded, Answer):
+        raise ValueError(f"{path} is no recorded request")
+    job = replace(job, remaining=settings.max_request_seconds)
     answer = Answerer(load_catalogue(settings), limits(settings)).answer(job)
-    return Replay(job, path.with_suffix(".answer").read_bytes(), answer)
+    return Replay(job, recorded.body, answer)

@@ -1,11 +1,9 @@
 """Who may ask, and over what: bearer tokens, and TLS of both transports from the same files."""
 
 import hashlib
-import hmac
 import re
 import ssl
-import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,12 +47,13 @@ class Tokens:
     """
 
     def __init__(self, known: Iterable[Token] = ()) -> None:
-        self._known = tuple(known)
+        # Looked up by digest: what the time of that tells is nothing of a token.
+        self._known = {token.digest: token for token in known}
 
     @property
     def required(self) -> bool:
         """Whether requests need a token."""
-        return any(not token.is_admin for token in self._known)
+        return any(not token.is_admin for token in self._known.values())
 
     def check(self, authorization: str | None, *, admin: bool = False) -> Token | None:
         """The token of a request that may go on; None: it needs none.
@@ -69,26 +68,18 @@ class Tokens:
         """
         if not admin and not self.required:
             return None
-        if admin and not any(token.is_admin for token in self._known):
+        if admin and not any(token.is_admin for token in self._known.values()):
             raise PermissionDenied(HEADER, "a call that this server takes from nobody", ADMIN_FIX)
         if authorization is None:
             raise Unauthenticated(HEADER, "nothing", FIX)
         scheme, _, text = authorization.strip().partition(" ")
         if scheme.lower() != "bearer":
             raise Unauthenticated(HEADER, "another scheme than Bearer", FIX)
-        found = self._find(_digest(text.strip()))
+        found = self._known.get(_digest(text.strip()))
         if found is None:
             raise Unauthenticated(HEADER, "a token that this server does not know", FIX)
         if admin and not found.is_admin:
             raise PermissionDenied(HEADER, "a token that is good for detection only", ADMIN_FIX)
-        return found
-
-    def _find(self, digest: bytes) -> Token | None:
-        """The token of a digest, in a time that does not depend on which."""
-        found = None
-        for token in self._known:
-            if hmac.compare_digest(digest, token.digest) and (found is None or token.is_admin):
-                found = token
         return found
 
 
@@ -136,56 +127,66 @@ def _tokens(setting: str, lines: list[str]) -> list[Token]:
 
 
 def _digest(token: str) -> bytes:
-    """All of one length, so that comparing them tells nothing of a token's own."""
     return hashlib.sha256(token.encode("utf-8", "surrogateescape")).digest()
-
-
-@dataclass(frozen=True)
-class Certificates:
-    """Key, certificate, and the CAs of clients where those are set."""
-
-    http: ssl.SSLContext
-    grpc: grpc.ServerCertificateConfiguration
 
 
 class ServerTls:
     """What each transport needs to speak TLS, with client certificates where a CA is set.
+
+    Args:
+        settings: Certificate, key and client CA.
+
+    Raises:
+        InvalidSettings: A file cannot be read, or certificate and key are no pair.
 
     Attributes:
         http: For the HTTP server.
         grpc: For the gRPC server.
     """
 
-    def __init__(self, read: Callable[[], Certificates], require_clients: bool) -> None:
-        """Read the files.
-
-        Args:
-            read: Reads them; raises InvalidSettings.
-            require_clients: Whether a client must show a certificate.
-        """
-        self.read = read
-        first = read()
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
         self.http = _RenewableContext(ssl.PROTOCOL_TLS_SERVER)
-        self.http.current = first.http
-        self._lock = threading.Lock()
-        self._next: grpc.ServerCertificateConfiguration | None = None
+        self.use(self.read())
         self.grpc = grpc.dynamic_ssl_server_credentials(
-            first.grpc,
-            self._take_next,  # type: ignore[arg-type]  # None is left out of its stubs
-            require_client_authentication=require_clients,
+            self._for_grpc,
+            lambda: self._for_grpc,  # asked for each connection
+            require_client_authentication=settings.tls_client_ca is not None,
         )
 
-    def use(self, certificates: Certificates) -> None:
-        """Use others from the next connection on; those that are open stay as they are."""
-        self.http.current = certificates.http
-        with self._lock:
-            self._next = certificates.grpc
+    def use(self, certificates: "Certificates") -> None:
+        """Use these from the next connection on; those that are open stay as they are."""
+        self.http.current, self._for_grpc = certificates
 
-    def _take_next(self) -> grpc.ServerCertificateConfiguration | None:
-        """Asked by gRPC for each connection, in a thread of its own; None: as before."""
-        with self._lock:
-            taken, self._next = self._next, None
-        return taken
+    def read(self) -> "Certificates":
+        """The files as they are now; raises InvalidSettings."""
+        settings = self._settings
+        certificate, key, ca = settings.tls_certificate, settings.tls_key, settings.tls_client_ca
+        assert certificate is not None
+        assert key is not None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.set_alpn_protocols(["http/1.1"])
+        wrong = f"tls_certificate: got {str(certificate)!r} with tls_key {str(key)!r}. "
+        wrong += "They are no certificate with its key, in PEM"
+        try:
+            pair, authorities = (key.read_bytes(), certificate.read_bytes()), None
+            context.load_cert_chain(certificate, key, password=_refuse_encrypted_key)
+            if ca is not None:
+                wrong = f"tls_client_ca: got {str(ca)!r}. It holds no certificate in PEM"
+                authorities = ca.read_bytes()
+                context.load_verify_locations(ca)
+                context.verify_mode = ssl.CERT_REQUIRED
+        except (ssl.SSLError, ValueError) as error:
+            raise InvalidSettings(f"{wrong}: {error}.") from None
+        except OSError as error:
+            names = {certificate: "tls_certificate", key: "tls_key", ca: "tls_client_ca"}
+            path = Path(error.filename)
+            raise InvalidSettings(f"{names[path]}: got {str(path)!r}. {error.strerror}.") from None
+        return context, grpc.ssl_server_certificate_configuration([pair], authorities)
+
+
+Certificates = tuple[ssl.SSLContext, grpc.ServerCertificateConfiguration]
 
 
 class _RenewableContext(ssl.SSLContext):
@@ -199,51 +200,8 @@ class _RenewableContext(ssl.SSLContext):
 
 
 def load_tls(settings: Settings) -> ServerTls | None:
-    """Read certificate, key and client CA; None where the settings name no certificate.
-
-    Raises:
-        InvalidSettings: A file cannot be read, or certificate and key are no pair.
-    """
-    certificate, key, ca = settings.tls_certificate, settings.tls_key, settings.tls_client_ca
-    if certificate is None or key is None:
-        return None
-    return ServerTls(lambda: _read_certificates(certificate, key, ca), ca is not None)
-
-
-def _read_certificates(certificate: Path, key: Path, ca: Path | None) -> Certificates:
-    pair = (_read("tls_key", key), _read("tls_certificate", certificate))
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.set_alpn_protocols(["http/1.1"])
-    try:
-        context.load_cert_chain(certificate, key, password=_refuse_encrypted_key)
-    except (ssl.SSLError, ValueError) as error:
-        raise InvalidSettings(
-            f"tls_certificate: got {str(certificate)!r} with tls_key {str(key)!r}. "
-            f"They are no certificate with its key, in PEM: {error}."
-        ) from None
-    authorities = None
-    if ca is not None:
-        authorities = _read("tls_client_ca", ca)
-        _require_clients(context, ca)
-    return Certificates(context, grpc.ssl_server_certificate_configuration([pair], authorities))
-
-
-def _require_clients(context: ssl.SSLContext, ca: Path) -> None:
-    try:
-        context.load_verify_locations(ca)
-    except ssl.SSLError as error:
-        raise InvalidSettings(
-            f"tls_client_ca: got {str(ca)!r}. It holds no certificate in PEM: {error}."
-        ) from None
-    context.verify_mode = ssl.CERT_REQUIRED
-
-
-def _read(name: str, path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InvalidSettings(f"{name}: got {str(path)!r}. {error.strerror}.") from None
+    """Of the settings; None where they name no certificate. Raises as ServerTls."""
+    return None if settings.tls_certificate is None else ServerTls(settings)
 
 
 def _refuse_encrypted_key() -> str:

@@ -14,9 +14,7 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.front.grpc import METHODS as GRPC_METHODS
 from edgegrasp_service.front.grpc import GrpcServer
-from edgegrasp_service.front.http import METHODS as HTTP_METHODS
 from edgegrasp_service.front.http import HttpMiddleware, create_app
 from edgegrasp_service.front.http_protocol import HttpProtocol
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
@@ -63,7 +61,7 @@ class Server:
     ) -> None:
         self._settings = settings
         self._tls = load_tls(settings)
-        self.metrics = Metrics(sorted({*GRPC_METHODS.values(), *HTTP_METHODS.values()}))
+        self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.worker_replaced)
         self._recorder: Recorder | None = None
         if settings.record_folder is not None:
@@ -75,27 +73,22 @@ class Server:
             (self.metrics.count_call, log_call, *observers),
             None if self._recorder is None else self._recorder.record,
         )
-        self.reloader = Reloader(
-            self.service, lambda: load_tokens(settings), self._tls, self.metrics.reloaded
-        )
+        self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         self._watch()
         self.http_url = ""
         self.grpc_address = ""
 
     def _watch(self) -> None:
-        service, admission, watch = self.service, self.service.admission, self.metrics.watch
-        self.metrics.describe_models(lambda: self.pool.models)
+        service, admission, pool = self.service, self.service.admission, self.pool
+        watch = self.metrics.watch
         watch("ready", "1: requests are answered", lambda: service.ready)
         watch("requests_in_flight", "requests not yet answered", lambda: service.in_flight)
-        watch("requests_active", "requests that workers have", lambda: self.pool.busy)
-        watch(
-            "queue_depth",
-            "requests let in that no worker has",
-            lambda: max(0, admission.tickets - self.pool.busy),
-        )
+        watch("requests_active", "requests that workers have", lambda: pool.busy)
+        waiting = "requests let in that no worker has"
+        watch("queue_depth", waiting, lambda: max(0, admission.tickets - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
-        watch("workers", "worker processes", lambda: len(self.pool.pids))
-        watch("workers_resident_bytes", "memory of workers", lambda: self.pool.resident_bytes)
+        watch("workers", "worker processes", lambda: len(pool.pids))
+        watch("workers_resident_bytes", "memory of workers", lambda: pool.resident_bytes)
 
     async def serve(
         self,
@@ -151,13 +144,11 @@ class Server:
 
     async def _drain(self, grpc_server: GrpcServer) -> None:
         """Refuse new requests, and wait until those accepted are answered, or grace is over."""
-        clock = asyncio.get_running_loop().time
-        end = clock() + self._settings.grace_seconds
         self.service.stopping.set()
         await grpc_server.stop_serving()
-        await asyncio.sleep(min(NOTICE_SECONDS, self._settings.grace_seconds))
-        if not await self.service.drain(end - clock()):
-            logger.warning("grace is over: requests in flight are given up")
+        notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
+        await asyncio.sleep(notice)
+        await self.service.drain(self._settings.grace_seconds - notice)
 
     def _http_server(self) -> "_HttpServer":
         tls = self._tls

@@ -1,12 +1,9 @@
 """Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
-import difflib
-import json
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, SecretStr, ValidationError, model_validator
 from pydantic_settings import (
@@ -23,11 +20,15 @@ from edgegrasp_service.errors import InvalidSettings
 MIB = 2**20
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
+CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
 # No one may see these, nor give them as flags, which every user of a machine can see.
 SECRETS = ("tokens", "admin_tokens")
-CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
 
-Origins = dict[str, str]  # setting: "default", the file's name, a variable or a flag
+Port = Annotated[int, Field(ge=0, le=65535)]
+Count = Annotated[int, Field(ge=1)]
+Size = Annotated[int, Field(ge=MIB)]  # bytes
+Wait = Annotated[float, Field(ge=0.0, le=3600.0)]  # seconds
+Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
 
 
 class Settings(BaseSettings):
@@ -37,137 +38,116 @@ class Settings(BaseSettings):
     """
 
     model_config = SettingsConfigDict(
-        env_prefix="EDGEGRASP_", env_ignore_empty=True, extra="forbid", frozen=True
+        env_prefix=PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
     )
 
-    host: str = Field(default="127.0.0.1", description="address both transports bind to")
-    http_port: int = Field(default=8000, ge=0, le=65535, description="0: any free port")
-    grpc_port: int = Field(default=50051, ge=0, le=65535, description="0: any free port")
+    host: str = Field("127.0.0.1", description="address both transports bind to")
+    http_port: Port = Field(8000, description="0: any free port")
+    grpc_port: Port = Field(50051, description="0: any free port")
     backend: Literal["weights", "dummy"] = Field(
-        default="weights", description="dummy: made-up grasps, for load tests without weights"
+        "weights", description="dummy: made-up grasps, for load tests without weights"
     )
-    dummy_seconds: float = Field(
-        default=0.0, ge=0.0, le=3600.0, description="service time of the dummy backend, seconds"
-    )
+    dummy_seconds: Wait = Field(0.0, description="service time of the dummy backend, seconds")
     weights: tuple[Path, ...] = Field(
-        default=(), description="weights files or folders of them, besides those that ship"
+        (), description="weights files or folders of them, besides those that ship"
     )
     grippers: tuple[Path, ...] = Field(
-        default=(), description="gripper files (.toml), named by their stem in requests"
+        (), description="gripper files (.toml), named by their stem in requests"
     )
-    default_model: str = Field(default="", description="weights used when a request names none")
+    default_model: str = Field("", description="weights used when a request names none")
     device: str = Field(
-        default="cpu",
+        "cpu",
         pattern=r"^(auto|cpu|cuda(:\d+)?)$",
         description="where detectors compute: cpu, cuda, cuda:N, or auto: the first GPU, else cpu",
     )
     max_body_bytes: int = Field(
-        default=32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
+        32 * MIB, ge=1024, le=1024 * MIB, description="largest request body accepted"
     )
-    max_points: int = Field(
-        default=2_000_000, ge=1, description="most points in a cloud, before downsampling"
+    max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
+    max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
+    max_approach_points: Count = Field(
+        256, le=256, description="most approach points a request may ask for"
     )
-    # Bounds.
-    max_voxels: int = Field(
-        default=300_000, ge=1, description="most points in a cloud, after downsampling"
-    )
-    max_approach_points: int = Field(
-        default=256, ge=1, le=256, description="most approach points a request may ask for"
-    )
-    max_candidates: int = Field(
-        default=16_000, ge=1, le=16_000, description="most candidates a request may ask for"
+    max_candidates: Count = Field(
+        16_000, le=16_000, description="most candidates a request may ask for"
     )
     workers: int = Field(
-        default=0,
-        ge=0,
-        le=1024,
-        description="processes that detect, each with one thread; 0: one a core",
+        0, ge=0, le=1024, description="processes that detect, each with one thread; 0: one a core"
     )
     max_worker_bytes: int = Field(
-        default=3 * 1024 * MIB,
+        3 * 1024 * MIB,
         ge=64 * MIB,
         description="memory a worker may take for its request; one that needs more is replaced",
     )
     max_queue_length: int = Field(
-        default=32, ge=0, le=65536, description="most requests in the server beside those at work"
+        32, ge=0, le=65536, description="most requests in the server beside those at work"
     )
-    max_held_bytes: int = Field(
-        default=512 * MIB,
-        ge=MIB,
+    max_held_bytes: Size = Field(
+        512 * MIB,
         description="most bytes of bodies held at a time; who comes then waits to be read",
     )
-    max_streams: int = Field(
-        default=16, ge=1, le=1024, description="most gRPC streams open at a time"
+    max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
+    max_stream_requests: Count = Field(
+        4, le=1024, description="most requests of one stream read ahead"
     )
-    max_stream_requests: int = Field(
-        default=4, ge=1, le=1024, description="most requests of one stream read ahead"
-    )
-    max_connections: int = Field(
-        default=512, ge=1, le=65536, description="most HTTP connections open at a time"
+    max_connections: Count = Field(
+        512, le=65536, description="most HTTP connections open at a time"
     )
     max_request_seconds: float = Field(
-        default=120.0,
+        120.0,
         gt=0.0,
         le=86400.0,
         description="longest a request may take, where the caller sets no shorter deadline",
     )
-    read_seconds: float = Field(
-        default=10.0,
-        gt=0.0,
-        le=3600.0,
+    read_seconds: Timeout = Field(
+        10.0,
         description="time for a gRPC message, or for an HTTP body at min_bytes_per_second and more",
     )
-    write_seconds: float = Field(
-        default=10.0,
-        gt=0.0,
-        le=3600.0,
-        description="time for an answer to be taken, and more at min_bytes_per_second",
+    write_seconds: Timeout = Field(
+        10.0, description="time for an answer to be taken, and more at min_bytes_per_second"
     )
-    min_bytes_per_second: int = Field(
-        default=50_000, ge=1, description="slowest that bodies and answers may be sent"
+    min_bytes_per_second: Count = Field(
+        50_000, description="slowest that bodies and answers may be sent"
     )
     record_folder: Path | None = Field(
-        default=None, description="folder that requests and answers are recorded in; none: not"
+        None, description="folder that requests and answers are recorded in; none: not"
     )
-    record_bytes: int = Field(
-        default=1024 * MIB, ge=MIB, description="most bytes recorded; the oldest are deleted"
+    record_bytes: Size = Field(
+        1024 * MIB, description="most bytes recorded; the oldest are deleted"
     )
     max_header_bytes: int = Field(
-        default=32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
+        32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
     tls_certificate: Path | None = Field(
-        default=None, description="PEM file: the server's certificate and those between it and a CA"
+        None, description="PEM file: the server's certificate and those between it and a CA"
     )
-    tls_key: Path | None = Field(default=None, description="PEM file: key of the certificate")
+    tls_key: Path | None = Field(None, description="PEM file: key of the certificate")
     tls_client_ca: Path | None = Field(
-        default=None, description="PEM file: CAs of clients, which must then show a certificate"
+        None, description="PEM file: CAs of clients, which must then show a certificate"
     )
     tokens: tuple[SecretStr, ...] = Field(
-        default=(), description="bearer tokens, one of which a request must carry; none: no need"
+        (), description="bearer tokens, one of which a request must carry; none: no need"
     )
-    token_file: Path | None = Field(default=None, description="file of further tokens, one a line")
+    token_file: Path | None = Field(None, description="file of further tokens, one a line")
     admin_tokens: tuple[SecretStr, ...] = Field(
-        default=(), description="tokens that may reload weights too; none: SIGHUP only"
+        (), description="tokens that may reload weights too; none: SIGHUP only"
     )
     admin_token_file: Path | None = Field(
-        default=None, description="file of further admin tokens, one a line"
+        None, description="file of further admin tokens, one a line"
     )
-    grace_seconds: float = Field(
-        default=10.0,
-        ge=0.0,
-        le=3600.0,
-        description="time for requests in flight when stopping, seconds",
+    grace_seconds: Wait = Field(
+        10.0, description="time for requests in flight when stopping, seconds"
     )
     otlp_endpoint: str = Field(
-        default="",
+        "",
         pattern=r"^(https?://[^@\s]+)?$",  # no password: it would be printed
         description="URL that traces are posted to, e.g. http://127.0.0.1:4318/v1/traces",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="least severe records logged"
+        "info", description="least severe records logged"
     )
     log_format: Literal["auto", "json", "text"] = Field(
-        default="auto", description="auto: text on a terminal, JSON lines elsewhere"
+        "auto", description="auto: text on a terminal, JSON lines elsewhere"
     )
 
     @model_validator(mode="after")
@@ -196,37 +176,26 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
 
     Args:
         config: The file; None: the one EDGEGRASP_CONFIG names, if it does.
-        given: Settings by name; in messages they are flags.
+        given: Settings by name.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.
     """
-    return load_settings_and_origins(config, **given)[0]
-
-
-def load_settings_and_origins(
-    config: Path | None = None, **given: object
-) -> tuple[Settings, Origins]:
-    """As `load_settings`, and where each setting came from; raises as it does."""
-    origins = dict.fromkeys(Settings.model_fields, "default")
+    named = os.environ.get(CONFIG_VARIABLE)
+    path = config or (Path(named) if named else None)
+    sources = {"a flag": given}
     try:
-        path = config or _config_of_environment()
-        from_file = _read_file(path) if path else {}
-        from_environment = _read_environment()
-        _refuse_unknown(given, Settings.model_fields, lambda name: f"--{name.replace('_', '-')}")
-        origins |= dict.fromkeys(from_file, str(path))
-        origins |= {name: PREFIX + name.upper() for name in from_environment}
-        origins |= {name: f"--{name.replace('_', '-')}" for name in given}
-        return Settings(**{**from_file, **from_environment, **given}), origins
+        sources["the environment"] = _read_environment()
+        if path is not None:
+            sources[str(path)] = _read_file(path)
+        merged: dict[str, Any] = {}
+        for fields in reversed(sources.values()):
+            merged |= fields
+        return Settings(**merged)
     except ValidationError as error:
-        raise InvalidSettings(_sentence(error, origins)) from None
+        raise InvalidSettings(_sentence(error, sources)) from None
     except SettingsError as error:
         raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
-
-
-def _config_of_environment() -> Path | None:
-    path = os.environ.get(CONFIG_VARIABLE, "")
-    return Path(path) if path else None
 
 
 def _read_file(path: Path) -> dict[str, Any]:
@@ -237,12 +206,13 @@ def _read_file(path: Path) -> dict[str, Any]:
         fields = TomlConfigSettingsSource(Settings, path).toml_data
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise InvalidSettings(f"config: {path}: {error}.") from None
-    _refuse_unknown(fields, Settings.model_fields, lambda name: f"{path}: {name}")
     return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
 
 
 def _located(name: str, value: Any, folder: Path) -> Any:
-    if "Path" not in str(Settings.model_fields[name].annotation):
+    if name not in Settings.model_fields or "Path" not in str(
+        Settings.model_fields[name].annotation
+    ):
         return value
     if isinstance(value, list):
         return [folder / part if isinstance(part, str) else part for part in value]
@@ -250,39 +220,26 @@ def _located(name: str, value: Any, folder: Path) -> Any:
 
 
 def _read_environment() -> dict[str, Any]:
-    ours = [
-        name.upper()
-        for name, value in os.environ.items()
-        if name.upper().startswith(PREFIX) and value
-    ]
-    known = [CONFIG_VARIABLE, *(PREFIX + name.upper() for name in Settings.model_fields)]
-    _refuse_unknown(
-        [name for name in ours if not name.startswith(CLIENT_PREFIX)], known, lambda name: name
-    )
+    """The settings in EDGEGRASP_* variables, and names that are none."""
+    names = [name.upper() for name, value in os.environ.items() if value]
+    ours = {name.removeprefix(PREFIX).lower(): name for name in names if name.startswith(PREFIX)}
+    for name, variable in ours.items():
+        known = name in Settings.model_fields or variable == CONFIG_VARIABLE
+        if not known and not variable.startswith(CLIENT_PREFIX):
+            raise InvalidSettings(f"{one_line(variable)}: no such setting.")
     return EnvSettingsSource(Settings)()
 
 
-def _refuse_unknown(
-    names: Iterable[str], known: Iterable[str], label: Callable[[str], str]
-) -> None:
-    choices = list(known)
-    for name in names:
-        if name not in choices:
-            nearest = difflib.get_close_matches(name, choices, n=1, cutoff=0.0)[0]
-            shown = label(nearest).rpartition(": ")[2]
-            raise InvalidSettings(
-                f"{one_line(label(name))}: no such setting. Did you mean {shown}?"
-            )
-
-
-def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
-    """The first thing wrong; never the value of a secret."""
+def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str:
+    """The first thing wrong and where it is set; never the value of a secret."""
     first = error.errors(include_url=False)[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
         return f"{message}."
     name = str(first["loc"][0])
-    origin = origins.get(name, "default")
+    origin = next(source for source, fields in sources.items() if name in fields)
+    if first["type"] == "extra_forbidden":
+        return f"{one_line(name)}: no such setting. It comes from {origin}."
     got = "a secret" if name in SECRETS else repr(first["input"])
     path = ".".join(str(part) for part in first["loc"])
     return f"{path}: got {got}. {message}. It comes from {origin}."
@@ -291,28 +248,3 @@ def _sentence(error: ValidationError, origins: Mapping[str, str]) -> str:
 def one_line(text: str) -> str:
     """A text from outside as it may stand in a message."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def config_text(settings: Settings, origins: Origins) -> str:
-    """Settings as a TOML file that gives the same ones, secrets left out."""
-    lines = ["# EdgeGrasp settings in effect, and where each comes from; secrets are left out."]
-    for name in Settings.model_fields:
-        value = getattr(settings, name)
-        if name in SECRETS:
-            lines.append(f"# {name}: {len(value) or 'none'}{', hidden' * bool(value)}")
-        elif value is None:
-            lines.append(f"# {name}: none")
-        else:
-            lines.append(f"{name} = {_toml(value)}")
-        lines[-1] += f"  # {one_line(origins[name])}"
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, tuple):
-        return f"[{', '.join(_toml(part) for part in value)}]"
-    if isinstance(value, int | float):
-        return repr(value)
-    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -16,8 +16,8 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_service.call import Call
 from edgegrasp_service.errors import STATUS, kind_of
+from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
 

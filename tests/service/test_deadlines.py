@@ -8,7 +8,7 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_service.call import Call
+from edgegrasp_service.observability import Call
 
 
 async def test_a_request_that_expires_while_it_waits_is_never_computed(

@@ -22,8 +22,7 @@ from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import AsyncGraspClient
-from edgegrasp_service.call import CALL, Call
-from edgegrasp_service.observability import JsonFormatter, LogQueue, TextFormatter
+from edgegrasp_service.observability import CALL, Call, JsonFormatter, LogQueue, TextFormatter
 
 TOKEN = "a-token-of-enough-letters"
 

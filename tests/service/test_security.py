@@ -23,8 +23,8 @@ from edgegrasp_client import (
     ServerUnavailableError,
     Tls,
 )
-from edgegrasp_service.call import Call
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
+from edgegrasp_service.observability import Call
 from edgegrasp_service.probe import is_ready
 from edgegrasp_service.security import load_tls
 from edgegrasp_service.server import warn

@@ -1,23 +1,15 @@
 """Defaults, then a file, then the environment, then flags; every mistake named with its source."""
 
+import json
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edgegrasp_service.errors import InvalidSettings
-from edgegrasp_service.settings import (
-    SECRETS,
-    Settings,
-    config_text,
-    load_settings,
-    load_settings_and_origins,
-)
+from edgegrasp_service.settings import SECRETS, Settings, load_settings
 
 TOKEN = "a-token-of-enough-letters"
 
@@ -58,11 +50,18 @@ def test_each_source_wins_over_the_one_before(
     monkeypatch.setenv("EDGEGRASP_CONFIG", str(config))
     monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "2")
     monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "2")
-    settings, origins = load_settings_and_origins(http_port=3)
+    settings = load_settings(http_port=3)
     assert (settings.http_port, settings.grpc_port, settings.max_points) == (3, 2, 1)
-    names = ("http_port", "grpc_port", "max_points", "host")
-    sources = ["--http-port", "EDGEGRASP_GRPC_PORT", str(config), "default"]
-    assert [origins[name] for name in names] == sources
+
+
+@pytest.mark.parametrize("source", ["a flag", "the environment", "server.toml"])
+def test_a_mistake_is_told_with_its_source(
+    monkeypatch: pytest.MonkeyPatch, config: Path, source: str
+) -> None:
+    config.write_text("http_port = -1\n" if source == "server.toml" else "http_port = 1\n")
+    monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "-1" if source == "the environment" else "")
+    with pytest.raises(InvalidSettings, match=f"http_port: got .*It comes from .*{source}"):
+        load_settings(config, **({"http_port": -1} if source == "a flag" else {}))
 
 
 def test_the_file_given_wins_over_the_one_the_environment_names(
@@ -92,7 +91,7 @@ def test_lists_in_the_environment_are_json(monkeypatch: pytest.MonkeyPatch) -> N
     ("given", "sentence"),
     [
         ({"http_port": -1}, "http_port: got -1. Input should be greater"),
-        ({"htp_port": 1}, "--htp-port: no such setting. Did you mean --http-port?"),
+        ({"htp_port": 1}, "htp_port: no such setting"),
         ({"backend": "none"}, "backend: got 'none'"),
         ({"max_body_bytes": "many"}, "max_body_bytes: got 'many'"),
         ({"tokens": [1]}, "tokens.0: got a secret"),
@@ -111,8 +110,8 @@ def test_bad_settings_are_named(given: dict[str, object], sentence: str) -> None
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("htttp_port = 1\n", "htttp_port: no such setting. Did you mean http_port?"),
-        ("[tls]\nkey = 1\n", "tls: no such setting. Did you mean tls_key?"),
+        ("htttp_port = 1\n", "htttp_port: no such setting"),
+        ("[tls]\nkey = 1\n", "tls: no such setting"),
         ('http_port = "many"\n', "http_port: got 'many'"),
         ("http_port 1\n", "server.toml: Expected '=' after a key"),
         ("http_port = \xff\n", "server.toml:"),
@@ -131,17 +130,12 @@ def test_a_missing_file_is_named(config: Path) -> None:
         load_settings(config)
 
 
-@pytest.mark.parametrize(
-    ("variable", "nearest"),
-    [("EDGEGRASP_HTP_PORT", "EDGEGRASP_HTTP_PORT"), ("EDGEGRASP_TOKEN", "EDGEGRASP_TOKENS")],
-)
-def test_unknown_variables_are_named(
-    monkeypatch: pytest.MonkeyPatch, variable: str, nearest: str
-) -> None:
+@pytest.mark.parametrize("variable", ["EDGEGRASP_HTP_PORT", "EDGEGRASP_TOKEN"])
+def test_unknown_variables_are_named(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
     monkeypatch.setenv(variable, TOKEN)
     with pytest.raises(InvalidSettings) as caught:
         load_settings()
-    assert str(caught.value) == f"{variable}: no such setting. Did you mean {nearest}?"
+    assert str(caught.value) == f"{variable}: no such setting."
 
 
 def test_a_clients_variables_are_not_the_servers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,42 +149,19 @@ def test_made_directly_settings_read_no_environment(monkeypatch: pytest.MonkeyPa
     assert Settings().http_port == 8000
 
 
-@given(
-    default_model=st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0")),
-    names=st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))),
-    seconds=st.floats(0.0, 3600.0),
-)
-def test_printed_settings_are_a_file_that_gives_them_again(
-    tmp_path_factory: pytest.TempPathFactory, default_model: str, names: list[str], seconds: float
-) -> None:
-    given_settings = {
-        "default_model": default_model,
-        "weights": [f"/{name}" for name in names],
-        "grace_seconds": seconds,
-    }
-    settings, origins = load_settings_and_origins(**given_settings)
-    file = tmp_path_factory.mktemp("config") / "printed.toml"
-    file.write_text(config_text(settings, origins))
-    assert load_settings(file) == settings
-
-
-def test_every_setting_is_printed_with_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_settings_in_effect_are_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EDGEGRASP_GRPC_PORT", "7")
     done = serve("--print-config", "--http-port", "9", "--weights", "/a", "--weights", "/b")
     assert done.returncode == 0, done.stderr
-    printed = tomllib.loads(done.stdout)
+    printed = json.loads(done.stdout)
     assert (printed["http_port"], printed["grpc_port"]) == (9, 7)
     assert printed["weights"] == ["/a", "/b"]
-    assert "http_port = 9  # --http-port\n" in done.stdout
-    assert "grpc_port = 7  # EDGEGRASP_GRPC_PORT\n" in done.stdout
-    assert 'host = "127.0.0.1"  # default\n' in done.stdout
-    for name in Settings.model_fields:
-        assert f"\n{name} = " in done.stdout or f"\n# {name}: " in done.stdout
+    assert set(printed) == set(Settings.model_fields) - set(SECRETS)
 
 
 def test_secrets_are_not_printed() -> None:
     done = serve("--print-config", EDGEGRASP_TOKENS=f'["{TOKEN}"]')
-    assert "# tokens: 1, hidden  # EDGEGRASP_TOKENS\n" in done.stdout
+    assert done.returncode == 0, done.stderr
     assert TOKEN not in done.stdout + done.stderr
     wrong = serve("--print-config", EDGEGRASP_TOKENS=TOKEN)
     assert wrong.returncode == 1

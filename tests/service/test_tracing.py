@@ -5,9 +5,8 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_service.call import Call
 from edgegrasp_service.errors import DetectorFailed, InvalidSettings, report
-from edgegrasp_service.observability import Tracer, otlp_provider
+from edgegrasp_service.observability import Call, Tracer, otlp_provider
 
 pytest.importorskip("opentelemetry.sdk", reason="the extra `otel` is not installed")
 

@@ -79,7 +79,7 @@ class Admission:
             DeadlineExceeded: The deadline passed inside.
         """
         self._check_pace(deadline)
-        self.check_room(client, make_room=True)
+        self._make_room(client)
         ticket = Ticket(client)
         self._tickets.append(ticket)
         self._empty.clear()
@@ -94,24 +94,17 @@ class Admission:
         finally:
             self._leave(ticket)
 
-    def check_room(self, client: str, *, make_room: bool = False) -> None:
-        """Raise Overloaded unless there is a place for one more, or another client may lose one.
-
-        Args:
-            client: Who asks.
-            make_room: Refuse the other client's latest request.
-        """
+    def _make_room(self, client: str) -> None:
+        """Raise Overloaded unless there is a place for one more, or another client loses one."""
         if len(self._tickets) < self._max_tickets:
             return
         holder, count = Counter(ticket.client for ticket in self._tickets).most_common(1)[0]
-        for ticket in reversed(self._tickets):
-            if count * 2 <= self._max_tickets or holder == client:
-                break
-            if ticket.client == holder and not ticket.at_work:
-                if make_room:
+        if count * 2 > self._max_tickets and holder != client:
+            for ticket in reversed(self._tickets):
+                if ticket.client == holder and not ticket.at_work:
                     ticket.refuse(self._full("Others wait, and you hold most of its places"))
                     self._leave(ticket)
-                return
+                    return
         raise self._full(f"{len(self._tickets)} requests are in it")
 
     def resize(self, ticket: Ticket, size: int) -> None:

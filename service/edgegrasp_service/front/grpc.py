@@ -5,50 +5,63 @@ method then reads its message once there is room for it, and knows when its answ
 """
 
 import asyncio
-import inspect
 import logging
 import math
 import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NoReturn
 
 import grpc
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.any_pb2 import Any as AnyMessage
+from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import DecodeError
+from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
+    BadRequest,
+    ErrorInfo,
+    RetryInfo,
+)
+from google.rpc.status_pb2 import Status  # type: ignore[import-untyped]
 from grpc import aio
 from grpc.aio import EOF  # type: ignore[attr-defined]  # not in its stubs
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health, health_pb2
 from grpc_reflection.v1alpha import reflection, reflection_pb2
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
-from edgegrasp_service.errors import AddressInUse, Cancelled, NotReady, Overloaded, Problem, report
-from edgegrasp_service.front.problems import abort, error_detail
-from edgegrasp_service.front.service import STOPPING, GraspService, Reloader, check_headers
-from edgegrasp_service.worker.job import Method
+from edgegrasp_service.errors import (
+    STOPPING,
+    AddressInUse,
+    Cancelled,
+    NotReady,
+    Overloaded,
+    Problem,
+    RequestTimeout,
+    report,
+)
+from edgegrasp_service.front.service import GraspService, Reloader, check_headers
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.worker.job import Answer, Job, Method
 
 logger = logging.getLogger(__name__)
 
 SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
 HEALTH = health.SERVICE_NAME
+STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
-# Values of the label `method`.
-METHODS = {
-    **{f"/{SERVICE.full_name}/{name}": name for name in SERVICE.methods_by_name},
-    **{f"/{HEALTH}/{name}": f"Health{name}" for name in ("Check", "Watch", "List")},
-    **{f"/{name}/ServerReflectionInfo": "Reflection" for name in REFLECTION},
-}
 LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
 SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
 SMALL_READS = 8  # messages of health checks and reflection read at a time
 SMALL_READ_SECONDS = 2.0
 
-Behaviour = Callable[[Any, Any], Awaitable[None]]  # request iterator, context
-Handler = Any  # grpc.RpcMethodHandler, of which the stubs know no fields
+DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
+ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
+STATUS_METADATA = "grpc-status-details-bin"  # trailing: a google.rpc.Status
+
+Behaviour = Callable[[Any], Awaitable[None]]  # takes the context
 
 
 class GrpcServer:
@@ -87,37 +100,20 @@ class GrpcServer:
             ("grpc.keepalive_timeout_ms", 10_000),
             ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
         ]
-        self._server = aio.server(interceptors=[_Interceptor(service)], options=options)
-        methods = _Methods(service, reloader).handlers()
-        self._add(SERVICE.full_name, methods)
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = (SERVICE.full_name, HEALTH, *REFLECTION)
-        reflect = grpc.stream_stream_rpc_method_handler(
-            reflection.aio.ReflectionServicer(names).ServerReflectionInfo,  # type: ignore[attr-defined]
-            reflection_pb2.ServerReflectionRequest.FromString,
-            reflection_pb2.ServerReflectionResponse.SerializeToString,
-        )
-        for name in REFLECTION:  # the same messages under both names
-            self._add(name, {"ServerReflectionInfo": reflect})
-        host = settings.host
-        address = f"[{host}]" if ":" in host else host
+        self._server = aio.server(options=options)
+        router = _Router(service, _Methods(service, reloader, self._health).behaviours())
+        self._server.add_generic_rpc_handlers((router,))
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        place = f"{host}:{settings.grpc_port}"
         try:
             if credentials is None:
-                self.port = self._server.add_insecure_port(f"{address}:{settings.grpc_port}")
+                port = self._server.add_insecure_port(place)
             else:
-                self.port = self._server.add_secure_port(
-                    f"{address}:{settings.grpc_port}", credentials
-                )
+                port = self._server.add_secure_port(place, credentials)
         except RuntimeError as error:
-            place = f"{address}:{settings.grpc_port}"
             raise AddressInUse(f"gRPC: cannot listen on {place} ({error})") from None
-        self.address = f"{address}:{self.port}"
-
-    def _add(self, name: str, handlers: dict[str, Handler]) -> None:
-        self._server.add_generic_rpc_handlers(
-            (grpc.method_handlers_generic_handler(name, handlers),)
-        )
+        self.address = f"{host}:{port}"
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
@@ -126,8 +122,7 @@ class GrpcServer:
 
     async def set_serving(self, serving: bool) -> None:
         """Tell health checks."""
-        states = health_pb2.HealthCheckResponse.ServingStatus
-        status = states.SERVING if serving else states.NOT_SERVING
+        status = STATES.SERVING if serving else STATES.NOT_SERVING
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
 
@@ -140,180 +135,174 @@ class GrpcServer:
         await self._server.stop(grace_seconds)
 
 
-class _Methods:
-    """The methods of edgegrasp.v1.GraspService."""
+class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
+    """Every method, named, counted and logged.
 
-    def __init__(self, service: GraspService, reloader: Reloader) -> None:
+    Args:
+        service: Told of every call.
+        behaviours: The name of the method of each path, and what it does.
+    """
+
+    def __init__(self, service: GraspService, behaviours: dict[str, tuple[str, Behaviour]]) -> None:
+        self._service = service
+        self._behaviours = behaviours
+
+    def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
+        """The handler of a path, also of one that there is not."""
+        path: str = handler_call_details.method
+
+        async def handle(messages: Any, context: Any) -> None:
+            await self._handle(path, context)
+
+        return grpc.stream_stream_rpc_method_handler(handle, response_serializer=_serialized)
+
+    async def _handle(self, path: str, context: Any) -> None:
+        metadata = context.invocation_metadata() or ()
+        headers = {name: value for name, value in metadata if isinstance(value, str)}
+        method, behave = self._behaviours.get(path, ("other", _unimplemented))
+        with self._service.call("grpc", method, headers, _address(context.peer())) as call:
+            call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
+            if (remaining := context.time_remaining()) is not None:
+                call.limit(remaining)
+            name = ((REQUEST_ID_HEADER, call.request_id),)
+            try:
+                context.set_trailing_metadata(name)
+                check_headers("metadata", len(metadata))
+                if not path.startswith(f"/{HEALTH}/"):
+                    self._service.authorize(call, headers.get("authorization"))
+                if call.long:
+                    await context.send_initial_metadata(name)
+                await behave(context)
+            except Cancelled:
+                raise asyncio.CancelledError from None  # what is not taken holds up an error too
+            except EdgeGraspError as error:
+                await _abort(context, report(error))
+            except aio.AbortError:
+                raise
+            except Exception as error:
+                logger.exception("%s failed", method)
+                await _abort(context, report(error))
+
+
+class _Methods:
+    """What the methods do: those of edgegrasp.v1.GraspService, health checks and reflection."""
+
+    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
         self._service = service
         self._reloader = reloader
+        self._checks = checks
+        names = (SERVICE.full_name, HEALTH, *REFLECTION)
+        self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
+        self._small_reads = asyncio.Semaphore(SMALL_READS)
         self._streams = 0
 
-    def handlers(self) -> dict[str, Handler]:
-        """By the methods' names."""
+    def behaviours(self) -> dict[str, tuple[str, Behaviour]]:
+        """By the methods' paths; and what each is called in metrics and the log."""
+        ours: dict[str, Behaviour] = {
+            "DetectGrasps": partial(self._answer, "DetectGrasps"),
+            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
+            "DetectGraspsStream": self._stream,
+            "ListModels": self._list_models,
+            "ReloadModels": self._reload_models,
+        }
         return {
-            "DetectGrasps": _handler(partial(self._answer, "DetectGrasps")),
-            "ScoreGrasps": _handler(partial(self._answer, "ScoreGrasps")),
-            "DetectGraspsStream": _handler(self._stream),
-            "ListModels": _handler(self._list_models),
-            "ReloadModels": _handler(self._reload_models),
+            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
+            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
+            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
+            **{
+                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
+                for name in REFLECTION
+            },
         }
 
-    async def _answer(self, method: Method, messages: Any, context: Any) -> None:
-        service, call = self._service, current_call()
-        async with service.admit(call, service.settings.max_body_bytes) as ticket:
-            body = await self._read(context)
-            work = service.answer(call, ticket, method, body)
-            del body  # the job has it until a worker has
-            answer = await work
+    async def _answer(self, method: Method, context: Any) -> None:
+        service = self._service
+
+        async def read() -> bytes:
+            message = await service.receive(context.read())
+            if message is EOF:
+                raise InvalidRequest("request", "nothing", "Send one message.")
+            body: bytes = message
+            return body
+
+        async def write(answer: Answer) -> None:
             if answer.error is not None:
-                await abort(context, answer.error)
-            await _write(context, answer.body, service.time_to_write(len(answer.body)))
-            call.end_stage("write")
+                await _abort(context, answer.error)
+            await context.write(answer.body)
 
-    async def _read(self, context: Any) -> bytes:
-        try:
-            async with asyncio.timeout(self._service.time_to_read(0)):
-                message = await context.read()
-        except TimeoutError:
-            raise self._service.too_slow(0) from None
-        if message is EOF:
-            raise InvalidRequest("request", "nothing", "Send one message.")
-        self._service.check_size(len(message))
-        body: bytes = message
-        return body
+        job, most = Job(method, "grpc", b"", 0.0), service.settings.max_body_bytes
+        await service.answer(current_call(), job, most, read, write)
 
-    async def _stream(self, messages: Any, context: Any) -> None:
+    async def _stream(self, context: Any) -> None:
         most = self._service.settings.max_streams
         if self._streams >= most:
             raise Overloaded(f"The server has {most} streams open. Try again in 1 s.")
         self._streams += 1
         try:
             async for response in answer_stream(self._service, current_call(), context):
-                await _write(context, response, self._service.time_to_write(len(response)))
+                await self._service.send(context.write(response), len(response))
         finally:
             self._streams -= 1
 
-    async def _list_models(self, messages: Any, context: Any) -> None:
-        models = [grasp_pb2.Model(**vars(model)) for model in self._service.models()]
-        await context.write(grasp_pb2.ListModelsResponse(models=models).SerializeToString())
+    async def _list_models(self, context: Any) -> None:
+        await context.write(grasp_pb2.ListModelsResponse(models=self._service.models()))
 
-    async def _reload_models(self, messages: Any, context: Any) -> None:
-        loaded = await self._reloader.reload(current_call())
-        models = [grasp_pb2.Model(**vars(model)) for model in loaded]
-        await context.write(grasp_pb2.ReloadModelsResponse(models=models).SerializeToString())
+    async def _reload_models(self, context: Any) -> None:
+        models = await self._reloader.reload(current_call())
+        await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
+    async def _check_health(self, context: Any) -> None:
+        request = await self._read_health(context)
+        if request.service not in ("", SERVICE.full_name):
+            await _abort(context, _not_found(grpc.StatusCode.NOT_FOUND, request.service))
+        await context.write(await self._checks.Check(request, context))
 
-def _handler(behaviour: Behaviour) -> Handler:
-    return grpc.stream_stream_rpc_method_handler(behaviour)
+    async def _watch_health(self, context: Any) -> None:
+        request = await self._read_health(context)
+        await self._checks.Watch(request, context)
 
+    async def _read_health(self, context: Any) -> Any:
+        kind = health_pb2.HealthCheckRequest
+        return await self._read_small(kind, context) or kind()
 
-async def _write(context: Any, message: bytes, seconds: float) -> None:
-    """Send a message; a client that does not take it loses its call."""
-    try:
-        async with asyncio.timeout(seconds):
-            await context.write(message)
-    except TimeoutError:
-        logger.warning("a client did not take its answer of %d bytes", len(message))
-        raise asyncio.CancelledError from None
-
-
-class _Interceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in its stubs only
-    """Before every method, those of health checks and reflection included."""
-
-    def __init__(self, service: GraspService) -> None:
-        self._service = service
-        self._small_reads = asyncio.Semaphore(SMALL_READS)
-        self._around: dict[str, tuple[Handler, Handler]] = {}  # by path: a handler, and its own
-
-    async def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable[Handler]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> Handler:
-        """The method's handler, named, counted and logged."""
-        path: str = handler_call_details.method
-        handler = await continuation(handler_call_details) or _handler(_unimplemented)
-        known, around = self._around.get(path, (None, None))
-        if known is not handler:
-            around = self._handler_around(path, handler)
-            if path in METHODS:
-                self._around[path] = handler, around
-        return around
-
-    def _handler_around(self, path: str, handler: Handler) -> Handler:
-        method = METHODS.get(path, "other")
-        small = not path.startswith(f"/{SERVICE.full_name}/")
-        behaviour = self._on_messages(handler) if small else handler.stream_stream
-
-        async def named(messages: Any, context: Any) -> None:
-            headers = _headers(context.invocation_metadata())
-            with self._service.call("grpc", method, headers, _address(context.peer())) as call:
-                call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
-                if (remaining := context.time_remaining()) is not None:
-                    call.limit(remaining)
-                try:
-                    context.set_trailing_metadata(((REQUEST_ID_HEADER, call.request_id),))
-                    self._check(path, call, context, headers)
-                    if call.long:
-                        await context.send_initial_metadata(((REQUEST_ID_HEADER, call.request_id),))
-                    await behaviour(messages, context)
-                    call.code = "OK"
-                except EdgeGraspError as error:
-                    await abort(context, report(error))
-                except BaseException as error:
-                    call.code = call.code or _code(error, context)
-                    raise
-
-        return grpc.stream_stream_rpc_method_handler(
-            named, response_serializer=handler.response_serializer
-        )
-
-    def _check(self, path: str, call: Call, context: Any, headers: dict[str, str]) -> None:
-        check_headers("metadata", len(context.invocation_metadata() or ()))
-        if not path.startswith(f"/{HEALTH}/"):
-            self._service.authorize(call, headers.get("authorization"))
-
-    def _on_messages(self, handler: Handler) -> Behaviour:
-        """A method of small messages, whatever its kind, as one of streams."""
-        decode = handler.request_deserializer or (lambda data: data)
-
-        async def read(context: Any) -> Any:
-            """The next message; None: there are no more."""
-            try:
-                async with self._small_reads, asyncio.timeout(SMALL_READ_SECONDS):
-                    data = await context.read()
-                return None if data is EOF else decode(data)
-            except TimeoutError:
-                raise Cancelled("The message did not arrive.") from None
-            except DecodeError:
-                fix = "Send a message as the .proto file has it."
-                raise InvalidRequest("request", "bytes that are no message", fix) from None
-
-        async def requests(context: Any) -> AsyncIterator[Any]:
-            while (message := await read(context)) is not None:
+    async def _reflect(self, context: Any) -> None:
+        async def requests() -> AsyncIterator[Any]:
+            kind = reflection_pb2.ServerReflectionRequest
+            while (message := await self._read_small(kind, context)) is not None:
                 yield message
 
-        async def behave(messages: Any, context: Any) -> None:
-            if handler.request_streaming:
-                method, given = handler.stream_stream, requests(context)
-            else:
-                method = handler.unary_stream or handler.unary_unary
-                given = await read(context)
-            if inspect.isasyncgenfunction(method):
-                async for answer in method(given, context):
-                    await context.write(answer)
-            elif (answer := await method(given, context)) is not None:
-                await context.write(answer)
+        async for answer in self._reflection.ServerReflectionInfo(requests(), context):
+            await context.write(answer)
 
-        return _unimplemented if handler.stream_stream is _unimplemented else behave
-
-
-async def _unimplemented(messages: Any, context: Any) -> None:
-    await context.abort(grpc.StatusCode.UNIMPLEMENTED, "Method not found!")
+    async def _read_small(self, kind: Any, context: Any) -> Any:
+        """The next message of a method whose messages are small; None: there are no more."""
+        try:
+            async with self._small_reads, asyncio.timeout(SMALL_READ_SECONDS):
+                data = await context.read()
+            return None if data is EOF else kind.FromString(data)
+        except TimeoutError:
+            value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
+            raise RequestTimeout("request", value, "Send it at once.") from None
+        except DecodeError:
+            raise _no_message(data) from None
 
 
-def _headers(metadata: Any) -> dict[str, str]:
-    return {name: value for name, value in metadata or () if isinstance(value, str)}
+async def _unimplemented(context: Any) -> None:
+    await _abort(context, _not_found(grpc.StatusCode.UNIMPLEMENTED, "Method not found!"))
+
+
+def _not_found(code: grpc.StatusCode, detail: str) -> Problem:
+    return Problem("grpc", detail, "", "", "", code.name, 404)
+
+
+def _no_message(data: bytes) -> InvalidRequest:
+    value = f"{len(data)} bytes that are no message of this method"
+    return InvalidRequest("request", value, "Send a message as the .proto file has it.")
+
+
+def _serialized(message: Any) -> bytes:
+    data: bytes = message if isinstance(message, bytes) else message.SerializeToString()
+    return data
 
 
 def _address(peer: str) -> str:
@@ -321,21 +310,49 @@ def _address(peer: str) -> str:
     return urllib.parse.unquote(peer).partition(":")[2].rpartition(":")[0].strip("[]")
 
 
-def _code(error: BaseException, context: Any) -> str:
-    if isinstance(error, asyncio.CancelledError | GeneratorExit):
-        return "CANCELLED"
-    code = context.code()
-    return code.name if isinstance(code, grpc.StatusCode) else "UNKNOWN"
+async def _abort(context: Any, problem: Problem) -> NoReturn:
+    """End a gRPC call with an error: ours and those of google.rpc, and the request's id."""
+    call = current_call()
+    call.problem = problem
+    code = grpc.StatusCode[problem.code]
+    status = Status(code=code.value[0], message=problem.detail, details=_details(problem))
+    trailing = (
+        (ERROR_METADATA, _error_detail(problem).SerializeToString()),
+        (STATUS_METADATA, status.SerializeToString()),
+        (REQUEST_ID_HEADER, call.request_id),
+    )
+    await context.abort(code, problem.detail, trailing)
+    raise AssertionError("abort raises")
+
+
+def _error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
+    """An error as the message of edgegrasp.v1."""
+    return grasp_pb2.ErrorDetail(
+        kind=problem.kind,
+        field=problem.field,
+        value=problem.value,
+        fix=problem.fix,
+        retry_after=problem.retry_after,
+    )
+
+
+def _details(problem: Problem) -> list[AnyMessage]:
+    reason = problem.kind.upper().replace("-", "_")
+    details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
+    if problem.retry_after is not None:
+        delay = Duration()
+        delay.FromMilliseconds(int(problem.retry_after * 1000))
+        details.append(RetryInfo(retry_delay=delay))
+    if problem.field:
+        violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
+        details.append(BadRequest(field_violations=[violation]))
+    packed = [AnyMessage() for _ in details]
+    for envelope, detail in zip(packed, details, strict=True):
+        envelope.Pack(detail)
+    return packed
 
 
 # Streams: requests of one at work side by side, answered in their order
-
-
-class _Ahead(NamedTuple):
-    """A request of the stream that is not answered yet."""
-
-    request_id: bytes
-    work: asyncio.Task[bytes | Problem]
 
 
 async def answer_stream(service: GraspService, stream: Call, context: Any) -> AsyncIterator[bytes]:
@@ -356,33 +373,30 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
         NotReady: The server is stopping; what was read is answered before.
         InvalidRequest: A message is no DetectGraspsStreamRequest.
     """
-    ahead: deque[_Ahead] = deque()
+    ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
     stopping = asyncio.create_task(service.stopping.wait())
     reading: asyncio.Task[Any] | None = asyncio.create_task(_next_envelope(context))
     try:
         while reading or ahead:
+            waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
             if reading and len(ahead) < service.settings.max_stream_requests:
-                waiting = {reading, stopping} | ({ahead[0].work} if ahead else set())
-            else:
-                waiting = {ahead[0].work}
+                waiting |= {reading, stopping}
             await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            if ahead and ahead[0].work.done():
-                request_id, work = ahead.popleft()
-                yield _response(request_id, work.result())
+            if ahead and ahead[0].done():
+                yield ahead.popleft().result()
             elif reading and reading.done():
                 request = reading.result()
                 if request is not None:
-                    work = asyncio.create_task(_answer(service, stream, request))
-                    ahead.append(_Ahead(request.request_id, work))
+                    ahead.append(asyncio.create_task(_answer(service, stream, request)))
                 last = request is None or stopping.done()
                 reading = None if last else asyncio.create_task(_next_envelope(context))
-            elif stopping.done() and reading:
+            elif reading:  # the server is stopping
                 reading.cancel()
                 reading = None
         if stopping.done():
             raise NotReady(STOPPING)
     finally:
-        for task in (stopping, reading, *(request.work for request in ahead)):
+        for task in (stopping, reading, *ahead):
             if task is not None:
                 task.cancel()
 
@@ -396,29 +410,46 @@ async def _next_envelope(context: Any) -> Any:
         envelope = _RequestEnvelope.FromString(data)
         envelope.request_id.decode()
     except (DecodeError, UnicodeDecodeError):
-        value = f"{len(data)} bytes that are no message of this method"
-        fix = "Send a message as the .proto file has it."
-        raise InvalidRequest("request", value, fix) from None
+        raise _no_message(data) from None
     return envelope
 
 
-async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes | Problem:
-    """A serialized DetectGraspsResponse, or why there is none."""
+async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes:
+    """A serialized DetectGraspsStreamResponse."""
+    request_id: str = envelope.request_id.decode()
+    call = Call(
+        "grpc", stream.method, request_id, stream.peer, stream.token,
+        traceparent=stream.traceparent, in_stream=True,
+    )  # fmt: skip
+    body: bytes = envelope.request
+    detection = b""
+
+    async def read() -> bytes:
+        return body
+
+    async def write(answer: Answer) -> None:
+        nonlocal detection
+        detection = answer.body
+
     try:
-        with service.stream_call(stream, envelope.request_id.decode()) as call:
+        with service.observe(call):
             _check(envelope)
             if envelope.HasField("timeout"):
                 call.limit(envelope.timeout)
-            body: bytes = envelope.request
-            service.check_size(len(body))
-            async with service.admit(call, len(body)) as ticket:
-                answer = await service.answer(call, ticket, "DetectGrasps", body)
-            return answer.error or answer.body
-    except EdgeGraspError as error:
-        return report(error)
+            await service.answer(
+                call, Job("DetectGrasps", "grpc", b"", 0.0), len(body), read, write
+            )
     except Exception as error:
-        logger.exception("a request of a stream failed")
-        return report(error)
+        if not isinstance(error, EdgeGraspError):
+            logger.exception("a request of a stream failed")
+    response = _ResponseEnvelope(request_id=envelope.request_id)
+    if (problem := call.problem) is None:
+        response.detection = detection
+    else:
+        number, detail = grpc.StatusCode[problem.code].value[0], _error_detail(problem)
+        told = grasp_pb2.StreamError(code=number, message=problem.detail, detail=detail)
+        response.error = told.SerializeToString()
+    return _serialized(response)
 
 
 def _check(envelope: Any) -> None:
@@ -430,18 +461,6 @@ def _check(envelope: Any) -> None:
     if envelope.ByteSize() != size:
         fix = "Send the fields of this server's .proto file only."
         raise InvalidRequest("request", "a field that this server does not know", fix)
-
-
-def _response(request_id: bytes, answer: bytes | Problem) -> bytes:
-    if isinstance(answer, bytes):
-        envelope = _ResponseEnvelope(request_id=request_id, detection=answer)
-    else:
-        number = grpc.StatusCode[answer.code].value[0]
-        detail = error_detail(answer)
-        error = grasp_pb2.StreamError(code=number, message=answer.detail, detail=detail)
-        envelope = _ResponseEnvelope(request_id=request_id, error=error.SerializeToString())
-    data: bytes = envelope.SerializeToString()
-    return data
 
 
 def _envelope(name: str, **fields: int) -> Any:

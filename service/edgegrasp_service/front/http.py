@@ -12,12 +12,12 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from edgegrasp.v1.grasp_pb2 import Model
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
-from edgegrasp_service.call import REQUEST_ID_HEADER, Call, current_call
-from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
-from edgegrasp_service.front.problems import problem_response
+from edgegrasp_service.errors import STATUS, Cancelled, Problem, UnsupportedMediaType, report
+from edgegrasp_service.front.http_protocol import problem_document
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import Metrics
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
 from edgegrasp_service.schemas import (
     TIMEOUT,
     DetectionBody,
@@ -28,10 +28,10 @@ from edgegrasp_service.schemas import (
     openapi_detect,
     openapi_score,
 )
-from edgegrasp_service.worker.job import Answer, Method
+from edgegrasp_service.worker.job import Answer, Job, Method
 
 ASSETS = "/docs/assets"
-PIECE = 2**18  # bytes of an answer given to the connection at a time
+CHALLENGE = 'Bearer realm="edgegrasp"'
 
 # Values of the label `method`: the gRPC method's name where there is one.
 METHODS = {
@@ -48,7 +48,6 @@ METHODS = {
 }
 # Without a token: whoever restarts a server need not know one, and the pages tell no secret.
 OPEN = ("Live", "Ready", "Docs")
-UNANSWERED = "499"  # the caller went away; as nginx logs it
 
 DESCRIPTION = """Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
 
@@ -57,22 +56,6 @@ Metres, radians, seconds. Positions and directions are in the frame of the cloud
 the field, the value received and the fix."""
 
 PROBLEM = {"content": {"application/problem+json": {"schema": ProblemBody.model_json_schema()}}}
-PROBLEMS = {
-    400: "The cloud or an option is wrong.",
-    401: "No token, or none that the server knows.",
-    403: "A token for detection, or a server without admin tokens.",
-    404: "No weights of that name.",
-    408: "The body arrives too slowly.",
-    409: "New weights cannot be used; the old ones still serve.",
-    413: "Over the server's limits.",
-    415: "A body the server does not read.",
-    429: "The server is full; Retry-After says for how long.",
-    431: "Headers over the server's limits.",
-    500: "The server failed; its log says why.",
-    501: "The format's reader is not installed on the server.",
-    503: "Weights are loading, the server is stopping, or the worker of the request died.",
-    504: "The deadline passed before there was an answer.",
-}
 OF_REQUESTS = (400, 401, 404, 408, 413, 415, 429, 431, 500, 501, 503, 504)
 
 
@@ -93,7 +76,6 @@ class HttpMiddleware:
         peer = scope["client"][0] if scope["client"] else ""
         whole = headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
         with self._service.call("http", method, headers, peer) as call:
-            call.code = UNANSWERED
 
             async def receive_noting() -> Message:
                 nonlocal whole
@@ -114,8 +96,7 @@ class HttpMiddleware:
             try:
                 self._check(scope, call, headers)
             except EdgeGraspError as error:
-                call.problem = report(error)
-                await problem_response(call.problem)(scope, receive, send_named)
+                await _problem_response(call, report(error))(scope, receive, send_named)
                 return
             if scope["method"] == "HEAD":  # the protocol leaves the body out
                 scope = {**scope, "method": "GET"}
@@ -180,7 +161,7 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         responses=_problems(401, 503),
     )
     async def list_models() -> JSONResponse:
-        return JSONResponse({"models": [vars(model) for model in service.models()]})
+        return _models_response(service.models())
 
     @app.post(
         "/v1/models:reload",
@@ -189,8 +170,7 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         responses=_problems(401, 403, 409, 503),
     )
     async def reload() -> JSONResponse:
-        models = await reloader.reload(current_call())
-        return JSONResponse({"models": [vars(model) for model in models]})
+        return _models_response(await reloader.reload(current_call()))
 
     @app.get("/health/live", summary="Does the process answer?", response_model=HealthBody)
     async def live() -> JSONResponse:
@@ -219,58 +199,61 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
 
 
 def _problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    return {status: {"description": PROBLEMS[status], **PROBLEM} for status in statuses}
+    """Documentation of answers: what each error of a status means."""
+    meanings: dict[int, list[str]] = {}
+    for kind, (_, status) in STATUS.items():
+        meanings.setdefault(status, []).append((kind.__doc__ or "").partition("\n")[0])
+    return {status: {"description": " ".join(meanings[status]), **PROBLEM} for status in statuses}
 
 
 class _GraspResponse(Response):
-    """Takes a ticket, receives the request, has it answered, and sends the answer."""
+    """Receives a request once there is room for it, has it answered, and sends the answer."""
 
     def __init__(self, service: GraspService, method: Method) -> None:
         super().__init__()
         self._service = service
         self._method = method
-        self._sending = False
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; raises the errors of `GraspService`."""
-        service, call = self._service, current_call()
-        headers = Headers(scope=scope)
+        service, call, headers = self._service, current_call(), Headers(scope=scope)
         call.limit(_timeout(headers))
-        most = service.settings.max_body_bytes
-        size = int(headers.get("content-length", most))
-        service.check_size(size)
+        size = int(headers.get("content-length", service.settings.max_body_bytes))
+        content_type, query = headers.get("content-type", ""), scope["query_string"]
+        job = Job(self._method, "http", b"", 0.0, content_type, query.decode("latin-1"))
+
+        async def write(answer: Answer) -> None:
+            if answer.error is not None:
+                response = _problem_response(call, answer.error)
+            else:
+                response = Response(answer.body, media_type="application/json")
+            start = {"type": "http.response.start", "status": response.status_code}
+            await send({**start, "headers": response.raw_headers})
+            await send({"type": "http.response.body", "body": response.body, "more_body": True})
+            await send({"type": "http.response.body"})  # once the client has taken most of it
+
         try:
-            async with service.admit(call, size) as ticket:
-                body = await self._receive_body(receive)
-                content_type = headers.get("content-type", "")
-                query = scope["query_string"].decode("latin-1")
-                work = service.answer(call, ticket, self._method, body, content_type, query)
-                del body  # the job has it until a worker has
-                answer = await _unless_gone(receive, work)
-                if answer.error is None:
-                    response = Response(answer.body, media_type="application/json")
-                else:
-                    response = _problem(call, answer.error)
-                await self._send(response, send)
-                call.end_stage("write")
-        except EdgeGraspError:
-            if not self._sending:
+            await service.answer(
+                call,
+                job,
+                size,
+                lambda: self._receive_body(receive),
+                write,
+                lambda work: _unless_gone(receive, work),
+            )
+        except EdgeGraspError as error:
+            if not call.code:
                 raise
-            call.code = UNANSWERED
+            call.problem, call.code = report(error), ""
             scope["state"]["abort"]()  # half an answer is none
             await _gone(receive)
 
     async def _receive_body(self, receive: Receive) -> bytes:
-        """The body; raises RequestTimeout where it arrives too slowly."""
         pieces: list[bytes] = []
         received, more = 0, True
         start = asyncio.get_running_loop().time()
         while more:
-            try:
-                async with asyncio.timeout_at(start + self._service.time_to_read(received)):
-                    message = await receive()
-            except TimeoutError:
-                raise self._service.too_slow(received) from None
+            message = await self._service.receive(receive(), received, start)
             if message["type"] == "http.disconnect":
                 raise Cancelled("The client left before its request was whole.")
             pieces.append(message.get("body", b""))
@@ -278,21 +261,6 @@ class _GraspResponse(Response):
             self._service.check_size(received)
             more = message.get("more_body", False)
         return b"".join(pieces)
-
-    async def _send(self, response: Response, send: Send) -> None:
-        """Send an answer in pieces; raises Cancelled where the client does not take them."""
-        body = bytes(response.body)
-        start = {"type": "http.response.start", "status": response.status_code}
-        self._sending = True
-        try:
-            async with asyncio.timeout(self._service.time_to_write(len(body))):
-                await send({**start, "headers": response.raw_headers})
-                for begin in range(0, len(body), PIECE):
-                    piece = body[begin : begin + PIECE]
-                    await send({"type": "http.response.body", "body": piece, "more_body": True})
-                await send({"type": "http.response.body"})
-        except TimeoutError:
-            raise Cancelled(f"The client did not take {len(body)} bytes.") from None
 
 
 async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> Answer:
@@ -329,19 +297,33 @@ def _timeout(headers: Headers) -> float:
     return timeout
 
 
-def _problem(call: Call, problem: Problem) -> Response:
+def _models_response(models: list[Model]) -> JSONResponse:
+    names = [field.name for field in Model.DESCRIPTOR.fields]
+    facts = [{name: getattr(model, name) for name in names} for model in models]
+    return JSONResponse({"models": facts})
+
+
+def _problem_response(call: Call, problem: Problem) -> Response:
+    """The answer that tells of an error."""
     call.problem = problem
-    return problem_response(problem)
+    headers = {}
+    if problem.retry_after is not None:
+        headers["retry-after"] = str(math.ceil(problem.retry_after))
+    if problem.status == 401:
+        headers["www-authenticate"] = CHALLENGE
+    document = problem_document(problem)
+    return Response(document, problem.status, headers, "application/problem+json")
 
 
 async def _answer_error(request: Request, error: Exception) -> Response:
-    return _problem(current_call(), report(error))
+    return _problem_response(current_call(), report(error))
 
 
 async def _answer_http_error(request: Request, error: Exception) -> Response:
     """Errors of the routing itself: no such path, no such method."""
     assert isinstance(error, HTTPException)
     detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
-    response = problem_response(Problem("http", detail, "", "", "", "", error.status_code))
+    problem = Problem("http", detail, "", "", "", "", error.status_code)
+    response = _problem_response(current_call(), problem)
     response.headers.update(error.headers or {})
     return response

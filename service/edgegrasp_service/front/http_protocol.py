@@ -4,14 +4,15 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
+import orjson
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_service.errors import HeadersTooLarge, Overloaded, RequestTimeout, report
-from edgegrasp_service.front.problems import problem_document
+from edgegrasp_service.errors import HeadersTooLarge, Overloaded, Problem, RequestTimeout, report
+from edgegrasp_service.schemas import KIND_PREFIX
 from edgegrasp_service.settings import Settings
 
-LINGER_SECONDS = 2.0  # for a client that still sends to read why it was refused
+LINGER_SECONDS = 5.0  # for a client to take what is not sent yet, though it may still send
 MANY_PIECES, SMALL_PIECE = 1024, 16  # so many chunks of so few bytes are no body of a cloud
 
 
@@ -119,7 +120,6 @@ class HttpProtocol(HttpToolsProtocol):
             self._header_timer = self.loop.call_later(seconds, self._headers_late)
 
     def _headers_late(self) -> None:
-        self._header_timer = None
         if not self.transport.is_closing():
             value = f"not whole in {self._settings.read_seconds:g} s"
             self._refuse(RequestTimeout("headers", value, "Send them at once."))
@@ -162,16 +162,20 @@ class _GentleTransport:
             self._transport.resume_reading()
         else:
             self._transport.close()
-        self._abort_soon(self._transport.get_write_buffer_size())
+        asyncio.get_running_loop().call_later(LINGER_SECONDS, self._transport.abort)
 
-    def _abort_soon(self, unsent: int) -> None:
-        """Abort unless more is taken of what is not sent yet."""
 
-        def look() -> None:
-            left = self._transport.get_write_buffer_size()
-            if 0 < left < unsent:
-                self._abort_soon(left)
-            else:
-                self._transport.abort()
-
-        asyncio.get_running_loop().call_later(LINGER_SECONDS, look)
+def problem_document(problem: Problem) -> bytes:
+    """An error as a problem document (RFC 9457)."""
+    return orjson.dumps(
+        {
+            "type": KIND_PREFIX + problem.kind,
+            "title": problem.kind.replace("-", " ").capitalize(),
+            "status": problem.status,
+            "detail": problem.detail,
+            "field": problem.field,
+            "value": problem.value,
+            "fix": problem.fix,
+            "retry_after": problem.retry_after,
+        }
+    )

@@ -4,13 +4,15 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, TypeVar
 
+from edgegrasp.v1.grasp_pb2 import Model
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.call import CALL, REQUEST_ID_HEADER, Call
 from edgegrasp_service.errors import (
+    STOPPING,
     Cancelled,
     HeadersTooLarge,
     NotReady,
@@ -20,36 +22,21 @@ from edgegrasp_service.errors import (
     RequestTimeout,
     report,
 )
-from edgegrasp_service.front.admission import Admission, Ticket
-from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens
+from edgegrasp_service.front.admission import Admission
+from edgegrasp_service.observability import CALL, REQUEST_ID_HEADER, Call
+from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job, Method, Transport
+from edgegrasp_service.worker.job import Answer, Job, Transport
 from edgegrasp_service.worker.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
 
-STOPPING = "The server is stopping. Try another one."
-GIVEN_UP = "The server stopped before there was an answer. Try another one."
 MAX_HEADERS = 64
 
+T = TypeVar("T")
+
 Observer = Callable[[Call], None]
-Recorder = Callable[[Call, Job, Answer], None]
-
-
-@dataclass(frozen=True)
-class ModelInfo:
-    """Loaded weights; the fields of edgegrasp.v1.Model."""
-
-    name: str
-    architecture: str = ""
-    digest: str = ""
-    parameters: int = 0
-    crop_radius: float = 0.0  # metres
-    voxel_size: float = 0.0  # metres
-    gripper: str = ""
-    default: bool = False
-    hand_description: bool = False
-    device: str = ""
+Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
@@ -90,14 +77,10 @@ class GraspService:
         """Whether requests are answered."""
         return bool(self.pool.models) and not self.stopping.is_set()
 
-    def models(self) -> list[ModelInfo]:
+    def models(self) -> list[Model]:
         """The weights a request can name; raises NotReady."""
         self.check_ready()
-        known = ModelInfo.__dataclass_fields__
-        return [
-            ModelInfo(**{name: value for name, value in facts.items() if name in known})
-            for facts in self.pool.models
-        ]
+        return [Model(**facts) for facts in self.pool.models]
 
     def check_ready(self) -> None:
         """Raise NotReady while weights are loading, and when the server is stopping."""
@@ -119,17 +102,32 @@ class GraspService:
             peer: Its address.
 
         Yields:
-            The call; the transport sets its `code`.
+            The call; of HTTP the transport sets the `code`.
         """
         call = Call(transport, method, headers.get(REQUEST_ID_HEADER, ""), peer)
         call.traceparent = headers.get("traceparent", "")
+        with self.observe(call):
+            yield call
+
+    @contextmanager
+    def observe(self, call: Call) -> Iterator[None]:
+        """As `call`, for one that has a name, such as a request of a stream."""
         CALL.set(call)
         self.in_flight += 1
         try:
-            yield call
+            yield
+        except Exception as error:
+            call.problem = call.problem or report(error)
+            raise
+        except BaseException:
+            call.problem = call.problem or report(Cancelled("The caller cancelled the request."))
+            raise
         finally:
             self.in_flight -= 1
-            self._ended(call)
+            call.end()
+            loop = asyncio.get_running_loop()
+            for observer in self._observers:
+                loop.call_soon(observer, call)  # once the answer is on its way
 
     def authorize(self, call: Call, authorization: str | None) -> None:
         """Check the token of a call; raises Unauthenticated or PermissionDenied."""
@@ -137,120 +135,108 @@ class GraspService:
         if known is not None:
             call.token, call.is_admin = known.name, known.is_admin
 
-    @asynccontextmanager
-    async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
-        """A place in the server, taken before the body of a request is read.
+    async def answer(
+        self,
+        call: Call,
+        job: Job,
+        size: int,
+        read: Callable[[], Awaitable[bytes]],
+        write: Callable[[Answer], Awaitable[None]],
+        wait: Callable[[Coroutine[Any, Any, Answer]], Awaitable[Answer]] | None = None,
+    ) -> None:
+        """Admit a request, read its body, have a worker answer it, and send the answer.
 
         Args:
-            call: The request; the ticket ends with its deadline.
-            size: Bytes that its body may have.
+            call: The request; all of it ends with its deadline.
+            job: What a worker is to do, without the body.
+            size: Bytes that the body may have.
+            read: Gives the body, once there is room for it.
+            write: Sends the answer, which may be an error.
+            wait: Waits for the answer, and ends the work where it raises; None: just wait.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
             Overloaded: There is no place, or its turn would come too late.
+            PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
+            WorkerLost: The worker died.
+            Cancelled: The client does not take its answer.
         """
         self.check_ready()
+        self.check_size(size)
         call.limit(self.settings.max_request_seconds)
-        try:
-            async with self.admission.admit(call.client, call.deadline, size) as ticket:
-                call.end_stage("admission")
-                yield ticket
-        except Exception as error:
-            call.problem = call.problem or report(error)  # gRPC aborts with an error of its own
-            raise
-        except BaseException:
-            call.problem = report(Cancelled("The caller cancelled the request."))
-            raise
+        async with self.admission.admit(call.client, call.deadline, size) as ticket:
+            call.end_stage("admission")
+            job = replace(job, body=await read(), request_id=call.request_id)
+            self.check_size(len(job.body))
+            call.end_stage("read")
+            call.bytes_in = len(job.body)
+            self.admission.resize(ticket, call.bytes_in)
+            began = 0.0
 
-    async def answer(
-        self,
-        call: Call,
-        ticket: Ticket,
-        method: Method,
-        body: bytes,
-        content_type: str = "",
-        query: str = "",
-    ) -> Answer:
-        """Have a worker answer a request whose body is there.
+            def begun() -> None:
+                nonlocal began
+                call.end_stage("wait")
+                began = time.monotonic()
+                ticket.at_work = True
 
-        Raises:
-            WorkerLost: The worker died.
-        """
-        call.end_stage("read")
-        call.bytes_in = len(body)
-        self.admission.resize(ticket, len(body))
-        job = Job(method, call.transport, body, 0.0, content_type, query, call.request_id)
-        began = 0.0
+            try:
+                work = self.pool.run(job, call.deadline, begun)
+                answer = await (wait(work) if wait else work)
+            finally:
+                if began:
+                    self.admission.worked(time.monotonic() - began)
+                ticket.at_work = False
+            call.facts, call.problem = answer.facts, answer.error
+            call.stages |= answer.facts.seconds
+            call.bytes_out = len(answer.body)
+            self.admission.resize(ticket, call.bytes_out)
+            if self._record is not None:
+                self._record(job, answer)
+            del job
+            await self.send(write(answer), call.bytes_out)
+            call.end_stage("write")
 
-        def begun() -> None:
-            nonlocal began
-            call.end_stage("wait")
-            began = time.monotonic()
-            ticket.at_work = True
-
-        try:
-            answer = await self.pool.run(job, call.deadline, begun)
-        finally:
-            if began:
-                self.admission.worked(time.monotonic() - began)
-            ticket.at_work = False
-        call.facts, call.problem = answer.facts, answer.error
-        call.bytes_out = len(answer.body)
-        call.stages |= answer.facts.seconds
-        self.admission.resize(ticket, len(answer.body))
-        if self._record is not None:
-            self._record(call, job, answer)
-        return answer
-
-    @contextmanager
-    def stream_call(self, stream: Call, request_id: str) -> Iterator[Call]:
-        """One request of a stream."""
-        call = Call(
-            stream.transport, stream.method, request_id, stream.peer, stream.token, in_stream=True
-        )
-        call.traceparent = stream.traceparent
-        CALL.set(call)
-        try:
-            yield call
-        except Exception as error:
-            call.problem = report(error)
-            raise
-        except BaseException:
-            call.problem = report(Cancelled("The caller cancelled the request."))
-            raise
-        finally:
-            call.code = "OK" if call.problem is None else call.problem.code
-            self._ended(call)
-
-    async def drain(self, grace: float) -> bool:
-        """Refuse new requests, and wait until those accepted are answered.
-
-        Args:
-            grace: Seconds to wait at most; then they are given up.
-
-        Returns:
-            Whether every one of them was answered.
-        """
+    async def drain(self, grace: float) -> None:
+        """Refuse new requests, and wait for those accepted; after `grace` seconds give them up."""
         self.stopping.set()
         try:
             async with asyncio.timeout(grace):
                 await self.admission.empty()
         except TimeoutError:
-            self.admission.refuse_all(NotReady(GIVEN_UP))
+            logger.warning("grace is over: requests in flight are given up")
+            gone = "The server stopped before there was an answer. Try another one."
+            self.admission.refuse_all(NotReady(gone))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):  # to be told
                     await self.admission.empty()
-            return False
-        return True
 
-    def time_to_read(self, received: int) -> float:
-        """Seconds after which so many bytes are too few."""
-        return self.settings.read_seconds + received / self.settings.min_bytes_per_second
+    async def receive(self, part: Awaitable[T], received: int = 0, start: float = 0.0) -> T:
+        """The next part of a body; raises RequestTimeout where it arrives too slowly.
 
-    def time_to_write(self, size: int) -> float:
-        """Seconds in which an answer of so many bytes must be taken."""
-        return self.settings.write_seconds + size / self.settings.min_bytes_per_second
+        Args:
+            part: Reads it.
+            received: Bytes that came before.
+            start: When the body began, by the clock of the event loop; 0: now.
+        """
+        slowest = self.settings.min_bytes_per_second
+        seconds = self.settings.read_seconds + received / slowest
+        try:
+            async with asyncio.timeout_at((start or time.monotonic()) + seconds):
+                return await part
+        except TimeoutError:
+            fix = f"Send at least {slowest} bytes a second."
+            value = f"{received} bytes in {seconds:.0f} s"
+            raise RequestTimeout("body", value, fix) from None
+
+    async def send(self, sending: Awaitable[None], size: int) -> None:
+        """Wait until so many bytes are taken; raises Cancelled where that takes too long."""
+        seconds = self.settings.write_seconds + size / self.settings.min_bytes_per_second
+        try:
+            async with asyncio.timeout(seconds):
+                await sending
+        except TimeoutError:
+            raise Cancelled(f"The client did not take {size} bytes.") from None
 
     def check_size(self, size: int) -> None:
         """Raise PayloadTooLarge for a body over the limit."""
@@ -259,46 +245,27 @@ class GraspService:
             fix = f"Send at most {most} bytes, e.g. float32 points or a downsampled cloud."
             raise PayloadTooLarge("body", f"{size} bytes", fix)
 
-    def too_slow(self, received: int) -> RequestTimeout:
-        """The error for a body of which only so much came in time."""
-        value = f"{received} bytes in {self.time_to_read(received):.0f} s"
-        fix = f"Send at least {self.settings.min_bytes_per_second} bytes a second."
-        return RequestTimeout("body", value, fix)
-
-    def _ended(self, call: Call) -> None:
-        call.seconds = time.monotonic() - call.start
-        loop = asyncio.get_running_loop()
-        for observer in self._observers:
-            loop.call_soon(observer, call)  # once the answer is on its way
-
 
 class Reloader:
-    """Reloads one server, one reload after the other.
+    """Reloads weights, tokens and certificates of one server; the old ones serve meanwhile.
 
     Args:
-        service: Whose weights and tokens are loaded beside the old ones, which serve meanwhile.
-        read_tokens: Reads them.
+        service: Whose weights and tokens are replaced.
         tls: Whose certificates are read anew; None: there are none.
         reloaded: Told of each reload whether it succeeded.
     """
 
     def __init__(
-        self,
-        service: GraspService,
-        read_tokens: Callable[[], Tokens],
-        tls: ServerTls | None,
-        reloaded: Callable[[bool], None],
+        self, service: GraspService, tls: ServerTls | None, reloaded: Callable[[bool], None]
     ) -> None:
         self._service = service
-        self._read_tokens = read_tokens
         self._tls = tls
         self._reloaded = reloaded
-        self._turn = asyncio.Lock()
-        self._waiting = False
+        self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def reload(self, call: Call) -> list[ModelInfo]:
-        """Load weights, tokens and certificates anew, for a caller with an admin token.
+    async def reload(self, call: Call) -> list[Model]:
+        """Load anew for a caller with an admin token.
 
         Returns:
             What is loaded now.
@@ -306,11 +273,11 @@ class Reloader:
         Raises:
             PermissionDenied: The caller has none.
             NotReady: The first weights are still loading, or the server is stopping.
-            ReloadFailed: Something cannot be used, and all is as before; or a reload waits already.
+            ReloadFailed: Something cannot be used, and all is as before; or a reload is under way.
         """
         if not call.is_admin:
             raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
-        return await self._in_turn()
+        return await self._reload()
 
     def reload_soon(self) -> None:
         """Begin a reload in the running event loop; what comes of it is in the log."""
@@ -320,45 +287,34 @@ class Reloader:
 
     async def _reload_quietly(self) -> None:
         try:
-            await self._in_turn()
+            await self._reload()
         except EdgeGraspError as error:
             logger.warning("SIGHUP: %s", error)
 
-    async def _in_turn(self) -> list[ModelInfo]:
-        self._service.check_ready()
-        if self._waiting:
-            raise ReloadFailed("A reload waits for another one already. Try again later.")
-        self._waiting = self._turn.locked()
-        try:
-            await self._turn.acquire()
-        finally:
-            self._waiting = False
-        try:
-            return await self._reload()
-        finally:
-            self._turn.release()
-
-    async def _reload(self) -> list[ModelInfo]:
-        try:
-            tokens = self._read_tokens()
-            certificates = None if self._tls is None else self._tls.read()
-            await self._service.pool.reload()
-        except EdgeGraspError as error:
-            self._reloaded(False)
-            logger.error("reload failed, the old weights still serve: %s", error)
-            raise ReloadFailed(f"The old weights still serve. {error}") from None
-        except Exception:
-            self._reloaded(False)
-            logger.exception("reload failed, the old weights still serve")
-            raise ReloadFailed("The old weights still serve; the log says why.") from None
-        self._service.tokens = tokens
-        if self._tls is not None and certificates is not None:
-            self._tls.use(certificates)
-        self._reloaded(True)
-        models = self._service.models()
-        digests = {model.name: model.digest for model in models}
-        logger.info("reloaded", extra={"fields": {"digests": digests}})
-        return models
+    async def _reload(self) -> list[Model]:
+        service = self._service
+        service.check_ready()
+        if self._lock.locked():
+            raise ReloadFailed("A reload is under way already. Try again later.")
+        async with self._lock:
+            try:
+                tokens = load_tokens(service.settings)
+                certificates = None if self._tls is None else self._tls.read()
+                await service.pool.start()
+            except Exception as error:
+                self._reloaded(False)
+                known = isinstance(error, EdgeGraspError)
+                logger.error("reload failed: %s", error, exc_info=not known)
+                why = error if known else "The log says why."
+                raise ReloadFailed(f"The old weights still serve. {why}") from None
+            service.tokens = tokens
+            if self._tls is not None and certificates is not None:
+                self._tls.use(certificates)
+            self._reloaded(True)
+            models = service.models()
+            digests = {model.name: model.digest for model in models}
+            logger.info("reloaded", extra={"fields": {"digests": digests}})
+            return models
 
 
 def check_headers(kind: str, count: int, size: int = 0, most: int = 0) -> None:

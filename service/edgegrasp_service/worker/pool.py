@@ -9,8 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,9 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import SECRETS, Settings
 from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.pipe import (
+from edgegrasp_service.worker.process import (
     HEADER,
     LOST,
-    Failed,
     Ready,
     Start,
     pack,
@@ -69,8 +67,8 @@ class WorkerPool:
         self.size = worker_count(settings)
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
-        self._idle: list[_Worker] = []  # the last one in is the first one out: its caches are warm
-        self._waiting: deque[asyncio.Future[_Worker]] = deque()
+        # The last one in is the first one out: its caches are warm.
+        self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closed = False
 
@@ -94,7 +92,7 @@ class WorkerPool:
         return pages * resource.getpagesize()
 
     async def start(self) -> None:
-        """Load, and start the workers.
+        """Load, and start the workers; those of a start before end when they have answered.
 
         Raises:
             EdgeGraspError: Weights cannot be used.
@@ -109,9 +107,11 @@ class WorkerPool:
                 worker.close()
             raise
         old_nursery, old_workers = self._nursery, self._workers
-        self._nursery, self._workers, self._idle = nursery, set(workers), []
+        self._nursery, self._workers = nursery, set(workers)
+        while not self._idle.empty():
+            self._idle.get_nowait()
         self.models = workers[0].models
-        nursery.watch(lambda: self._spawn(self._renew(nursery)))
+        nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._free(worker)
         if old_nursery is not None:
@@ -119,10 +119,6 @@ class WorkerPool:
         for worker in old_workers:
             if worker.answer is None:  # the others finish what they have begun
                 worker.close()
-
-    async def reload(self) -> None:
-        """Load anew; jobs that come after that meet what was loaded. Raises as `start`."""
-        await self.start()
 
     async def run(
         self, job: Job, deadline: float, begun: Callable[[], None] = lambda: None
@@ -161,64 +157,48 @@ class WorkerPool:
             self._nursery.close()
 
     async def _take(self) -> "_Worker":
-        if self._idle:
-            return self._idle.pop()
-        waiting: asyncio.Future[_Worker] = asyncio.get_running_loop().create_future()
-        self._waiting.append(waiting)
-        try:
-            return await waiting
-        except asyncio.CancelledError:
-            if waiting.done() and not waiting.cancelled():  # it was this one's turn just now
-                self._free(waiting.result())
-            raise
+        while True:
+            worker = await self._idle.get()
+            if worker in self._workers:  # and not dead
+                return worker
 
     def _free(self, worker: "_Worker") -> None:
         """A worker has nothing to do: the next job, or the end where there are newer ones."""
-        if worker not in self._workers:
+        if worker in self._workers:
+            self._idle.put_nowait(worker)
+        else:
             worker.close()
-            return
-        while self._waiting:
-            waiting = self._waiting.popleft()
-            if not waiting.done():
-                waiting.set_result(worker)
-                return
-        self._idle.append(worker)
 
     def _lost(self, worker: "_Worker") -> None:
         """A worker died: start another in its place."""
-        if worker in self._idle:
-            self._idle.remove(worker)
         if worker in self._workers and not self._closed:
             logger.warning("worker %d died and is replaced", worker.pid)
             self._workers.discard(worker)
             self._replaced()
-            self._spawn(self._replace(worker.nursery))
+            self._spawn(self._until_done(worker.nursery, lambda: self._replace(worker.nursery)))
 
     async def _replace(self, nursery: "_Nursery") -> None:
-        while nursery is self._nursery:
-            worker = _Worker(self, nursery)
-            try:
-                await worker.start()
-            except (EdgeGraspError, OSError) as error:
-                logger.error("a worker cannot be replaced yet: %s", error)
-                await asyncio.sleep(RETRY_SECONDS)
-            else:
-                if nursery is not self._nursery:
-                    worker.close()
-                    return
-                self._workers.add(worker)
-                self._free(worker)
-                return
+        worker = _Worker(self, nursery)
+        await worker.start()
+        if nursery is not self._nursery:
+            worker.close()
+            return
+        self._workers.add(worker)
+        self._free(worker)
 
-    async def _renew(self, lost: "_Nursery") -> None:
-        """The nursery died: start anew, while the workers that it left go on."""
-        logger.error("the process that workers fork from died; weights are loaded again")
-        while lost is self._nursery:
+    async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
+        """Start again what died of a nursery, until that succeeds or there is a newer nursery."""
+        while nursery is self._nursery:
             try:
-                await self.start()
+                return await start()
             except (EdgeGraspError, OSError) as error:
-                logger.error("weights cannot be loaded again yet: %s", error)
+                logger.error("what died cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
+
+    def _nursery_lost(self, nursery: "_Nursery") -> None:
+        """Load again, while the workers that it left go on."""
+        logger.error("the process that workers fork from died; weights are loaded again")
+        self._spawn(self._until_done(nursery, self.start))
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -249,14 +229,15 @@ class _Nursery:
         nursery = cls(process, control)
         try:
             send(control, Start(settings.model_dump(mode="json", exclude=set(SECRETS))))
-            answer = await _in_thread(lambda: receive(control))
+            answer = await asyncio.to_thread(receive, control.recv_into)
         except BaseException:
             nursery.close()
             raise
-        if not isinstance(answer, Ready):
+        if answer is None or answer.failure:
             nursery.close()
-            reason = answer.reason if answer else "the process that loads weights died"
-            raise InvalidSettings(reason)
+            raise InvalidSettings(
+                answer.failure if answer else "the process that loads weights died"
+            )
         control.setblocking(False)
         return nursery
 
@@ -288,10 +269,6 @@ class _Nursery:
         self._process.kill()
         self._process.wait()
         self._control.close()
-
-
-async def _in_thread(work: Callable[[], Any]) -> Any:
-    return await asyncio.get_running_loop().run_in_executor(None, work)
 
 
 class _Worker(asyncio.Protocol):
@@ -362,11 +339,11 @@ class _Worker(asyncio.Protocol):
         self._take(message)
 
     def _take(self, message: object) -> None:
-        if isinstance(message, Ready):
+        if isinstance(message, Ready) and message.failure:
+            self._ready.set_exception(InvalidSettings(message.failure))
+        elif isinstance(message, Ready):
             self.pid, self.models = message.pid, message.models
             self._ready.set_result(None)
-        elif isinstance(message, Failed):
-            self._ready.set_exception(InvalidSettings(message.reason))
         elif isinstance(message, Answer) and self.answer is not None:
             answer, self.answer = self.answer, None
             if self._killing is not None:
