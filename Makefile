@@ -47,7 +47,6 @@ fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect
 
 bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the README's table
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --readme README.md
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.curves
 
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
