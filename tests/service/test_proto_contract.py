@@ -139,32 +139,6 @@ def test_every_break_is_found(name: str) -> None:
     assert any(said in line for line in found), found
 
 
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        ([("ONE", 1)], "Kind.TWO is gone"),
-        ([("ONE", 1), ("TWO", 3)], "Kind.TWO = 2 is now 3"),
-        ([("ONE", 1), ("DOS", 2)], "Kind.TWO is gone"),
-        (None, "enum Kind is gone"),
-    ],
-)
-def test_enum_breaks_are_found(values: list[tuple[str, int]] | None, said: str) -> None:
-    """edgegrasp.v1 has no enum yet."""
-
-    def with_enum(names: list[tuple[str, int]] | None) -> File:
-        file = File()
-        file.CopyFrom(COMMITTED)
-        if names is not None:
-            enum = file.enum_type.add(name="Kind")
-            for name, number in names:
-                enum.value.add(name=name, number=number)
-        return file
-
-    old = with_enum([("ONE", 1), ("TWO", 2)])
-    assert contract.breaks(old, with_enum([("ONE", 1), ("TWO", 2), ("THREE", 3)])) == []
-    assert any(said in line for line in contract.breaks(old, with_enum(values)))
-
-
 def test_additions_are_no_breaks() -> None:
     more = File()
     more.CopyFrom(COMMITTED)
@@ -205,7 +179,3 @@ def test_style() -> None:
         for part in one.field:
             # T_cloud_hand names frames as the equations do.
             assert re.fullmatch(r"(T_)?[a-z][a-z0-9_]*", part.name), f"{one.name}.{part.name}"
-    for enum in file.enum_type:
-        prefix = re.sub(r"(?<!^)(?=[A-Z])", "_", enum.name).upper()
-        assert all(value.name.startswith(f"{prefix}_") for value in enum.value)
-        assert enum.value[0].name == f"{prefix}_UNSPECIFIED"
