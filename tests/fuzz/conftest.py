@@ -8,16 +8,25 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import hypothesis
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
+LONG, QUICK = "fuzz", settings(max_examples=25, deadline=None, derandomize=True)
 settings.register_profile(
-    "fuzz",
+    LONG,
     max_examples=1500,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
+
+
+def given(*strategies: Any, **named: Any) -> Callable[[Any], Any]:
+    """Hypothesis's own, with few examples, and always the same, where the profile is not `fuzz`."""
+    few = settings.get_current_profile_name() != LONG
+    return lambda test: (QUICK if few else settings())(hypothesis.given(*strategies, **named)(test))
+
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3)).astype(np.float32)
 

@@ -422,5 +422,3 @@ def test_bombs_in_files_are_refused_within_the_memory_of_the_body(name: str) -> 
     finally:
         tracemalloc.stop()
     assert peak < 2 * len(data) + 16 * MIB, f"{peak / MIB:.1f} MiB for {len(data) / MIB:.1f} MiB"
-
-
