@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from google.protobuf import descriptor_pb2
@@ -50,59 +51,45 @@ def change(path: str, **values: object) -> Callable[[File], None]:
     return apply
 
 
-def remove_field(file: File) -> None:
-    fields = message(file, "Grasp").field
-    fields.remove(field(file, "Grasp", "width"))
+def remove(parts: Callable[[File], Any], name: str) -> Callable[[File], None]:
+    def apply(file: File) -> None:
+        found = parts(file)
+        found.remove(next(part for part in found if part.name == name))
+
+    return apply
+
+
+def fields(file: File) -> Any:
+    return message(file, "Grasp").field
 
 
 def reuse_number(file: File) -> None:
-    remove_field(file)
-    message(file, "Grasp").field.add(name="opening", number=4, type=Field.TYPE_FLOAT, label=1)
+    remove(fields, "width")(file)
+    fields(file).add(name="opening", number=4, type=Field.TYPE_FLOAT, label=1)
 
 
 def leave_oneof(file: File) -> None:
     field(file, "DetectGraspsRequest", "encoded").ClearField("oneof_index")
 
 
-def rename_oneof(file: File) -> None:
-    message(file, "DetectGraspsRequest").oneof_decl[0].name = "source"
-
-
-def remove_message(file: File) -> None:
-    file.message_type.remove(message(file, "Cone"))
-
-
 def unreserve(file: File) -> None:
     del message(file, "DetectOptions").reserved_range[:]
 
 
-def remove_map_entry_field(file: File) -> None:
-    del message(file, "DetectGraspsResponse").nested_type[0].field[1]
+def set_in(part: Callable[[File], Any], **values: object) -> Callable[[File], None]:
+    def apply(file: File) -> None:
+        for name, value in values.items():
+            setattr(part(file), name, value)
+
+    return apply
 
 
-def remove_rpc(file: File) -> None:
-    methods = file.service[0].method
-    methods.remove(next(method for method in methods if method.name == "ScoreGrasps"))
-
-
-def remove_service(file: File) -> None:
-    del file.service[:]
-
-
-def other_answer(file: File) -> None:
-    file.service[0].method[0].output_type = ".edgegrasp.v1.ScoreGraspsResponse"
-
-
-def stream_answers(file: File) -> None:
-    file.service[0].method[0].server_streaming = True
-
-
-def rename_package(file: File) -> None:
-    file.package = "edgegrasp.v2"
+def first_method(file: File) -> Any:
+    return file.service[0].method[0]
 
 
 BREAKS = {
-    "field removed": (remove_field, "Grasp.width = 4 is gone"),
+    "field removed": (remove(fields, "width"), "Grasp.width = 4 is gone"),
     "number used again": (reuse_number, "Grasp.width = 4: name 'width' is now 'opening'"),
     "field renamed": (change("Grasp.width", name="opening"), "name 'width'"),
     "field renumbered": (change("Grasp.width", number=99), "Grasp.width = 4 is gone"),
@@ -117,15 +104,33 @@ BREAKS = {
         change("DetectOptions.seed", proto3_optional=False), "proto3_optional"
     ),
     "left its oneof": (leave_oneof, "oneof 'cloud' is now ''"),
-    "oneof renamed": (rename_oneof, "oneof 'cloud' is now 'source'"),
-    "message removed": (remove_message, "message Cone is gone"),
+    "oneof renamed": (
+        set_in(lambda file: message(file, "DetectGraspsRequest").oneof_decl[0], name="source"),
+        "oneof 'cloud' is now 'source'",
+    ),
+    "message removed": (remove(lambda file: file.message_type, "Cone"), "message Cone is gone"),
     "number no longer reserved": (unreserve, "10 to 10 is no longer reserved"),
-    "nested field removed": (remove_map_entry_field, "CountsEntry.value = 2 is gone"),
-    "rpc removed": (remove_rpc, "rpc GraspService.ScoreGrasps is gone"),
-    "service removed": (remove_service, "service GraspService is gone"),
-    "rpc answers otherwise": (other_answer, "output_type"),
-    "rpc streams": (stream_answers, "server_streaming False is now True"),
-    "package renamed": (rename_package, "package edgegrasp.v1 is now edgegrasp.v2"),
+    "nested field removed": (
+        remove(lambda file: message(file, "DetectGraspsResponse").nested_type[0].field, "value"),
+        "CountsEntry.value = 2 is gone",
+    ),
+    "rpc removed": (
+        remove(lambda file: file.service[0].method, "ScoreGrasps"),
+        "rpc GraspService.ScoreGrasps is gone",
+    ),
+    "service removed": (
+        remove(lambda file: file.service, "GraspService"), "service GraspService is gone"
+    ),
+    "rpc answers otherwise": (
+        set_in(first_method, output_type=".edgegrasp.v1.ScoreGraspsResponse"), "output_type"
+    ),
+    "rpc streams": (
+        set_in(first_method, server_streaming=True), "server_streaming False is now True"
+    ),
+    "package renamed": (
+        set_in(lambda file: file, package="edgegrasp.v2"),
+        "package edgegrasp.v1 is now edgegrasp.v2",
+    ),
 }  # fmt: skip
 
 
@@ -154,7 +159,7 @@ def test_a_break_is_not_written_into_the_contract(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken = contract.current()
-    remove_field(broken)
+    remove(fields, "width")(broken)
     monkeypatch.setattr(contract, "current", lambda: broken)
     monkeypatch.setattr("sys.argv", ["contract.py", str(tmp_path)])
     with pytest.raises(SystemExit, match=r"Grasp\.width = 4 is gone"):
