@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.schemas import GIVEN, PER_POINT
 from edgegrasp_service.worker.answer import Answerer
@@ -64,16 +64,6 @@ def test_lists(values: object, name: str) -> None:
     decode(size, points=POINTS.tobytes(), **{name: values})
 
 
-@given(changed(POINT_CLOUD2) | VALUES)
-def test_point_cloud2(fields: object) -> None:
-    decode(len(repr(fields)), point_cloud2=fields)
-
-
-@given(st.lists(changed(DEPTH_IMAGE) | changed(DEPTH_ROWS), min_size=1, max_size=2) | VALUES)
-def test_depth_images(images: object) -> None:
-    decode(len(repr(images)), depth_images=images)
-
-
 MESSAGES = [
     grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes(), options={"seed": 3, "top_k": 2}),
     grasp_pb2.DetectGraspsRequest(encoded={"format": "ply", "data": FILES["ply"][0]}),
@@ -101,11 +91,6 @@ OPTIONS = {
     "approach_direction": {"cones": [{"direction": [0, 0, -1], "max_angle": 1.0}]},
     "support": {"kind": "ransac", "distance": 0.01}, "suppression": None, "sampling": "uniform",
 }  # fmt: skip
-
-
-@given(changed(OPTIONS) | st.dictionaries(st.text(max_size=5), VALUES, max_size=3))
-def test_options(options: dict[str, object]) -> None:
-    decodes_or_refuses(lambda: parse_options(options), len(repr(options)), MAX_POINTS)
 
 
 FORM = b"".join(
@@ -156,6 +141,7 @@ def test_messages(content: bytes, scores: bool) -> None:
     st.sampled_from(sorted(DOCUMENTS)).flatmap(
         lambda name: changed({name: DOCUMENTS[name]} | BESIDE)
     )
+    | st.fixed_dictionaries({"depth_images": st.lists(changed(DEPTH_ROWS), max_size=2)})
     | st.fixed_dictionaries({"points": LISTS, "options": VALUES, "normals": LISTS, "edges": LISTS})
     | VALUES,
     st.booleans(),

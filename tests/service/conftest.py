@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
@@ -27,84 +26,6 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import ONE_THREAD
 
 PATIENCE = 20  # seconds; longer than anything takes
-
-
-@dataclass
-class Answer:
-    code: str  # gRPC status name, or HTTP status
-    body: Any = None
-    kind: str = ""
-    field: str = ""
-
-
-class RawGrpc:
-    """Sends what a careless client might, and shows what comes back."""
-
-    name = "grpc"
-
-    def __init__(self, address: str) -> None:
-        self.channel = grpc.insecure_channel(address, (("grpc.max_send_message_length", -1),))
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
-
-    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
-        encoded = grasp_pb2.EncodedCloud(format=file_format, data=data)
-        return self.request(encoded=encoded, options=grasp_pb2.DetectOptions(**options))
-
-    def request(self, **fields: Any) -> Answer:
-        try:
-            body = self._stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(**fields), timeout=20)
-        except grpc.RpcError as error:
-            trailers = dict(error.trailing_metadata())
-            detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
-            return Answer(error.code().name, None, detail.kind, detail.field)
-        return Answer("OK", body)
-
-    def close(self) -> None:
-        self.channel.close()
-
-
-class RawRest:
-    name = "rest"
-
-    def __init__(self, address: str) -> None:
-        self.http = httpx.Client(base_url=address, timeout=20)
-
-    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
-        headers = {"content-type": f"application/x-{file_format}"}
-        return self.post(content=data, headers=headers, params=options)
-
-    def post(self, path: str = "/v1/grasps", **request: Any) -> Answer:
-        response = self.http.post(path, **request)
-        body = response.json()
-        if response.is_success:
-            return Answer("200", body)
-        assert response.headers["content-type"] == "application/problem+json"
-        assert body["status"] == response.status_code
-        kind = body["type"].removeprefix("urn:edgegrasp:error:")
-        return Answer(str(response.status_code), None, kind, body["field"])
-
-    def close(self) -> None:
-        self.http.close()
-
-
-@pytest.fixture
-def raw_grpc(dummy_server) -> Iterator[RawGrpc]:
-    raw = RawGrpc(dummy_server.grpc_address)
-    yield raw
-    raw.close()
-
-
-@pytest.fixture
-def raw_rest(dummy_server) -> Iterator[RawRest]:
-    raw = RawRest(dummy_server.http_url)
-    yield raw
-    raw.close()
-
-
-@pytest.fixture(params=["grpc", "rest"])
-def raw(request: pytest.FixtureRequest) -> RawGrpc | RawRest:
-    found: RawGrpc | RawRest = request.getfixturevalue(f"raw_{request.param}")
-    return found
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Who is let in: bounds of requests and bytes, fairness between clients, and honest refusals."""
 
 import asyncio
-import io
 
 import grpc
 import httpx
@@ -10,9 +9,11 @@ import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
 from edgegrasp_service.front.admission import Admission, Ticket
 
+PATIENCE = 60
 FAR = 1000.0  # seconds
 
 
@@ -161,23 +162,22 @@ async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
         assert (await accepted).grasps
 
 
-async def test_turns_come_in_order(serve, connect, cloud) -> None:
+async def test_turns_come_in_order(serve, cloud) -> None:
     running = await serve()
-    client = connect(running)
+    client, answered, asked = running.connect("grpc"), [], []
     running.stages.shut("run")
-    answered: list[int] = []
 
     async def ask(number: int) -> None:
         assert (await client.detect(cloud)).fine
         answered.append(number)
 
-    asked = [asyncio.create_task(ask(0))]
-    await running.until(lambda: running.stages.begun["run"] == 1)
-    for number in (1, 2, 3):
+    for number in range(4):
         asked.append(asyncio.create_task(ask(number)))
         await running.until(lambda number=number: running.waiting == number)
+        await running.until(lambda: running.stages.begun["run"] == 1)
     running.stages.open("run")
     await asyncio.gather(*asked)
+    await client.close()
     assert answered == [0, 1, 2, 3]
 
 
@@ -198,13 +198,10 @@ async def test_requests_over_a_bound(serve, connect, is_error, cloud) -> None:
     assert refused.field == "body"
 
 
-def test_a_cloud_of_1280_by_720(raw) -> None:
+def test_a_cloud_of_1280_by_720(dummy_server, transport: str) -> None:
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (720, 1280, 3))
-    file = io.BytesIO()
-    np.save(file, points.astype(np.float64 if raw.name == "rest" else np.float32))
-    answer = raw.file("npy", file.getvalue())
-    counts = answer.body["counts"] if raw.name == "rest" else answer.body.counts
-    assert counts["points"] == 1280 * 720
+    with GraspClient(dummy_server.address(transport), timeout=PATIENCE) as client:
+        assert client.detect(points).counts["points"] == 1280 * 720
 
 
 async def test_http_connections_outlive_errors_but_not_refusals(serve, cloud) -> None:
