@@ -121,17 +121,6 @@ async def test_certificates_are_read_anew(
         assert await still.models()
 
 
-async def test_no_tls_older_than_1_2(serve, server_tls, pem) -> None:
-    server = (await serve(**server_tls)).server
-    context = ssl.create_default_context(cafile=pem["ca"])
-    context.maximum_version = ssl.TLSVersion.TLSv1_2
-    async with httpx.AsyncClient(verify=context) as http:
-        assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
-    loaded = load_tls(Settings(**server_tls))
-    assert loaded is not None
-    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
-
-
 @pytest.mark.parametrize(
     ("changed", "sentence"),
     [
@@ -139,33 +128,17 @@ async def test_no_tls_older_than_1_2(serve, server_tls, pem) -> None:
         ({"tls_key": "other_server_key"}, "They are no certificate with its key"),
         ({"tls_certificate": "text"}, "They are no certificate with its key"),
         ({"tls_client_ca": "text"}, "tls_client_ca: got"),
-        ({"tls_key": "encrypted"}, "nobody is there to ask"),
     ],
 )
 def test_bad_certificates_are_named(
     pem, server_tls, tmp_path: Path, changed: dict[str, str], sentence: str
 ) -> None:
     (tmp_path / "text").write_text("no certificate")
-    files = {**pem, "text": tmp_path / "text", "encrypted": encrypted(pem, tmp_path)}
+    files = {**pem, "text": tmp_path / "text"}
     given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
     with pytest.raises(InvalidSettings) as caught:
         load_tls(Settings(**given))
     assert sentence in str(caught.value)
-
-
-def encrypted(pem: dict[str, Path], folder: Path) -> Path:
-    from cryptography.hazmat.primitives import serialization
-
-    key = serialization.load_pem_private_key(pem["server_key"].read_bytes(), None)
-    path = folder / "encrypted.pem"
-    path.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.BestAvailableEncryption(b"word"),
-        )
-    )
-    return path
 
 
 async def test_tokens(serve, transport: str, cloud: np.ndarray, tmp_path: Path) -> None:
@@ -223,15 +196,14 @@ async def test_only_probes_are_open(serve) -> None:
             assert await call.code() == StatusCode.UNAUTHENTICATED
 
 
-@pytest.mark.parametrize("secure", ["plain", "tls", "client certificates"])
-async def test_the_containers_health_check(serve, server_tls, pem, secure: str) -> None:
-    given: dict[str, Any] = {} if secure == "plain" else dict(server_tls)
-    if secure == "client certificates":
-        given["tls_client_ca"] = pem["ca"]
+async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) -> None:
+    given = server_tls | {"tls_client_ca": pem["ca"]}
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
-    settings = Settings(**given, http_port=port)
-    assert await asyncio.to_thread(is_ready, settings)
+    assert await asyncio.to_thread(is_ready, Settings(**given, http_port=port))
+    loaded = load_tls(Settings(**given))
+    assert loaded is not None
+    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 async def test_the_health_check_waits_for_weights(begin) -> None:
