@@ -323,9 +323,10 @@ def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud
         held = [http_socket(url) for _ in range(150)]
         while "Too many open files" not in (tmp_path / "log").read_text():
             time.sleep(0.05)
-        time.sleep(0.5)
+        time.sleep(1.0)
         for connection in held:
             connection.close()
+        time.sleep(1.5)  # asyncio tries to accept again after a second
         with GraspClient(address, timeout=PATIENCE) as client:
             assert len(client.detect(cloud).grasps) == 10
         process.terminate()

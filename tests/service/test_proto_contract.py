@@ -1,7 +1,6 @@
 """edgegrasp.v1 keeps its promises: every kind of break is found, and additions are none."""
 
 import importlib.util
-import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -165,22 +164,3 @@ def test_a_break_is_not_written_into_the_contract(
     with pytest.raises(SystemExit, match=r"Grasp\.width = 4 is gone"):
         contract.main()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_style() -> None:
-    """What `buf lint` asks of names: one spelling for each kind of thing."""
-    file = contract.current()
-    assert re.fullmatch(r"[a-z]+\.v\d+", file.package)
-    assert file.name == f"{file.package.replace('.', '/')}/grasp.proto"
-    for service in file.service:
-        assert service.name.endswith("Service")
-        for method in service.method:
-            assert re.fullmatch(r"[A-Z][A-Za-z]+", method.name)
-            answer = method.name.removesuffix("Stream")
-            assert method.input_type.endswith((f".{method.name}Request", f".{answer}Request"))
-            assert method.output_type.endswith((f".{method.name}Response", f".{answer}Response"))
-    for one in file.message_type:
-        assert re.fullmatch(r"[A-Z][A-Za-z0-9]+", one.name)
-        for part in one.field:
-            # T_cloud_hand names frames as the equations do.
-            assert re.fullmatch(r"(T_)?[a-z][a-z0-9_]*", part.name), f"{one.name}.{part.name}"
