@@ -5,8 +5,6 @@ import asyncio
 import httpx
 import pytest
 
-from edgegrasp_service.call import Call
-
 
 async def test_a_request_that_expires_while_it_waits_is_never_computed(
     serve, connect, is_error, cloud
@@ -114,11 +112,3 @@ async def test_a_body_that_never_ends_is_given_up_at_the_deadline(serve) -> None
     assert b" 504 " in await asyncio.wait_for(reader.readline(), 20)
     writer.close()
     await running.until(lambda: running.ended == ["deadline-exceeded"])
-
-
-@pytest.mark.parametrize("given", ["a b", "", "x" * 129, "käse", "a\nb"])
-def test_an_unusable_request_id_is_replaced(given: str) -> None:
-    made = Call("http", "DetectGrasps", request_id=given).request_id
-    assert made != given
-    assert len(made) == 32
-    assert Call("http", "DetectGrasps", request_id="arm-1/7").request_id == "arm-1/7"

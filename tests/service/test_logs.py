@@ -166,6 +166,11 @@ def test_one_record_is_one_line(message: str, value: str) -> None:
     assert len(TextFormatter().format(record).splitlines()) == 1
 
 
+@pytest.mark.parametrize("given_id", ["käse", "a\nb"])
+def test_an_unusable_request_id_is_replaced(given_id: str) -> None:
+    assert len(Call("http", "DetectGrasps", request_id=given_id).request_id) == 32
+
+
 def test_a_fault_is_logged_with_its_traceback_and_request() -> None:
     queue = LogQueue(None, JsonFormatter())
     CALL.set(Call("http", "DetectGrasps", "mine"))

@@ -6,8 +6,8 @@ from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_service.call import Call
-from edgegrasp_service.errors import DetectorFailed, InvalidSettings, report
-from edgegrasp_service.observability import Tracer, otlp_provider
+from edgegrasp_service.errors import DetectorFailed, report
+from edgegrasp_service.observability import Tracer
 
 pytest.importorskip("opentelemetry.sdk", reason="the extra `otel` is not installed")
 
@@ -72,9 +72,3 @@ def test_a_fault_marks_the_span(exporter, tracer: Tracer) -> None:
     root = exporter.get_finished_spans()[-1]
     assert (root.name, root.status.description) == ("DetectGrasps", "detector-failed")
     assert root.parent is None
-
-
-def test_without_the_packages_the_setting_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "opentelemetry.sdk.trace", None)
-    with pytest.raises(InvalidSettings, match=r"otlp_endpoint: got .*edgegrasp\[otel\]"):
-        otlp_provider("http://127.0.0.1:4318/v1/traces")

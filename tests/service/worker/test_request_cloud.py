@@ -117,6 +117,8 @@ def test_views_are_fused() -> None:
         ([], "depth_images", "0 images"),
         ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
         ([{}], "depth_images.0.depth", "nothing"),
+        ([image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "rgb8",
+          "data": b"abc"}}], "depth_images.0.depth.encoding", "'rgb8'"),
         ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
         ([image(depth_of(), pose(0)) | {"depth": [[1], [1, 2]]}], "depth_images.0.depth", "length"),
         ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", ""),
@@ -219,6 +221,9 @@ def test_normals_and_colours(kind: str) -> None:
         ({"width": 2**31}, "point_cloud2.width"),
         ({"row_step": 2**30, "height": 1000}, "point_cloud2.data"),
         ({"point_step": 0}, "point_cloud2.fields.0.offset"),
+        ({"row_step": 1}, "point_cloud2.row_step"),
+        ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields.5.name"),
+        ({"height": -1}, "point_cloud2.height"),
     ],
 )
 def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
