@@ -20,20 +20,12 @@ OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 
 
 def files_of(cloud: np.ndarray) -> dict[str, bytes]:
+    """Each format by itself: test_formats.py."""
     npy, npz = io.BytesIO(), io.BytesIO()
     np.save(npy, cloud)
     np.savez_compressed(npz, points=cloud)
-    ply = "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\n"
-    ply += "property float y\nproperty float z\nend_header\n"
-    pcd = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
-    pcd += "POINTS {0}\nDATA binary\n"
-    return {
-        "npy": npy.getvalue(),
-        "npz": npz.getvalue(),
-        "ply": ply.format(len(cloud)).encode() + cloud.tobytes(),
-        "pcd": pcd.format(len(cloud)).encode() + cloud.tobytes(),
-        "xyz": "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode(),
-    }
+    xyz = "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode()
+    return {"npy": npy.getvalue(), "npz": npz.getvalue(), "xyz": xyz}
 
 
 def grasps_of(answer: Any) -> list[dict[str, Any]]:

@@ -104,16 +104,10 @@ async def test_hostile_callers_add_no_labels(serve, cloud: np.ndarray) -> None:
     async with aio.insecure_channel(server.grpc_address) as channel:
         stub = grasp_pb2_grpc.GraspServiceStub(channel)
         for number in range(5):
-            await asyncio.gather(
-                channel.unary_unary(f"/evil.Service{number}/Method", bytes, bytes)(b""),
-                stub.DetectGrasps(
-                    grasp_pb2.DetectGraspsRequest(
-                        points=cloud.tobytes(),
-                        options=grasp_pb2.DetectOptions(model=f"evil-{number}"),
-                    )
-                ),
-                return_exceptions=True,
-            )
+            request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+            request.options.model = f"evil-{number}"
+            unknown = channel.unary_unary(f"/evil.Service{number}/Method", bytes, bytes)
+            await asyncio.gather(unknown(b""), stub.DetectGrasps(request), return_exceptions=True)
     after = await read(server)
     added = {
         tuple(dict(labels)[name] for name in ("transport", "method", "code"))

@@ -314,11 +314,6 @@ def test_bad_queries(query: str, field: str, rest: RestAsker) -> None:
     assert rest.problem("DetectGrasps", npy(POINTS), "application/x-npy", query).field == field
 
 
-def test_query_beside_json(rest: RestAsker) -> None:
-    body = json.dumps({"points": POINTS.tolist()}).encode()
-    assert rest.problem("DetectGrasps", body, "application/json", "seed=1").field == "seed"
-
-
 def form(*parts: tuple[str, bytes], end: bytes = b"--b--\r\n") -> bytes:
     return (
         b"".join(b"--b\r\n%s\r\n\r\n%s\r\n" % (head.encode(), data) for head, data in parts) + end
