@@ -8,8 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import hypothesis
 import numpy as np
 from hypothesis import strategies as st
+
+given = hypothesis.given  # `make fuzz` sets the profile with many examples
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (40, 3)).astype(np.float32)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-SHORT = ("--phases", "fuzzing", "--max-examples", "15")
+SHORT = ("--phases", "fuzzing", "--max-examples", "5")
 LONG = ("--phases", "coverage,fuzzing", "--max-examples", "100", "--max-time", "120")
 CHECKS = (
     "not_a_server_error",
@@ -44,5 +44,5 @@ def test_the_server_keeps_to_its_document(start_server, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout[-5000:]
         counted = re.search(r"(\d+) generated, (\d+) passed", done.stdout)
         assert counted, done.stdout[-5000:]
-        assert int(counted[1]) == int(counted[2]) > 20
+        assert int(counted[1]) == int(counted[2]) > 10
         assert server.stop() == 0

@@ -2,6 +2,9 @@
 
 import asyncio
 import dataclasses
+import os
+import shutil
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -9,108 +12,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
 from grpc import aio
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.observability import Call
 from edgegrasp_service.server import Server
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.pool import ONE_THREAD
 
 PATIENCE = 20  # seconds; longer than anything takes
 
 
-@dataclass
-class Answer:
-    code: str  # gRPC status name, or HTTP status
-    kind: str
-    detail: str
-    field: str
-    value: str
-    fix: str
-    body: Any = None
-
-
-class RawGrpc:
-    """Sends what a careless client might, and shows what comes back."""
-
-    name = "grpc"
-
-    def __init__(self, address: str) -> None:
-        self.channel = grpc.insecure_channel(address, (("grpc.max_send_message_length", -1),))
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self.channel)
-
-    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
-        encoded = grasp_pb2.EncodedCloud(format=file_format, data=data)
-        return self.request(encoded=encoded, options=grasp_pb2.DetectOptions(**options))
-
-    def request(self, **fields: Any) -> Answer:
-        return self.send(grasp_pb2.DetectGraspsRequest(**fields))
-
-    def send(self, message: grasp_pb2.DetectGraspsRequest | grasp_pb2.ScoreGraspsRequest) -> Answer:
-        scores = isinstance(message, grasp_pb2.ScoreGraspsRequest)
-        call = self._stub.ScoreGrasps if scores else self._stub.DetectGrasps
-        try:
-            body = call(message, timeout=20)
-        except grpc.RpcError as error:
-            trailers = dict(error.trailing_metadata())
-            detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
-            told = (detail.kind, error.details(), detail.field, detail.value, detail.fix)
-            return Answer(error.code().name, *told)
-        return Answer("OK", "", "", "", "", "", body)
-
-    def close(self) -> None:
-        self.channel.close()
-
-
-class RawRest:
-    name = "rest"
-
-    def __init__(self, address: str) -> None:
-        self.http = httpx.Client(base_url=address, timeout=20)
-
-    def file(self, file_format: str, data: bytes, **options: Any) -> Answer:
-        headers = {"content-type": f"application/x-{file_format}"}
-        return self.post(content=data, headers=headers, params=options)
-
-    def post(self, path: str = "/v1/grasps", **request: Any) -> Answer:
-        response = self.http.post(path, **request)
-        body = response.json()
-        if response.is_success:
-            return Answer("200", "", "", "", "", "", body)
-        assert response.headers["content-type"] == "application/problem+json"
-        assert body["status"] == response.status_code
-        assert body["title"]
-        kind = body["type"].removeprefix("urn:edgegrasp:error:")
-        told = (kind, body["detail"], body["field"], body["value"], body["fix"])
-        return Answer(str(response.status_code), *told)
-
-    def close(self) -> None:
-        self.http.close()
-
-
-@pytest.fixture
-def raw_grpc(dummy_server) -> Iterator[RawGrpc]:
-    raw = RawGrpc(dummy_server.grpc_address)
-    yield raw
-    raw.close()
-
-
-@pytest.fixture
-def raw_rest(dummy_server) -> Iterator[RawRest]:
-    raw = RawRest(dummy_server.http_url)
-    yield raw
-    raw.close()
-
-
-@pytest.fixture(params=["grpc", "rest"])
-def raw(request: pytest.FixtureRequest) -> RawGrpc | RawRest:
-    found: RawGrpc | RawRest = request.getfixturevalue(f"raw_{request.param}")
-    return found
+@pytest.fixture(scope="session")
+def real_server(start_server: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """The weights that ship, and `mine`: a copy of others that a test may replace."""
+    mine = tmp_path_factory.mktemp("weights") / "mine.safetensors"
+    shutil.copy(WEIGHTS_FOLDER / "edgegrasp.safetensors", mine)
+    flags = ("--weights", str(mine), "--workers", "2", "--max-voxels", "10000000")
+    with start_server(*flags) as server:
+        server.mine = mine
+        yield server
 
 
 @dataclass
@@ -269,8 +195,34 @@ class Running:
 Serve = Callable[..., Awaitable[Running]]
 
 
+# Asks for a nursery, and lives until that ends: see nursery.py.
+ASK = """
+import os, socket, sys
+with socket.socket(socket.AF_UNIX) as asking:
+    asking.connect(sys.argv[1])
+    socket.send_fds(asking, [sys.argv[2].encode()], [0])
+    os.close(0)
+    asking.recv(1)
+"""
+
+
+@pytest.fixture(scope="session")
+def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...]]:
+    """The command of a nursery, but for its folder; one process has imported for all of them."""
+    path = str(tmp_path_factory.mktemp("nursery") / "socket")
+    command = [sys.executable, "-P", str(Path(__file__).parent / "nursery.py"), path]
+    environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        yield (sys.executable, "-ISc", ASK, path)
+        process.kill()
+
+
 @pytest.fixture
-async def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Serve]:
+async def begin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nursery: tuple[str, ...]
+) -> AsyncIterator[Serve]:
     """Begins servers of controlled dummies in this event loop, on free ports."""
     monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
     running: list[Running] = []
@@ -288,8 +240,7 @@ async def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterato
             if call.method in ("DetectGrasps", "ScoreGrasps") or call.in_stream:
                 calls.append(call)
 
-        nursery = (sys.executable, str(Path(__file__).parent / "nursery.py"), str(folder))
-        server = Server(Settings(**(ours | given)), [note], nursery)
+        server = Server(Settings(**(ours | given)), [note], (*nursery, str(folder)))
         opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
         serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))
         running.append(Running(server, stages, calls, stop, serving))

@@ -1,11 +1,13 @@
-"""The process that test servers' workers fork from: dummies whose stages wait and fail as told.
+"""The processes that test servers' workers fork from: dummies whose stages wait and fail as told.
 
-usage: nursery.py FOLDER    what a test writes into the folder tells what happens
+usage: nursery.py SOCKET    import everything once, then fork a nursery for each that asks there
 """
 
 import contextlib
+import fcntl
 import os
 import signal
+import socket
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -16,11 +18,39 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
 from edgegrasp_service import errors
 from edgegrasp_service.errors import Overloaded, kind_of
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker import answer as answer  # what a nursery imports
 from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
 from edgegrasp_service.worker.process import main
 
 PATIENCE = 20  # seconds; longer than anything takes
-FOLDER = Path(sys.argv[1])
+FOLDER = Path()  # what a test writes into it tells what happens
+
+
+def fork_nurseries(path: str) -> None:
+    """Each who asks sends the socket of its pool and a folder, and its nursery ends with it."""
+    global FOLDER
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    listening = socket.socket(socket.AF_UNIX)
+    listening.bind(path)
+    listening.listen()
+    os.write(1, b"ready\n")
+    while True:
+        asked, _ = listening.accept()
+        folder, pools, _, _ = socket.recv_fds(asked, 4096, 1)
+        if pools and os.fork() == 0:
+            listening.close()
+            fcntl.fcntl(asked, fcntl.F_SETOWN, os.getpid())
+            fcntl.fcntl(asked, fcntl.F_SETFL, os.O_ASYNC)  # SIGIO once who asked is gone: the end
+            os.dup2(pools[0], 0)
+            os.close(pools[0])
+            FOLDER = Path(folder.decode())
+            try:
+                main(load)
+            finally:
+                os._exit(0)
+        for pool in pools:
+            os.close(pool)
+        asked.close()
 
 
 def stage(name: str) -> None:
@@ -106,4 +136,4 @@ def load(settings: Settings) -> Catalogue:
 
 
 if __name__ == "__main__":
-    main(load)
+    fork_nurseries(sys.argv[1])

@@ -2,44 +2,38 @@
 
 import io
 import json
+from collections.abc import Iterator
 from typing import Any
 
+import grpc
 import httpx
 import numpy as np
 import pytest
-from google.protobuf import json_format
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from edgegrasp.v1 import grasp_pb2
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import GraspClient
 from edgegrasp_service.schemas import DetectionBody, ModelsBody, ScoringBody
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 
 
 def files_of(cloud: np.ndarray) -> dict[str, bytes]:
+    """Each format by itself: test_formats.py."""
     npy, npz = io.BytesIO(), io.BytesIO()
     np.save(npy, cloud)
     np.savez_compressed(npz, points=cloud)
-    ply = "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\n"
-    ply += "property float y\nproperty float z\nend_header\n"
-    pcd = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
-    pcd += "POINTS {0}\nDATA binary\n"
-    return {
-        "npy": npy.getvalue(),
-        "npz": npz.getvalue(),
-        "ply": ply.format(len(cloud)).encode() + cloud.tobytes(),
-        "pcd": pcd.format(len(cloud)).encode() + cloud.tobytes(),
-        "xyz": "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode(),
-    }
+    xyz = "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode()
+    return {"npy": npy.getvalue(), "npz": npz.getvalue(), "xyz": xyz}
 
 
 def grasps_of(answer: Any) -> list[dict[str, Any]]:
     """The grasps of either transport, as JSON values of which floats compare exactly."""
-    if isinstance(answer.body, dict):
-        return answer.body["grasps"]
+    if isinstance(answer, dict):
+        return answer["grasps"]
     found = []
-    for grasp in answer.body.grasps:
+    for grasp in answer.grasps:
         fields = {field.name: getattr(grasp, field.name) for field in grasp.DESCRIPTOR.fields}
         for name, value in fields.items():
             if name.startswith("T_"):
@@ -50,96 +44,73 @@ def grasps_of(answer: Any) -> list[dict[str, Any]]:
     return found
 
 
-def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, raw_grpc, raw_rest) -> None:
-    message = grasp_pb2.DetectOptions(**OPTIONS)
-    answers = [
-        raw_grpc.request(points=cloud.tobytes(), options=message),
-        raw_rest.post(json={"points": cloud.tolist(), "options": OPTIONS}),
-    ]
+@pytest.fixture
+def channel(dummy_server) -> Iterator[grpc.Channel]:
+    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
+        yield channel
+
+
+@pytest.fixture
+def http(dummy_server) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=dummy_server.http_url, timeout=20) as http:
+        yield http
+
+
+def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) -> None:
+    detect = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps
+    text = json.dumps(OPTIONS)
+    posted: list[dict[str, Any]] = [{"json": {"points": cloud.tolist(), "options": OPTIONS}}]
+    messages = [{"points": cloud.tobytes()}]
     for file_format, data in files_of(cloud).items():
-        upload = {"cloud": (f"cloud.{file_format}", data)}
-        part = {"options": json.dumps(OPTIONS)}
-        typed = {
-            "cloud": ("cloud", data, f"application/x-{file_format}"),
-            "options": (None, json.dumps(OPTIONS), "application/json"),
-        }
-        answers += [
-            raw_grpc.file(file_format, data, **OPTIONS),
-            raw_rest.file(file_format, data, **OPTIONS),
-            raw_rest.post(files=upload, data=part),
-            raw_rest.post(files=typed),
+        media_type = f"application/x-{file_format}"
+        messages.append({"encoded": {"format": file_format, "data": data}})
+        posted += [
+            {"content": data, "headers": {"content-type": media_type}, "params": OPTIONS},
+            {"files": {"cloud": (f"cloud.{file_format}", data)}, "data": {"options": text}},
+            {
+                "files": {
+                    "cloud": ("cloud", data, media_type),
+                    "options": (None, text, "application/json"),
+                }
+            },
         ]
+    answers = [
+        detect(grasp_pb2.DetectGraspsRequest(options=OPTIONS, **message)) for message in messages
+    ]
+    answers += [http.post("/v1/grasps", **request).json() for request in posted]
     expected = grasps_of(answers[0])
     assert len(expected) == 7
     assert all(grasps_of(answer) == expected for answer in answers)
 
 
-def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, raw_rest) -> None:
+def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, http) -> None:
     body = {"points": cloud.tolist(), "options": {"debug": True}}
-    debug = DetectionBody.model_validate(raw_rest.post(json=body).body).debug
+    debug = DetectionBody.model_validate(http.post("/v1/grasps", json=body).json()).debug
     assert debug is not None
     assert len(debug.outcome) == len(debug.score) == len(debug.T_cloud_hand) == 32
     assert debug.score[-1] is None
     body = {"points": cloud.tolist(), "edges": [[0, 1], [3, 3]]}
-    scoring = ScoringBody.model_validate(raw_rest.post("/v1/grasps:score", json=body).body)
+    scoring = ScoringBody.model_validate(http.post("/v1/grasps:score", json=body).json())
     assert [evaluation.grasp is None for evaluation in scoring.evaluations] == [False, True]
+    ModelsBody.model_validate(http.get("/v1/models").json())
 
 
-def test_seed_matters_and_zero_is_one(cloud: np.ndarray, raw) -> None:
-    data = files_of(cloud)["npy"]
-    default, zero, one = raw.file("npy", data), raw.file("npy", data, seed=0), None
-    one = raw.file("npy", data, seed=1)
-    assert grasps_of(default) == grasps_of(zero) != grasps_of(one)
+def test_nothing_found_is_a_success(cloud: np.ndarray, dummy_server, transport: str) -> None:
+    with GraspClient(dummy_server.address(transport)) as client:
+        detection = client.detect(cloud, min_score=1.0)
+    assert detection.grasps == []
+    assert (detection.counts["points"], detection.counts["returned"]) == (500, 0)
 
 
-def test_nothing_found_is_a_success(cloud: np.ndarray, raw) -> None:
-    answer = raw.file("npy", files_of(cloud)["npy"], min_score=1.0)
-    assert answer.code in ("OK", "200")
-    assert grasps_of(answer) == []
-    counts = answer.body["counts"] if raw.name == "rest" else answer.body.counts
-    assert (counts["points"], counts["returned"]) == (500, 0)
-
-
-def test_answers_are_as_documented(cloud: np.ndarray, raw_rest) -> None:
-    answer = raw_rest.file("npy", files_of(cloud)["npy"])
-    DetectionBody.model_validate(answer.body)
-    ModelsBody.model_validate(raw_rest.http.get("/v1/models").json())
-
-
-@pytest.mark.parametrize(
-    "text", ["0.1,0.2,0.3", "[0.1, 0.2, 0.3]", '{"x": 1}', "null", "0.1,b,0.3"]
-)
-def test_options_as_text(text: str, cloud: np.ndarray, raw_rest) -> None:
-    answer = raw_rest.file("npy", files_of(cloud)["npy"], viewpoint=text)
-    assert answer.code == ("400" if "x" in text or "b" in text else "200")
-
-
-def test_nested_options(cloud: np.ndarray, raw) -> None:
-    box = {"min": [0.0, 0.0, 0.0], "max": [-1.0, 1.0, 1.0]}
-    if raw.name == "rest":
-        answer = raw.file("npy", files_of(cloud)["npy"], workspace=json.dumps(box))
-    else:
-        corners = {name: dict(zip("xyz", box[name], strict=True)) for name in box}
-        answer = raw.file(
-            "npy",
-            files_of(cloud)["npy"],
-            workspace=json_format.ParseDict(corners, grasp_pb2.Workspace()),
-        )
-    assert (answer.kind, answer.field) == ("invalid-request", "options.workspace")
-
-
-def test_probes(dummy_server, raw_grpc) -> None:
+def test_probes_and_reflection(channel, http) -> None:
     for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
-        assert httpx.get(dummy_server.http_url + path).status_code == 200
-    health = health_pb2_grpc.HealthStub(raw_grpc.channel)
+        assert http.get(path).status_code == 200
+    health = health_pb2_grpc.HealthStub(channel)
     for name in ("", "edgegrasp.v1.GraspService"):
         request = health_pb2.HealthCheckRequest(service=name)
         assert health.Check(request).status == health_pb2.HealthCheckResponse.SERVING
-
-
-def test_reflection_lists_the_service(raw_grpc) -> None:
-    stub = reflection_pb2_grpc.ServerReflectionStub(raw_grpc.channel)
-    request = reflection_pb2.ServerReflectionRequest(list_services="")
-    answer = next(stub.ServerReflectionInfo(iter([request])))
+    reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
+    listing = reflection_pb2.ServerReflectionRequest(list_services="")
+    answer = next(reflection.ServerReflectionInfo(iter([listing])))
     names = {service.name for service in answer.list_services_response.service}
     assert {"edgegrasp.v1.GraspService", "grpc.health.v1.Health"} <= names

@@ -13,8 +13,8 @@ from grpc import aio
 import edgegrasp_model.errors
 import edgegrasp_service.errors
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_model.errors import EdgeGraspError, UnknownModel
-from edgegrasp_service.errors import STATUS, kind_of, report
+from edgegrasp_model.errors import EdgeGraspError
+from edgegrasp_service.errors import STATUS, kind_of
 
 # Errors of starting up: no request ever meets them.
 START_UP = {
@@ -111,8 +111,3 @@ def test_every_error_is_in_the_table() -> None:
         for name, kind in inspect.getmembers(module, inspect.isclass):
             abstract = kind.__subclasses__() or not issubclass(kind, EdgeGraspError)
             assert abstract or name in START_UP or kind in STATUS, f"{name} has no status"
-
-
-def test_report_of_an_unknown_model() -> None:
-    told = report(UnknownModel("x", ["b", "a"]))
-    assert (told.field, told.value, told.fix) == ("options.model", "'x'", "Use one of: a, b.")

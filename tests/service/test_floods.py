@@ -25,6 +25,7 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 
 PATIENCE = 30
+MIB = 2**20
 HEAD = "POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-npy\r\n"
 
 
@@ -50,7 +51,7 @@ def in_background(work: Callable[[threading.Event], None], count: int) -> Iterat
             thread.join(PATIENCE)
 
 
-def check_alive(server, cloud: np.ndarray, seconds: float = 3.0) -> None:
+def check_alive(server, cloud: np.ndarray, seconds: float = 1.0) -> None:
     """Liveness is answered all the time, and a good request in the end."""
     end, slowest = time.monotonic() + seconds, 0.0
     with httpx.Client(base_url=server.http_url, timeout=PATIENCE) as http:
@@ -63,34 +64,32 @@ def check_alive(server, cloud: np.ndarray, seconds: float = 3.0) -> None:
         assert len(client.detect(cloud).grasps) == 10
 
 
-def memory(server) -> int:
-    """Resident bytes of the process that accepts."""
-    pages = int(Path(f"/proc/{server.process.pid}/statm").read_text().split()[1])
-    return pages * 4096
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
-def test_messages_that_never_end(dummy_server, cloud) -> None:
+async def test_messages_that_never_end(serve, cloud) -> None:
     """Row 1: 60 gRPC messages of 31 MB, of which the end never comes, on one connection."""
-    before = memory(dummy_server)
-    with contextlib.closing(Http2(dummy_server.grpc_address)) as connection:
+    running = await serve(max_held_bytes=64 * MIB)
+    before = resident_bytes()
+    with contextlib.closing(Http2(running.server.grpc_address)) as connection:
         for stream in range(60):
             connection.begin("/edgegrasp.v1.GraspService/DetectGrasps", 2 * stream + 1)
         for stream in range(20):
             connection.begin("/grpc.health.v1.Health/Check", 121 + 2 * stream)
-        sending = threading.Thread(target=connection.send_all, args=(31 * 2**20,))
+        sending = threading.Thread(target=connection.send_all, args=(31 * MIB,))
         sending.start()
-        peak, end = 0, time.monotonic() + 6
-        with httpx.Client(base_url=dummy_server.http_url, timeout=PATIENCE) as http:
-            while time.monotonic() < end:
-                assert http.get("/health/live").status_code == 200
-                peak = max(peak, memory(dummy_server))
-                time.sleep(0.05)
+        await running.until(lambda: connection.sent > 50 * MIB)  # or there is no attack
+        async with httpx.AsyncClient(base_url=running.server.http_url, timeout=PATIENCE) as http:
+            for _ in range(30):
+                assert (await http.get("/health/live")).status_code == 200
+                await asyncio.sleep(0.05)
+        assert resident_bytes() - before < 500 * MIB
         connection.stop.set()
-        sending.join(PATIENCE)
-    assert connection.sent > 50 * 2**20  # or there was no attack
-    assert peak - before < 900 * 2**20
-    with GraspClient(dummy_server.grpc_address, timeout=PATIENCE) as client:
-        assert len(client.detect(cloud).grasps) == 10
+        await asyncio.to_thread(sending.join, PATIENCE)
+    client = running.connect("grpc")
+    assert (await client.detect(cloud)).fine
+    await client.close()
 
 
 class Http2:
@@ -183,11 +182,10 @@ class Http2:
         self._socket.close()
 
 
-@pytest.mark.parametrize("token", ["none", "wanted"])
-def test_bodies_in_crumbs(dummy_server, cloud, token: str) -> None:
+@pytest.mark.parametrize("path", ["/v1/grasps", "/v1/models:reload"])
+def test_bodies_in_crumbs(dummy_server, cloud, path: str) -> None:
     """Row 2: bodies in chunks of one byte, also after a refusal."""
     crumbs = b"1\r\nX\r\n" * 40_000
-    path = "/v1/grasps" if token == "none" else "/v1/models:reload"
     head = HEAD.replace("/v1/grasps", path) + "Transfer-Encoding: chunked\r\n\r\n"
 
     def attack(stop: threading.Event) -> None:
@@ -220,7 +218,7 @@ def test_a_form_of_nothing_but_boundaries(dummy_server, cloud) -> None:
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
 async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transport: str) -> None:
     """Row 5: a body of one byte now and then, in every place."""
-    running = await serve(max_queue_length=3, read_seconds=3.0)
+    running = await serve(max_queue_length=3, read_seconds=1.0)
     held, writers = [], []
     async with aio.insecure_channel(running.server.grpc_address) as channel:
         for _ in range(4):
@@ -243,15 +241,6 @@ async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transpor
         await client.close()
     for writer in writers:
         writer.close()
-
-
-async def test_a_length_over_the_limit_is_not_waited_for(serve) -> None:
-    running = await serve(max_body_bytes=10_000)
-    host, port = running.server.http_url.removeprefix("http://").split(":")
-    reader, writer = await asyncio.open_connection(host, int(port))
-    writer.write(HEAD.encode() + b"Content-Length: 10001\r\n\r\n")
-    assert b" 413 " in await asyncio.wait_for(reader.readline(), PATIENCE)
-    writer.close()
 
 
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
@@ -332,7 +321,9 @@ def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud
         assert process.stdout is not None
         url, address = process.stdout.readline().split()[3::2]
         held = [http_socket(url) for _ in range(150)]
-        time.sleep(2.0)
+        while "Too many open files" not in (tmp_path / "log").read_text():
+            time.sleep(0.05)
+        time.sleep(1.0)
         for connection in held:
             connection.close()
         time.sleep(1.5)  # asyncio tries to accept again after a second
@@ -344,15 +335,8 @@ def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud
         process.kill()
         process.communicate()
     lines = (tmp_path / "log").read_text().splitlines()
-    assert any("Too many open files" in line for line in lines)
     assert len(lines) < 20
     assert not any("Traceback" in line for line in lines)
-
-
-@pytest.fixture(scope="module")
-def real_server(start_server):
-    with start_server("--workers", "2", "--max-voxels", "10000000") as running:
-        yield running
 
 
 def test_a_cloud_far_too_dense(real_server, cloud) -> None:
@@ -377,15 +361,29 @@ def test_a_cloud_far_too_dense(real_server, cloud) -> None:
     begin = time.monotonic()
     with GraspClient(real_server.http_url, timeout=PATIENCE) as client:
         client.detect(cloud, num_approach_points=2, num_candidates=20)
-    assert time.monotonic() - begin < 12  # 38 s and more where nothing is killed
+    assert time.monotonic() - begin < 20  # 38 s and more where nothing is killed
     assert set(codes) == {grpc.StatusCode.DEADLINE_EXCEEDED}
 
 
-def test_too_many_voxels_are_named(start_server) -> None:
-    room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
-    with (
-        start_server("--workers", "1", "--max-voxels", "20000") as server,
-        GraspClient(server.grpc_address, timeout=PATIENCE) as client,
-        pytest.raises(Exception, match=r"voxels.*workspace"),
-    ):
-        client.detect(room)
+async def test_large_and_many_metadata_are_refused(serve, cloud: np.ndarray) -> None:
+    server = (await serve(max_header_bytes=16_384)).server
+    async with aio.insecure_channel(server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+        for metadata in ((("x-large", "a" * 40_000),), tuple((f"x-{n}", "y") for n in range(100))):
+            call = stub.DetectGrasps(request, metadata=metadata)
+            assert await call.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        trailers = dict(await call.trailing_metadata())
+        detail = grasp_pb2.ErrorDetail.FromString(trailers["edgegrasp-error-bin"])
+        assert (detail.kind, detail.field) == ("headers-too-large", "metadata")
+        assert len((await stub.DetectGrasps(request)).grasps) == 10
+
+
+def test_compressed_messages_are_refused(dummy_server) -> None:
+    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
+        stub, request = grasp_pb2_grpc.GraspServiceStub(channel), bytes(12 * 100_000)
+        with pytest.raises(grpc.RpcError) as caught:
+            stub.DetectGrasps(
+                grasp_pb2.DetectGraspsRequest(points=request), compression=grpc.Compression.Gzip
+            )
+        assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED

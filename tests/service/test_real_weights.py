@@ -1,5 +1,6 @@
 """A real network behind the server: every way in gives the detector's own grasps."""
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -10,23 +11,18 @@ import pytest
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
-from edgegrasp_client import Detection, GraspClient, InvalidRequestError, UnknownModelError
-
-OPTIONS: dict[str, Any] = {"seed": 7, "num_approach_points": 8, "num_candidates": 200}
+from edgegrasp_client import GraspClient
+from edgegrasp_model.detector import ModelCatalogue
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import Answerer, load_catalogue
+from edgegrasp_service.worker.job import Job
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import torch
-
-    from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
-    from edgegrasp_model.networks.config import EDGEGRASP_SMALL, CheckpointMetadata
-
-    network = build_network(EDGEGRASP_SMALL, torch.Generator().manual_seed(0))
-    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
-    metadata = CheckpointMetadata("untrained", EDGEGRASP_SMALL, voxel_size=0.004, gripper="panda")
-    save_checkpoint(path, network, metadata)
-    return path
+def catalogue() -> ModelCatalogue:
+    return ModelCatalogue.load()
 
 
 @pytest.fixture(scope="module")
@@ -38,55 +34,6 @@ def box() -> np.ndarray:
     surface[np.arange(6000), axis] = np.where(rng.random(6000) < 0.5, -1.0, 1.0)
     surface[axis == 2, 2] = 1.0
     return (surface * (0.02, 0.03, 0.05) + (0, 0, 0.05)).astype(np.float32)
-
-
-def as_lists(detection: Any) -> list[list[Any]]:
-    return [
-        [np.asarray(value, np.float32).tolist() for value in vars(grasp).values()]
-        for grasp in detection.grasps
-    ]
-
-
-def test_every_way_in_gives_the_detectors_grasps(
-    weights: Path, box: np.ndarray, start_server, tmp_path: Path
-) -> None:
-    from edgegrasp_model.detector import ModelCatalogue
-    from edgegrasp_model.options import DetectOptions
-
-    catalogue = ModelCatalogue.load([weights], default="untrained")
-    expected = catalogue.get().detect(box, DetectOptions(**OPTIONS))
-    assert expected.grasps
-
-    file = tmp_path / "box.ply"
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(box)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    file.write_bytes(header.encode() + box.tobytes())
-
-    with start_server("--weights", str(weights), "--default-model", "untrained") as server:
-        found: list[Detection] = []
-        for address in (server.grpc_address, server.http_url):
-            with GraspClient(address) as client:
-                found += [client.detect(box, **OPTIONS), client.detect(file, **OPTIONS)]
-                (model,) = (model for model in client.models() if model.default)
-                assert (model.name, model.parameters) == ("untrained", _parameters(catalogue))
-                with pytest.raises(UnknownModelError, match="untrained"):
-                    client.detect(box, model="none")
-        words = ["detect", str(file), "--json", "--seed", "7", "--num-approach-points", "8"]
-        words += ["--num-candidates", "200"]
-        remote = CliRunner().invoke(main.app, [*words, "--server", server.http_url])
-    words += ["--weights", str(weights), "--model", "untrained"]
-    local = CliRunner().invoke(main.app, words)
-
-    for detection in found:
-        assert as_lists(detection) == as_lists(expected)
-        assert detection.counts == expected.counts
-    for result in (remote, local):
-        printed = json.loads(result.stdout)["grasps"]
-        assert [list(grasp.values()) for grasp in printed] == as_lists(expected)
-
-
-def _parameters(catalogue: Any) -> int:
-    return next(row["parameters"] for row in catalogue.describe() if row["name"] == "untrained")
 
 
 # Many options at once, with the weights that ship.
@@ -141,14 +88,17 @@ def scene(box: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def test_many_options_give_the_same_grasps_everywhere(
-    scene: dict[str, np.ndarray], start_server, tmp_path: Path
-) -> None:
-    from edgegrasp_model.detector import ModelCatalogue
-    from edgegrasp_model.options import parse_options
-    from edgegrasp_model.scene.cloud import CloudInput
+def as_lists(detection: Any) -> list[list[Any]]:
+    return [
+        [np.asarray(value, np.float32).tolist() for value in vars(grasp).values()]
+        for grasp in detection.grasps
+    ]
 
-    expected = ModelCatalogue.load().get().detect(CloudInput(**scene), parse_options(MANY))
+
+def test_many_options_give_the_same_grasps_everywhere(
+    catalogue: ModelCatalogue, scene: dict[str, np.ndarray], real_server, tmp_path: Path
+) -> None:
+    expected = catalogue.get().detect(CloudInput(**scene), parse_options(MANY))
     assert expected.grasps
     assert expected.debug is not None
 
@@ -156,23 +106,23 @@ def test_many_options_give_the_same_grasps_everywhere(
     np.savez_compressed(file, **scene)
     options.write_text(json.dumps(MANY))
     flags = ["detect", str(file), "--json"]
+    remote = [*flags, "--options", str(options), "--server", real_server.grpc_address]
     for name, value in MANY.items():
         words = [] if name == "debug" else [value if isinstance(value, str) else json.dumps(value)]
         flags += [f"--{name.replace('_', '-')}", *words]
-    printed = [CliRunner().invoke(main.app, flags)]
+    body = {name: array.tolist() for name, array in scene.items()} | {"options": MANY}
+    documents = [httpx.post(f"{real_server.http_url}/v1/grasps", json=body, timeout=60).json()]
+    documents += [json.loads(CliRunner().invoke(main.app, each).stdout) for each in (flags, remote)]
+    for document in documents:
+        assert [list(grasp.values()) for grasp in document["grasps"]] == as_lists(expected)
+        assert document["counts"] == expected.counts
+        assert document["debug"]["outcome"] == expected.debug.outcome
+
     beside = {name: array for name, array in scene.items() if name != "points"}
-    found: list[Detection] = []
-    with start_server() as server:
-        with GraspClient(server.grpc_address) as client:
-            found.append(client.detect(file, **MANY))
-        with GraspClient(server.http_url) as client:
-            found.append(client.detect(scene["points"], **beside, **MANY))
-        remote = ["--server", server.http_url]
-        printed.append(CliRunner().invoke(main.app, [*flags, *remote]))
-        body = {name: array.tolist() for name, array in scene.items()} | {"options": MANY}
-        answer = httpx.post(f"{server.http_url}/v1/grasps", json=body, timeout=60).json()
-        words = ["detect", str(file), "--json", "--options", str(options)]
-        printed.append(CliRunner().invoke(main.app, [*words, "--server", server.grpc_address]))
+    with GraspClient(real_server.grpc_address) as client:
+        found = [client.detect(file, **MANY)]
+    with GraspClient(real_server.http_url) as client:
+        found.append(client.detect(scene["points"], **beside, **MANY))
     for detection in found:
         assert as_lists(detection) == as_lists(expected)
         assert detection.counts == expected.counts
@@ -180,60 +130,6 @@ def test_many_options_give_the_same_grasps_everywhere(
         assert detection.debug is not None
         for name, value in vars(expected.debug).items():
             np.testing.assert_array_equal(getattr(detection.debug, name), value)
-    for document in (answer, *(json.loads(result.stdout) for result in printed)):
-        assert [list(grasp.values()) for grasp in document["grasps"]] == as_lists(expected)
-        assert document["counts"] == expected.counts
-        assert document["debug"]["outcome"] == expected.debug.outcome
-
-
-def test_wrong_depths_are_put_right_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
-    from edgegrasp_model.detector import ModelCatalogue
-    from edgegrasp_model.options import parse_options
-
-    camera = np.array([0.3, 0.1, 0.6])
-    points = (camera + 1.05 * (scene["points"] - camera)).astype(np.float32)
-    plane = {"normal": [0.0, 0.0, 1.0], "offset": 0.0, "max_depth_error": 0.1}
-    options: dict[str, Any] = {"seed": 5, "support": plane}
-    seen_from = options | {"viewpoint": camera.tolist()}
-    expected = ModelCatalogue.load().get().detect(points, parse_options(seen_from))
-    assert expected.grasps
-    assert expected.warnings == ["the depths were multiplied by 0.952, as the support plane shows."]
-    contact = np.array([grasp.contact_point for grasp in expected.grasps])
-    assert (np.abs(contact) < np.array([0.02, 0.03, 0.1]) + 0.004).all()  # on the box again
-    with start_server() as server:
-        for address in (server.grpc_address, server.http_url):
-            with GraspClient(address) as client:
-                found = client.detect(points, **seen_from)
-                assert as_lists(found) == as_lists(expected)
-                assert found.warnings == expected.warnings
-                with pytest.raises(InvalidRequestError, match=r"options\.viewpoint: got nothing"):
-                    client.detect(points, **options)
-
-
-def test_scores_are_the_same_everywhere(scene: dict[str, np.ndarray], start_server) -> None:
-    from edgegrasp_model.detector import ModelCatalogue
-    from edgegrasp_model.options import parse_options
-
-    options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
-    points = scene["points"]
-    edges = np.random.default_rng(2).integers(0, 6000, (40, 2))
-    detector = ModelCatalogue.load().get()
-    poses = np.stack(
-        [g.T_cloud_hand for g in detector.detect(points, parse_options(options)).grasps]
-    )
-    by_edges = detector.score(points, parse_options(options), edges=edges)
-    by_poses = detector.score(points, parse_options(options), hand_poses=poses)
-    assert any(evaluation.grasp for evaluation in by_edges.evaluations)
-    assert any(evaluation.grasp for evaluation in by_poses.evaluations)
-    with start_server() as server:
-        for address in (server.grpc_address, server.http_url):
-            with GraspClient(address) as client:
-                assert evaluated(client.score(points, edges=edges, **options)) == evaluated(
-                    by_edges
-                )
-                scoring = client.score(points, hand_poses=poses, **options)
-                assert evaluated(scoring) == evaluated(by_poses)
-                assert scoring.counts == by_poses.counts
 
 
 def evaluated(scoring: Any) -> list[Any]:
@@ -242,3 +138,32 @@ def evaluated(scoring: Any) -> list[Any]:
         or [np.asarray(value, np.float32).tolist() for value in vars(evaluation.grasp).values()]
         for evaluation in scoring.evaluations
     ]
+
+
+def test_scores_are_the_same_everywhere(
+    catalogue: ModelCatalogue, scene: dict[str, np.ndarray], real_server
+) -> None:
+    options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
+    points, detector, parsed = scene["points"], catalogue.get(), parse_options(options)
+    found = detector.detect(points, parsed).grasps
+    poses = np.stack([grasp.T_cloud_hand for grasp in found])
+    edges = np.random.default_rng(2).integers(0, 6000, (40, 2))
+    for given in ({"edges": edges}, {"hand_poses": poses}):
+        expected = detector.score(points, parsed, **given)
+        assert any(evaluation.grasp for evaluation in expected.evaluations)
+        for address in (real_server.grpc_address, real_server.http_url):
+            with GraspClient(address) as client:
+                scoring = client.score(points, **given, **options)
+            assert evaluated(scoring) == evaluated(expected)
+            assert scoring.counts == expected.counts
+
+
+def test_too_many_voxels_are_named() -> None:
+    room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
+    np.save(file, room)
+    answerer = Answerer(load_catalogue(Settings(max_voxels=20_000)))
+    job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy")
+    error = answerer.answer(job).error
+    assert error is not None
+    assert "voxels" in error.value
+    assert "workspace" in error.fix

@@ -1,7 +1,6 @@
 """Who may ask, over both transports: TLS, client certificates, tokens, and what stays open."""
 
 import asyncio
-import logging
 import ssl
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import (
     AccessDeniedError,
     AsyncGraspClient,
-    GraspClient,
-    InvalidRequestError,
     ServerUnavailableError,
     Tls,
 )
@@ -31,7 +28,6 @@ from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
 
 USER = "user-token-0123456789"
-SECOND = "second-token-0123456789"
 ADMIN = "admin-token-0123456789"
 WRONG = "wrong-token-0123456789"
 HOST = "127.0.0.1"
@@ -62,11 +58,6 @@ def server_tls(pem: dict[str, Path]) -> dict[str, Path]:
     return {"tls_certificate": pem["server"], "tls_key": pem["server_key"]}
 
 
-def address_of(server: Any, transport: str) -> str:
-    address: str = server.grpc_address if transport == "grpc" else server.http_url
-    return address
-
-
 async def refused(address: str, **security: Any) -> Exception:
     async with AsyncGraspClient(address, timeout=5, **security) as client:
         with pytest.raises(Exception) as caught:  # noqa: PT011  # the caller looks at it
@@ -75,9 +66,8 @@ async def refused(address: str, **security: Any) -> Exception:
 
 
 async def test_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
-    server = (await serve(**server_tls)).server
-    assert server.http_url.startswith("https://")
-    address = address_of(server, transport)
+    running = await serve(**server_tls)
+    address = running.address(transport)
     async with AsyncGraspClient(address, tls=Tls(ca=pem["ca"])) as client:
         assert await client.ready()
         assert len((await client.detect(cloud)).grasps) == 10
@@ -86,22 +76,9 @@ async def test_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) ->
     assert {type(by_other), type(plain)} == {ServerUnavailableError}
 
 
-async def test_the_synchronous_client_over_tls(
-    serve, server_tls, pem, transport: str, cloud: np.ndarray
-) -> None:
-    server = (await serve(**server_tls, tokens=[USER])).server
-    address = address_of(server, transport)
-
-    def detect() -> int:
-        with GraspClient(address, tls=Tls(ca=pem["ca"]), token=USER) as client:
-            return len(client.detect(cloud).grasps)
-
-    assert await asyncio.to_thread(detect) == 10
-
-
 async def test_mutual_tls(serve, server_tls, pem, transport: str, cloud: np.ndarray) -> None:
-    server = (await serve(**server_tls, tls_client_ca=pem["ca"])).server
-    address = address_of(server, transport)
+    running = await serve(**server_tls, tls_client_ca=pem["ca"])
+    address = running.address(transport)
     own = Tls(pem["ca"], pem["client"], pem["client_key"])
     async with AsyncGraspClient(address, tls=own) as client:
         assert len((await client.detect(cloud)).grasps) == 10
@@ -125,12 +102,12 @@ async def test_certificates_are_read_anew(
 
     put("")
     given = {"tls_certificate": files["server"], "tls_key": files["server_key"]}
-    server = (await serve(**given, tls_client_ca=files["ca"])).server
-    address = address_of(server, transport)
+    running = await serve(**given, tls_client_ca=files["ca"])
+    address = running.address(transport)
     async with AsyncGraspClient(address, tls=tls("", "")) as before:
         assert await before.models()
         put("other_")
-        await server.reloader.reload(ADMINISTRATOR)
+        await running.server.reloader.reload(ADMINISTRATOR)
         async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
             assert len((await after.detect(cloud)).grasps) == 10
         assert len((await before.detect(cloud)).grasps) == 10
@@ -138,20 +115,9 @@ async def test_certificates_are_read_anew(
         assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
     files["server_key"].write_text("half a k")
     with pytest.raises(ReloadFailed, match="They are no certificate with its key"):
-        await server.reloader.reload(ADMINISTRATOR)
+        await running.server.reloader.reload(ADMINISTRATOR)
     async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
         assert await still.models()
-
-
-async def test_no_tls_older_than_1_2(serve, server_tls, pem) -> None:
-    server = (await serve(**server_tls)).server
-    context = ssl.create_default_context(cafile=pem["ca"])
-    context.maximum_version = ssl.TLSVersion.TLSv1_2
-    async with httpx.AsyncClient(verify=context) as http:
-        assert (await http.get(f"{server.http_url}/health/live")).status_code == 200
-    loaded = load_tls(Settings(**server_tls))
-    assert loaded is not None
-    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 @pytest.mark.parametrize(
@@ -161,47 +127,28 @@ async def test_no_tls_older_than_1_2(serve, server_tls, pem) -> None:
         ({"tls_key": "other_server_key"}, "They are no certificate with its key"),
         ({"tls_certificate": "text"}, "They are no certificate with its key"),
         ({"tls_client_ca": "text"}, "tls_client_ca: got"),
-        ({"tls_key": "encrypted"}, "nobody is there to ask"),
     ],
 )
 def test_bad_certificates_are_named(
     pem, server_tls, tmp_path: Path, changed: dict[str, str], sentence: str
 ) -> None:
     (tmp_path / "text").write_text("no certificate")
-    files = {**pem, "text": tmp_path / "text", "encrypted": encrypted(pem, tmp_path)}
+    files = {**pem, "text": tmp_path / "text"}
     given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
     with pytest.raises(InvalidSettings) as caught:
         load_tls(Settings(**given))
     assert sentence in str(caught.value)
 
 
-def encrypted(pem: dict[str, Path], folder: Path) -> Path:
-    from cryptography.hazmat.primitives import serialization
-
-    key = serialization.load_pem_private_key(pem["server_key"].read_bytes(), None)
-    path = folder / "encrypted.pem"
-    path.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.BestAvailableEncryption(b"word"),
-        )
-    )
-    return path
-
-
-async def test_tokens(serve, transport: str, cloud: np.ndarray, tmp_path: Path) -> None:
-    file = tmp_path / "tokens"
-    file.write_text(f"# of the cell\n\n  {SECOND}\n")
-    server = (await serve(tokens=[USER], token_file=file, admin_tokens=[ADMIN])).server
-    address = address_of(server, transport)
-    for token in (USER, SECOND, ADMIN):
+async def test_tokens(serve, transport: str, cloud: np.ndarray) -> None:
+    running = await serve(tokens=[USER], admin_tokens=[ADMIN])
+    address = running.address(transport)
+    for token in (USER, ADMIN):
         async with AsyncGraspClient(address, token=token) as client:
             assert len((await client.detect(cloud)).grasps) == 10
-    for token in (None, WRONG, USER[:-1], USER + "x"):
+    for token in (None, WRONG, USER[:-1]):
         error = await refused(address, token=token)
         assert isinstance(error, AccessDeniedError)
-        assert "authorization: got" in str(error)
         assert token is None or token not in str(error)
 
 
@@ -212,7 +159,7 @@ PROTECTED = [
 
 
 async def test_only_probes_are_open(serve) -> None:
-    server = (await serve(tokens=[USER], admin_tokens=[ADMIN])).server
+    server = (await serve(tokens=[USER], admin_tokens=[ADMIN], max_body_bytes=1024)).server
     async with httpx.AsyncClient(base_url=server.http_url) as http:
         for path in ("/health/live", "/health/ready", "/docs", "/openapi.json"):
             assert (await http.get(path)).status_code == 200
@@ -221,6 +168,12 @@ async def test_only_probes_are_open(serve) -> None:
             assert answer.status_code == 401, path
             assert answer.headers["www-authenticate"] == 'Bearer realm="edgegrasp"'
             assert answer.json()["type"] == "urn:edgegrasp:error:unauthenticated"
+        evil = {"origin": "http://evil.example", "access-control-request-method": "POST"}
+        for answer in (
+            await http.options("/v1/grasps", headers=evil),
+            await http.get("/v1/models", headers=evil),
+        ):
+            assert not [name for name in answer.headers if name.startswith("access-control")]
         basic = await http.get("/v1/models", auth=("user", USER))
         assert basic.json()["value"] == "another scheme than Bearer"
     async with aio.insecure_channel(server.grpc_address) as channel:
@@ -230,79 +183,23 @@ async def test_only_probes_are_open(serve) -> None:
         reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
         request = reflection_pb2.ServerReflectionRequest(list_services="")
         unknown = channel.unary_unary("/edgegrasp.v1.GraspService/None", bytes, bytes)
-        for call in (reflection.ServerReflectionInfo(iter([request])), unknown(b"")):
+        too_large = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))  # which is not read
+        for call in (
+            reflection.ServerReflectionInfo(iter([request])),
+            unknown(b""),
+            grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(too_large),
+        ):
             assert await call.code() == StatusCode.UNAUTHENTICATED
 
 
-async def test_a_refused_request_is_not_read(serve) -> None:
-    """Without a token, a body over the limit is refused for the token, not for its size."""
-    server = (await serve(tokens=[USER], max_body_bytes=1024)).server
-    stub_request = grasp_pb2.DetectGraspsRequest(points=bytes(12_000))
-    async with aio.insecure_channel(server.grpc_address) as channel:
-        call = grasp_pb2_grpc.GraspServiceStub(channel).DetectGrasps(stub_request)
-        assert await call.code() == StatusCode.UNAUTHENTICATED
-        detail = dict(await call.trailing_metadata())["edgegrasp-error-bin"]
-        assert grasp_pb2.ErrorDetail.FromString(detail).kind == "unauthenticated"
-
-
-async def test_no_token_reaches_a_log_or_an_answer(serve, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG)
-    server = (await serve(tokens=[USER], admin_tokens=[ADMIN])).server
-    for token in (USER, ADMIN, WRONG):
-        headers = {"authorization": f"Bearer {token}"}
-        async with httpx.AsyncClient(base_url=server.http_url, headers=headers) as http:
-            for path in ("/v1/models", "/metrics", "/none"):
-                answer = await http.get(path)
-                assert token not in answer.text + str(answer.headers)
-        async with AsyncGraspClient(server.grpc_address, token=token) as client:
-            await asyncio.gather(client.models(), return_exceptions=True)
-    ours = [record for record in caplog.records if record.name.startswith("edgegrasp")]
-    assert len(ours) > 6
-    assert not any(token in str(vars(record)) for record in ours for token in (USER, ADMIN, WRONG))
-    assert USER not in repr(Settings(tokens=[USER])) + str(Settings(tokens=[USER]))
-
-
-async def test_no_other_origin_is_let_in(serve) -> None:
-    server = (await serve()).server
-    async with httpx.AsyncClient(base_url=server.http_url) as http:
-        headers = {"origin": "http://evil.example", "access-control-request-method": "POST"}
-        for answer in (
-            await http.options("/v1/grasps", headers=headers),
-            await http.get("/v1/models", headers=headers),
-        ):
-            assert not [name for name in answer.headers if name.startswith("access-control")]
-
-
-async def test_only_this_machine_by_default(serve) -> None:
-    server = (await serve()).server
-    assert server.grpc_address.startswith("127.0.0.1:")
-    assert server.http_url.startswith("http://127.0.0.1:")
-
-
-def test_the_client_refuses_what_cannot_be() -> None:
-    missing = Path("none.pem")
-    for security in (
-        {"token": "two words"},
-        {"token": "line\nbreak"},
-        {"token": ""},
-        {"tls": Tls(ca=missing)},
-    ):
-        for address in ("127.0.0.1:1", "https://127.0.0.1:1"):
-            with pytest.raises(InvalidRequestError):
-                GraspClient(address, **security)
-    with pytest.raises(InvalidRequestError, match="alone"):
-        Tls(certificate=missing)
-
-
-@pytest.mark.parametrize("secure", ["plain", "tls", "client certificates"])
-async def test_the_containers_health_check(serve, server_tls, pem, secure: str) -> None:
-    given: dict[str, Any] = {} if secure == "plain" else dict(server_tls)
-    if secure == "client certificates":
-        given["tls_client_ca"] = pem["ca"]
+async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) -> None:
+    given = server_tls | {"tls_client_ca": pem["ca"]}
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
-    settings = Settings(**given, http_port=port)
-    assert await asyncio.to_thread(is_ready, settings)
+    assert await asyncio.to_thread(is_ready, Settings(**given, http_port=port))
+    loaded = load_tls(Settings(**given))
+    assert loaded is not None
+    assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
 async def test_the_health_check_waits_for_weights(begin) -> None:

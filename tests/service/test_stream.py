@@ -35,10 +35,13 @@ async def streams() -> AsyncIterator[Any]:
 async def test_answers_come_in_order_and_are_those_of_single_calls(serve, streams, cloud) -> None:
     running = await serve()
     stream = streams(running)
-    for seed in range(9):
+    await stream.write(request("cloud 0", cloud, seed=0))
+    answers = [await stream.read()]  # before the next request
+    for seed in range(1, 9):
         await stream.write(request(f"cloud {seed}", cloud, seed=seed))
     await stream.done_writing()
-    answers = [answer async for answer in stream]
+    while (answer := await stream.read()) is not aio.EOF:
+        answers.append(answer)
     assert [answer.request_id for answer in answers] == [f"cloud {seed}" for seed in range(9)]
     assert await stream.code() is grpc.StatusCode.OK
     async with aio.insecure_channel(running.server.grpc_address) as channel:
@@ -47,15 +50,6 @@ async def test_answers_come_in_order_and_are_those_of_single_calls(serve, stream
             alone = await stub.DetectGrasps(request("", cloud, seed=seed).request)
             assert answer.detection.grasps == alone.grasps
     assert running.ended == [""] * 18
-
-
-async def test_an_answer_comes_before_the_next_request(serve, streams, cloud) -> None:
-    stream = streams(await serve())
-    for name in ("a", "b", "a"):
-        await stream.write(request(name, cloud))
-        assert (await stream.read()).request_id == name
-    await stream.done_writing()
-    assert await stream.read() is aio.EOF
 
 
 async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, cloud) -> None:
@@ -69,19 +63,11 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, clou
         await stream.write(message)
     await stream.done_writing()
     answers = [answer async for answer in stream]
-    assert [answer.WhichOneof("answer") for answer in answers] == [
-        "detection",
-        "error",
-        "error",
-        "error",
-        "detection",
-    ]
+    kinds = [answer.WhichOneof("answer") for answer in answers]
+    assert kinds == ["detection", *["error"] * 3, "detection"]
     told = {answer.request_id: answer.error for answer in answers[1:4]}
-    assert {name: error.detail.field for name, error in told.items()} == {
-        "empty": "cloud",
-        "negative": "timeout",
-        "few": "cloud",
-    }
+    named = {name: error.detail.field for name, error in told.items()}
+    assert named == {"empty": "cloud", "negative": "timeout", "few": "cloud"}
     for error in told.values():
         assert error.code == grpc.StatusCode.INVALID_ARGUMENT.value[0]
         assert error.detail.kind == "invalid-request"
@@ -129,7 +115,7 @@ async def test_what_the_client_does_not_take_is_not_computed(serve, cloud) -> No
         stream = grpc_stub(channel).DetectGraspsStream()
         sending = asyncio.create_task(send(stream, [request("", crowd, **many)] * 60))
         await running.until(lambda: len(running.calls) >= 3)
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(0.5)
         assert len(running.calls) < 40
         assert len([answer async for answer in stream]) == 60
         await sending
@@ -200,22 +186,3 @@ async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(
     for each in (stream, idle):
         assert await each.code() is grpc.StatusCode.UNAVAILABLE
     await running.serving
-
-
-async def test_what_is_no_message_ends_the_stream(serve, cloud) -> None:
-    running = await serve()
-    method = "/edgegrasp.v1.GraspService/DetectGraspsStream"
-    bad = [b"\xff", b"\x0a\x02\xff\xfe"]  # no field at all; a name that is not UTF-8
-    async with aio.insecure_channel(running.server.grpc_address) as channel:
-        for data in bad:
-            stream = channel.stream_stream(method)()
-            await stream.write(data)
-            assert await stream.code() is grpc.StatusCode.INVALID_ARGUMENT
-        unknown = channel.stream_stream(method)()
-        await unknown.write(b"\xa0\x06\x01")
-        answer = grasp_pb2.DetectGraspsStreamResponse.FromString(await unknown.read())
-        assert (answer.error.detail.kind, answer.error.detail.field) == (
-            "invalid-request",
-            "request",
-        )
-        unknown.cancel()

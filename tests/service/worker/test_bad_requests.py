@@ -12,11 +12,6 @@ import pytest
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.grpc_wire import fill
-from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import report
-from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
-from edgegrasp_service.worker.job import Limits
 
 from .conftest import GrpcAsker, RestAsker
 
@@ -123,26 +118,12 @@ CASES = {
     "no cloud": Malformed("", "nothing", "Se"),
     "empty cloud": Malformed("cloud", "no points", "num_approach_points", points=POINTS[:0]),
     "NaN": Malformed("cloud", "row 17", "finite", points=spoiled(17, NAN)),
-    "infinity": Malformed("cloud", "row 3", "finite", points=spoiled(3, np.inf)),
     "millimetres": Malformed("cloud", "millimetres", "divide by 1000", points=POINTS * 1000),
     "fewer points than approach points": Malformed(
         "cloud", "5 points for num_approach_points = 32", "lower options.num", points=POINTS[:5]
     ),
     "normals for other points": Malformed(
         "normals", "shape (59, 3)", "60 points", points=POINTS, beside={"normals": POINTS[1:]}
-    ),
-    "normals with NaN": Malformed(
-        "normals", "row 2", "finite", points=POINTS, beside={"normals": spoiled(2, NAN)}
-    ),
-    "colours for other points": Malformed(
-        "colors", "shape (10, 3)", "60 points", points=POINTS, beside={"colors": POINTS[:10]}
-    ),
-    "segment ids for other points": Malformed(
-        "segment_ids", "shape (61,)", "60", points=POINTS, beside={"segment_ids": np.arange(61)}
-    ),
-    "view ids for other points": Malformed(
-        "view_ids", "shape (3,)", "60", {"viewpoint": [[0, 0, 1], [1, 0, 1]]},
-        points=POINTS, beside={"view_ids": np.arange(3)},
     ),
     # PointCloud2.
     "PointCloud2 without z": Malformed(
@@ -153,25 +134,8 @@ CASES = {
         "point_cloud2.fields.2.datatype", "5", "float32",
         ros=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
     ),
-    "PointCloud2 of an unknown type": Malformed(
-        "point_cloud2.fields.0.datatype", "9", "8",
-        ros=ros(fields=[{**ros()["fields"][0], "datatype": 9}, *ros()["fields"][1:]]),
-    ),
-    "PointCloud2 with a field beyond the point": Malformed(
-        "point_cloud2.fields.2.offset", "'z'", "point_step = 11", ros=ros(point_step=11)
-    ),
-    "PointCloud2 with short rows": Malformed(
-        "point_cloud2.row_step", "700", "width * point_step", ros=ros(row_step=700)
-    ),
     "PointCloud2 truncated": Malformed(
         "point_cloud2.data", "700 bytes", "whole cloud", ros=ros(data=POINTS.tobytes()[:700])
-    ),
-    "PointCloud2 of negative height": Malformed(
-        "point_cloud2.height", "-1", "greater", ros=ros(height=-1)
-    ),
-    "PointCloud2 with x twice": Malformed(
-        "point_cloud2.fields.1.name", "'x'", "once",
-        ros=ros(fields=[ros()["fields"][0]] * 2 + ros()["fields"][2:]),
     ),
     "PointCloud2 of too many points": Malformed(
         "point_cloud2", "2000001 points", "2000000", kind="payload-too-large",
@@ -181,19 +145,9 @@ CASES = {
     "depth image cut short": Malformed(
         "depth_images.0.depth.data", "4 bytes", "whole image", images=[image(data=bytes(4))]
     ),
-    "depth image of colours": Malformed(
-        "depth_images.1.depth.encoding", "'rgb8'", "16UC1",
-        images=[image(), image(encoding="rgb8")],
-    ),
-    "depth image without pixels": Malformed(
-        "depth_images.0.depth.height", "0", "greater", images=[image(height=0)]
-    ),
     "depth image of negative depth": Malformed(
         "depth_images.0.depth", "-0.5 m", "0 or NaN",
         images=[image(data=np.full(80, -0.5, "<f4").tobytes())],
-    ),
-    "depth image without a reading": Malformed(
-        "cloud", "holes only", "finite", images=[image(data=bytes(320))]
     ),
     "no focal length": Malformed(
         "depth_images.0.intrinsics.fx", "0.0", "greater than 0", images=[image(fx=0.0)]
@@ -206,35 +160,11 @@ CASES = {
         "options.viewpoint", "0.0, 0.0, 1.0", "Leave it out",
         {"viewpoint": [0.0, 0.0, 1.0]}, images=[image()],
     ),
-    "depth images beside points": Malformed(
-        "depth_images", "beside points", "one", points=POINTS, images=[image()]
-    ),
     # Options.
     "unknown model": Malformed(
         "options.model", "'resnet'", "dummy", {"model": "resnet"}, "unknown-model", points=POINTS
     ),
-    "no approach points": option("num_approach_points", 0, "", "0", "greater"),
-    "too many candidates": option("num_candidates", 10**6, "", "1000000", "16000"),
     "unknown sampling": option("sampling", "best", "", "'best'", "'uniform'"),
-    "negative seed": option("seed", -1, "", "-1", "greater"),
-    "NaN in a viewpoint": option("viewpoint", [NAN, 0.0, 0.0], ".0", "nan", "finite"),
-    "no direction up": option("up", [0.0, 0.0, 0.0], "", "[0.0, 0.0, 0.0]", "zero vector"),
-    "support normal of length 2": option(
-        "support", {"normal": [0.0, 0.0, 2.0], "offset": 0.0}, ".normal", "2.0", "length 1"
-    ),
-    "support plane without offset": option(
-        "support", {"normal": [0.0, 0.0, 1.0]}, ".offset", "nothing", "required"
-    ),
-    "depths wrong by half": option(
-        "support", {"normal": [0.0, 0.0, 1.0], "offset": 0.0, "max_depth_error": 0.5},
-        ".max_depth_error", "0.5", "0.3",
-    ),
-    "RANSAC without a distance": option(
-        "support", {"kind": "ransac", "distance": 0.0}, ".distance", "0.0", "greater than 0"
-    ),
-    "workspace upside down": option(
-        "workspace", {"min": [1.0, 0.0, 0.0], "max": [0.0, 1.0, 1.0]}, "", "min", "below"
-    ),
     "ball without a radius": option(
         "approach_region", shape(kind="sphere", center=[0.0, 0.0, 0.0], radius=0.0),
         ".include.0.radius", "0.0", "greater than 0",
@@ -244,36 +174,14 @@ CASES = {
         shape(kind="oriented_box", center=[0] * 3, half_extents=[1] * 3, quaternion=[0, 0, 0, 2]),
         ".include.0.quaternion", "2", "length 1",
     ),
-    "negative index": option(
-        "approach_region", shape(kind="indices", indices=[4, -1]), ".include.0.indices.1", "-1",
-        "greater",
-    ),
     "no segment": option(
         "contact_region", shape(kind="segments", ids=[]), ".include.0.ids", "[]", "at least 1"
     ),
     "approach direction of nothing": option("approach_direction", {}, "", "{", "cone"),
-    "cone too wide": option(
-        "approach_direction", {"cones": [{"direction": [0.0, 0.0, -1.0], "max_angle": 4.0}]},
-        ".cones.0.max_angle", "4.0", "less",
-    ),
-    "unknown preset": option("approach_direction", {"preset": "up"}, ".preset", "'up'", "'side'"),
-    "unknown collision mode": option("collision", {"mode": "dodge"}, ".mode", "'dodge'", "'avoid'"),
-    "margin of a metre": option("collision", {"margin": 1.0}, ".margin", "1.0", "0.1"),
-    "obstacle upside down": option(
-        "collision", {"obstacles": [{"kind": "box", "min": [1.0] * 3, "max": [0.0] * 3}]},
-        ".obstacles.0", "min", "below",
-    ),
     "gripper without fingertips": option(
         "gripper", {name: GRIPPER[name] for name in GRIPPER if name != "tip_z"}, ".tip_z",
         "nothing", "required",
     ),
-    "gripper that contradicts itself": option(
-        "gripper", GRIPPER | {"tip_z": 0.2}, "", "max_opening", "highest z"
-    ),
-    "score above 1": option("min_score", 1.5, "", "1.5", "less"),
-    "no grasp asked for": option("top_k", 0, "", "0", "greater"),
-    "negative suppression": option("suppression", {"rotation": -1.0}, ".rotation", "-1.0", "great"),
-    "unknown order": option("order", "best", "", "'best'", "'clearance'"),
     # Numbers beyond every measure, and what is no number.
     "up beyond measure": option("up", [1e200, 0.0, 1e200], ".0", "1e+200", "10000000"),
     "viewpoint beyond measure": option("viewpoint", [0.0, 1e300, 0.0], ".1", "1e+300", "10000000"),
@@ -293,9 +201,6 @@ CASES = {
     ),
     "edge to no point": Malformed(
         "edges", "60", "59", points=POINTS, edges=[[0, 1], [2, 60]], scores=True
-    ),
-    "edge from a negative row": Malformed(
-        "edges", "-1", "59", points=POINTS, edges=[[-1, 1]], scores=True
     ),
     "too many edges": Malformed(
         "edges", "16001", "16000", points=POINTS, edges=[[0, 1]] * 16001, scores=True
@@ -334,23 +239,13 @@ def test_malformed(name: str, both: RestAsker | GrpcAsker) -> None:
 JSON_CASES = {
     "wrong shape": ({"points": [[0.0, 0.0]] * 40}, "cloud", "shape (40, 2)", "(N, 3)"),
     "no rows": ({"points": [0.0, 0.0, 0.0]}, "cloud", "shape (3,)", "(N, 3)"),
-    "ragged": ({"points": [[0, 0, 0], [1]]}, "points", "different lengths", "[x, y, z]"),
-    "text": ({"points": [["a", "b", "c"]]}, "points", "['a', 'b', 'c']", "numbers"),
-    "no points": ({"options": {}}, "points", "nothing", "[x, y, z]"),
     "unknown field": ({"points": [], "pints": []}, "pints", "unknown", "points,"),
     "unknown option": ({"points": [], "options": {"sead": 1}}, "options.sead", "unknown", "seed"),
-    "options no object": ({"points": [], "options": [1]}, "options", "[1]", "object"),
     "true for a seed": (
         {"points": [], "options": {"seed": True}}, "options.seed", "True", "number"
     ),
     "text for a number": (
         {"points": [], "options": {"min_score": "0.5"}}, "options.min_score", "'0.5'", "number"
-    ),
-    "a number for a truth": (
-        {"points": [], "options": {"debug": 1}}, "options.debug", "1", "boolean"
-    ),
-    "true in a vector": (
-        {"points": [], "options": {"up": [0, 0, True]}}, "options.up.2", "True", "number"
     ),
     "unknown field of a shape": (
         {"points": [], "options": {"contact_region": {"include": [{"kind": "sphere", "r": 1}]}}},
@@ -360,15 +255,6 @@ JSON_CASES = {
         {"points": [], "options": {"contact_region": {"exclude": [{"kind": "cube"}]}}},
         "options.contact_region.exclude.0", "cube", "kind",
     ),
-    "two clouds": (
-        {"points": POINTS.tolist(), "point_cloud2": {}}, "point_cloud2", "beside points", "one"
-    ),
-    "text for segments": (
-        {"points": POINTS.tolist(), "segment_ids": "a"}, "segment_ids", "'a'", "list"
-    ),
-    "fractions for segments": (
-        {"points": POINTS.tolist(), "segment_ids": [0.5] * 60}, "segment_ids", "float64", "integer"
-    ),
     "no object": ([1, 2], "body", "[1, 2]", "object"),
     "NaN": (b'{"points": [[NaN, 0, 0], [0, 0, Infinity]]}', "cloud", "2 points with NaN", "finite"),
     "key twice": (b'{"points": [], "points": []}', "body", "2 times the key 'points'", "once"),
@@ -376,8 +262,6 @@ JSON_CASES = {
         b'{"points": [], "options": {"seed": 1, "seed": 2}}', "body", "the key 'seed'", "once"
     ),
     "empty": (b"", "body", "no valid JSON", "object"),
-    "cut short": (b'{"points": [[0, 0, ', "body", "no valid JSON", "object"),
-    "no UTF-8": (b"\xff\xfe", "body", "no valid JSON", "object"),
     "deep": (b"[" * 10_000, "body", "", ""),
     "half a character": (b'{"\\ud800": 1}', "\\ud800", "unknown", "only"),
     "more lists than points have": (
@@ -397,8 +281,8 @@ def test_bad_json(name: str, rest: RestAsker) -> None:
 
 
 def test_the_shortest_points_and_edges_there_are(rest: RestAsker) -> None:
-    points = b"[0,0,0]," * 50_000 + b"[0,0,1]"
-    edges = b",".join([b"[0,1]"] * 16_000)
+    points = b"[0,0,0]," * 5_000 + b"[0,0,1]"
+    edges = b",".join([b"[0,1]"] * 4_000)
     for beside, score in ((b"", False), (b',"edges":[' + edges + b"]", True)):
         assert rest.send(b'{"points":[' + points + b"]" + beside + b"}", score).error is None
 
@@ -409,27 +293,7 @@ def npy(array: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-# Name: array, options, field, part of value, part of fix.
-FILES = {
-    "wrong shape": (POINTS[:, :2], {}, "cloud", "shape (60, 2)", "(N, 3)"),
-    "four axes": (POINTS.reshape(5, 4, 3, 3), {}, "cloud", "shape (5, 4, 3, 3)", "(N, 3)"),
-    "integers": (POINTS.astype(np.int32), {}, "cloud", "dtype int32", "float32"),
-    "complex numbers": (POINTS.astype(complex), {}, "cloud", "dtype complex128", "float32"),
-    "option out of range": (POINTS, {"top_k": 0}, "options.top_k", "0", "greater"),
-}
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_bad_files(name: str, both: RestAsker | GrpcAsker) -> None:
-    array, options, field, value, fix = FILES[name]
-    error = both.file("npy", npy(array), **options).error
-    assert error is not None
-    assert (error.kind, error.field) == ("invalid-request", field)
-    assert value in error.value
-    assert fix in error.fix
-
-
-@pytest.mark.parametrize("media_type", ["", "text/plain", "application/x-las", "image/png"])
+@pytest.mark.parametrize("media_type", ["", "text/plain", "application/x-las"])
 def test_unread_media_type(media_type: str, rest: RestAsker) -> None:
     error = rest.problem("DetectGrasps", b"0 0 0", media_type)
     assert (error.status, error.field, error.value) == (415, "Content-Type", repr(media_type))
@@ -448,11 +312,6 @@ def test_unread_media_type(media_type: str, rest: RestAsker) -> None:
 )
 def test_bad_queries(query: str, field: str, rest: RestAsker) -> None:
     assert rest.problem("DetectGrasps", npy(POINTS), "application/x-npy", query).field == field
-
-
-def test_query_beside_json(rest: RestAsker) -> None:
-    body = json.dumps({"points": POINTS.tolist()}).encode()
-    assert rest.problem("DetectGrasps", body, "application/json", "seed=1").field == "seed"
 
 
 def form(*parts: tuple[str, bytes], end: bytes = b"--b--\r\n") -> bytes:
@@ -504,12 +363,6 @@ def test_a_good_form(rest: RestAsker) -> None:
         assert rest.answer("DetectGrasps", body, quoted).facts.grasps == 3
 
 
-def test_unread_format_in_a_message(grpc_: GrpcAsker) -> None:
-    error = grpc_.file("las", b"0 0 0").error
-    assert error is not None
-    assert (error.code, error.field, error.value) == ("INVALID_ARGUMENT", "format", "'las'")
-
-
 @pytest.mark.parametrize(
     ("body", "field", "value"),
     [
@@ -526,21 +379,17 @@ def test_bad_messages(body: Any, field: str, value: str, grpc_: GrpcAsker) -> No
     assert value in error.value
 
 
-UNKNOWN = {
-    "request": lambda message: message,
-    "request.options": lambda message: message.options,
-    "request.options.collision": lambda message: message.options.collision,
-    "request.options.viewpoint.0": lambda message: message.options.viewpoint.add(),
-    "request.options.contact_region.exclude.0": (
-        lambda message: message.options.contact_region.exclude.add()
-    ),
-}
-
-
-@pytest.mark.parametrize("field", UNKNOWN)
+@pytest.mark.parametrize(
+    "field",
+    ["request", "request.options", "request.options.viewpoint.0",
+     "request.options.contact_region.exclude.0"],
+)  # fmt: skip
 def test_unknown_fields_in_a_message(field: str, grpc_: GrpcAsker) -> None:
-    message = grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes())
-    UNKNOWN[field](message).MergeFromString(b"\xfa\x3f\x01a")  # number 1023, one byte
+    message: Any = grasp_pb2.DetectGraspsRequest(points=POINTS.tobytes())
+    part = message
+    for name in field.split(".")[1:]:
+        part = part.add() if name == "0" else getattr(part, name)
+    part.MergeFromString(b"\xfa\x3f\x01a")  # number 1023, one byte
     error = grpc_.send(message).error
     assert error is not None
     assert (error.kind, error.field) == ("invalid-request", field)
@@ -551,33 +400,26 @@ MANY = 200_000
 
 
 @pytest.mark.parametrize(
-    ("method", "body", "field"),
+    ("field", "body"),
     [
-        ("DetectGrasps", grasp_pb2.DetectOptions(viewpoint=[{}] * MANY), "options.viewpoint"),
+        ("options.viewpoint", {"options": {"viewpoint": [{}] * MANY}}),
+        ("options.collision.obstacles", {"options": {"collision": {"obstacles": [{}] * MANY}}}),
         (
-            "DetectGrasps",
-            grasp_pb2.DetectOptions(collision={"obstacles": [{}] * MANY}),
-            "options.collision.obstacles",
-        ),
-        (
-            "DetectGrasps",
-            grasp_pb2.DetectOptions(contact_region={"include": [{"indices": {}}] * MANY}),
             "options.contact_region.include",
+            {"options": {"contact_region": {"include": [{"indices": {}}] * MANY}}},
         ),
-        ("DetectGrasps", grasp_pb2.DetectGraspsRequest(depth_images=[{}] * MANY), "depth_images"),
-        ("ScoreGrasps", grasp_pb2.ScoreGraspsRequest(edges=[{}] * MANY), "edges"),
-        ("ScoreGrasps", grasp_pb2.ScoreGraspsRequest(hand_poses=[{}] * MANY), "hand_poses"),
+        ("depth_images", {"depth_images": [{}] * MANY}),
+        ("edges", {"edges": [{}] * MANY}),
+        ("hand_poses", {"hand_poses": [{}] * MANY}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_many_empty_messages_are_counted_not_read(
-    method: str, body: Any, field: str, grpc_: GrpcAsker
+    field: str, body: dict[str, Any], grpc_: GrpcAsker
 ) -> None:
-    """Two bytes each on the wire, and once half a kilobyte each in Python."""
-    if isinstance(body, grasp_pb2.DetectOptions):
-        body = grasp_pb2.DetectGraspsRequest(options=body)
-    body.points = POINTS.tobytes()
-    content = body.SerializeToString()
+    """Row 6: two bytes each on the wire, and once half a kilobyte each in Python."""
+    content = grasp_pb2.ScoreGraspsRequest(points=POINTS.tobytes(), **body).SerializeToString()
+    method = "ScoreGrasps" if field in ("edges", "hand_poses") else "DetectGrasps"
     tracemalloc.start()
     try:
         error = grpc_.problem(method, content)
@@ -586,24 +428,3 @@ def test_many_empty_messages_are_counted_not_read(
         tracemalloc.stop()
     assert (error.kind, error.field, error.value) == ("invalid-request", field, f"{MANY} of them")
     assert peak < 2_000_000
-
-
-def test_limits_of_the_server(points: np.ndarray) -> None:
-    limits = Limits(max_points=50, max_approach_points=8, max_candidates=100)
-    rest = RestAsker(Answerer(DummyCatalogue(), limits))
-    cases: list[tuple[dict[str, Any], str]] = [
-        ({"options": {"num_approach_points": 9}}, "options.num_approach_points"),
-        ({"options": {"num_approach_points": 8, "num_candidates": 101}}, "options.num_candidates"),
-        ({"options": {"num_approach_points": 8, "num_candidates": 9}}, "cloud"),
-    ]
-    for fields, named in cases:
-        error = rest.send({"points": points.tolist()} | fields).error
-        assert error is not None
-        assert (error.kind, error.field) == ("payload-too-large", named)
-
-
-def test_half_a_character_is_told_in_whole_ones() -> None:
-    """JSON can name one; UTF-8 cannot hold it, and no answer could be written."""
-    told = report(InvalidRequest("\ud800", "an unknown field", "Remove it."))
-    assert told.field == "\\ud800"
-    assert told.detail.encode() == rb"\ud800: got an unknown field. Remove it."

@@ -6,11 +6,11 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge
 from edgegrasp_service.worker.formats import read_file
 from edgegrasp_service.worker.request_cloud import decode_points
 
@@ -93,28 +93,8 @@ def test_every_format_gives_the_same_points(name: str) -> None:
     assert points.dtype.isnative
 
 
-@pytest.mark.parametrize("suffix", ["ply", "pcd"])
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("compressed", [False, True])
-def test_files_written_by_open3d(suffix: str, text: bool, compressed: bool, tmp_path) -> None:
-    open3d = pytest.importorskip("open3d", exc_type=ImportError)
-    path = tmp_path / f"cloud.{suffix}"
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
-    open3d.io.write_point_cloud(path, cloud, write_ascii=text, compressed=compressed)
-    points = read_file(suffix, path.read_bytes(), MANY).points
-    # Open3D writes few digits of text.
-    np.testing.assert_allclose(points, POINTS, atol=1e-5 if text else 1e-7)
-
-
-def test_packed_and_listed_points_match() -> None:
-    np.testing.assert_array_equal(decode_points(POINTS.tobytes(), MANY), POINTS)
-    listed = decode_points(POINTS.tolist(), MANY)
-    np.testing.assert_array_equal(listed.astype(np.float32), POINTS)
-    assert decode_points(b"", MANY).shape == decode_points([], MANY).shape == (0, 3)
-    assert decode_points([[0, 0, 1]], MANY).dtype == np.float64
-
-
 @pytest.mark.parametrize("name", [name for name in GOOD_FILES if name != "xyz"])
+@settings(max_examples=30, derandomize=True, deadline=None)
 @given(data=st.data())
 def test_truncated_files_are_refused(name: str, data: st.DataObject) -> None:
     whole = GOOD_FILES[name]
@@ -128,24 +108,18 @@ def test_truncated_files_are_refused(name: str, data: st.DataObject) -> None:
     assert caught.value.field == "cloud"
 
 
-def promise(count: int, file_format: str) -> bytes:
-    if file_format == "ply":
-        return ply(POINTS, promised=count)
-    if file_format == "pcd":
-        return pcd(POINTS, promised=count)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": (count, 3)}
-    )
-    return header.getvalue() + POINTS.tobytes()
-
-
-@pytest.mark.parametrize("file_format", ["npy", "ply", "pcd"])
 @pytest.mark.parametrize("count", [42, 10**9, 10**17])
-def test_a_header_cannot_promise_more_than_there_is(file_format: str, count: int) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        read_file(file_format, promise(count, file_format), max_points=10**18)
-    assert "promises" in caught.value.value
+def test_a_header_cannot_promise_more_than_there_is(count: int) -> None:
+    header = {"descr": "<f4", "fortran_order": False, "shape": (count, 3)}
+    files = {
+        "npy": npy_of(repr(header), POINTS.tobytes()),
+        "ply": ply(POINTS, promised=count),
+        "pcd": pcd(POINTS, promised=count),
+    }
+    for file_format, data in files.items():
+        with pytest.raises(InvalidRequest) as caught:
+            read_file(file_format, data, max_points=10**18)
+        assert "promises" in caught.value.value
 
 
 @pytest.mark.parametrize("name", GOOD_FILES)
@@ -154,19 +128,6 @@ def test_too_many_points(name: str) -> None:
         read_file(name[:3], GOOD_FILES[name], max_points=39)
     assert caught.value.value == "40 points"
     assert "39" in caught.value.fix
-
-
-def test_a_bomb_that_lies_about_its_size_is_not_unpacked() -> None:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("points.npy", bytes(50_000_000))
-    lying = stream.getvalue().replace(struct.pack("<I", 50_000_000), struct.pack("<I", 100))
-    tracemalloc.start()
-    with pytest.raises(InvalidRequest, match=r"no whole \.npz file"):
-        read_file("npz", lying, MANY)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 2_000_000
 
 
 @pytest.mark.parametrize(
@@ -182,38 +143,6 @@ def test_an_archive_must_say_which_array(data: bytes, value: str) -> None:
         read_file("npz", data, MANY)
     assert value in caught.value.value
     assert "points=points" in caught.value.fix
-
-
-@pytest.mark.parametrize(
-    ("points", "field", "value"),
-    [
-        ("abc", "points", "'abc'"),
-        (None, "points", "None"),
-        ([[0.0, 0.0, 0.0], [1.0, 2.0]], "points", "rows of different lengths"),
-        ([[0.0, 0.0, 0.0], ["a", 0.0, 0.0]], "points", "['a', 0.0, 0.0]"),
-        ([[0.0, 0.0, None]], "points", "[0.0, 0.0, None]"),
-        ([[True, False, True]], "points", "[True, False, True]"),
-        ([[10**400, 0, 0]], "points", "[1000000"),
-        ([{}], "points", "{}"),
-    ],
-)
-def test_lists_that_are_no_numbers(points: object, field: str, value: str) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        decode_points(points, MANY)
-    assert caught.value.field == field
-    assert caught.value.value.startswith(value)
-
-
-def test_packed_bytes_must_be_whole_points() -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        decode_points(POINTS.tobytes()[:-5], MANY)
-    assert caught.value.value.startswith("475 bytes")
-
-
-def test_unknown_format_names_the_known_ones() -> None:
-    with pytest.raises(UnsupportedMediaType) as caught:
-        read_file("las", b"LASF", MANY)
-    assert caught.value.fix == "Send one of: npy, npz, ply, pcd, xyz."
 
 
 @pytest.mark.parametrize(
@@ -233,26 +162,17 @@ def test_ply_headers_without_points(header: bytes) -> None:
     assert "vert" in caught.value.value
 
 
-def test_integer_coordinates_keep_their_type() -> None:
-    header = b"ply\nformat ascii 1.0\nelement vertex 1\n"
-    header += b"property int x\nproperty int y\nproperty int z\nend_header\n1 2 3\n"
-    assert read_file("ply", header, MANY).points.dtype == np.int32
-
-
-def test_compressed_pcd_without_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compressed_pcd(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With sizes that lie, and where nothing can unpack it."""
+    head, mark, _ = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    for sizes in ((4, 10**9), (10**9, 840)):
+        with pytest.raises(InvalidRequest):
+            read_file("pcd", head + mark + struct.pack("<II", *sizes) + bytes(4), MANY)
     monkeypatch.setitem(sys.modules, "open3d", None)
     body = struct.pack("<II", 4, 40 * 21) + bytes(4)
-    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
     with pytest.raises(DecoderMissing) as caught:
-        read_file("pcd", data[0] + data[1] + body, MANY)
+        read_file("pcd", head + mark + body, MANY)
     assert "uncompressed" in caught.value.fix
-
-
-@pytest.mark.parametrize("sizes", [(4, 10**9), (10**9, 840)])
-def test_compressed_pcd_with_false_sizes(sizes: tuple[int, int]) -> None:
-    data = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
-    with pytest.raises(InvalidRequest):
-        read_file("pcd", data[0] + data[1] + struct.pack("<II", *sizes) + bytes(4), MANY)
 
 
 NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
@@ -268,24 +188,6 @@ def test_what_stands_beside_points_in_an_npz_file() -> None:
     with pytest.raises(PayloadTooLarge) as caught:
         read_file("npz", npz(points=POINTS, segment_ids=np.zeros(1001, np.int32)), MANY)
     assert caught.value.field == "segment_ids"
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-def test_normals_and_colours_of_a_ply_file(encoding: str) -> None:
-    names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
-    kinds = ["float"] * 6 + ["uchar"] * 3
-    header = f"ply\nformat {encoding} 1.0\nelement vertex 40\n"
-    header += "".join(f"property {k} {n}\n" for k, n in zip(kinds, names, strict=True))
-    table = np.concatenate([POINTS, NORMALS, COLORS], axis=1)
-    if encoding == "ascii":
-        body = "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
-    else:
-        rows = [POINTS[i].tobytes() + NORMALS[i].tobytes() + COLORS[i].tobytes() for i in range(40)]
-        body = b"".join(rows)
-    cloud = read_file("ply", header.encode() + b"end_header\n" + body, MANY)
-    np.testing.assert_array_equal(cloud.points, POINTS)
-    np.testing.assert_array_equal(cloud.normals, NORMALS)
-    np.testing.assert_array_equal(cloud.colors, COLORS)
 
 
 @pytest.mark.parametrize("kind", ["F", "U"])
@@ -307,19 +209,21 @@ def test_normals_and_colours_of_a_pcd_file(kind: str, height: int) -> None:
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz"])
 @pytest.mark.parametrize("compressed", [False, True])
-def test_normals_and_colours_written_by_open3d(suffix: str, compressed: bool, tmp_path) -> None:
+@pytest.mark.parametrize("text", [False, True])
+def test_files_written_by_open3d(suffix: str, compressed: bool, text: bool, tmp_path) -> None:
     open3d = pytest.importorskip("open3d", exc_type=ImportError)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(np.float64)))
     cloud.normals = open3d.utility.Vector3dVector(NORMALS.astype(np.float64))
     cloud.colors = open3d.utility.Vector3dVector(COLORS / 255)
     path = tmp_path / f"cloud.{suffix}"
-    open3d.io.write_point_cloud(path, cloud, compressed=compressed)
+    open3d.io.write_point_cloud(path, cloud, write_ascii=text, compressed=compressed)
     found = read_file(suffix, path.read_bytes(), MANY)
-    np.testing.assert_allclose(found.points, POINTS, atol=1e-7)
+    close = 1e-5 if text else 1e-6  # it writes few digits of text
+    np.testing.assert_allclose(found.points, POINTS, atol=close)
     if suffix == "xyz":
         assert found.normals is found.colors is None
         return
-    np.testing.assert_allclose(found.normals, NORMALS, atol=1e-6)
+    np.testing.assert_allclose(found.normals, NORMALS, atol=close)
     scale = 255 if found.colors.dtype.kind == "f" else 1
     np.testing.assert_allclose(found.colors * scale, COLORS, atol=1.0)
 
@@ -426,6 +330,11 @@ def npz_of_zeros() -> bytes:
     return stream.getvalue()
 
 
+def npz_that_lies() -> bytes:
+    """About its size."""
+    return npz_of_zeros().replace(struct.pack("<I", 200 * MIB), struct.pack("<I", 100))
+
+
 def hidden_directory() -> bytes:
     """Two ends of a directory in one, of which a reader may take either."""
     data = bytearray(npz_of_many_members())
@@ -457,6 +366,7 @@ PLY += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
 
 BOMBS: dict[str, tuple[str, bytes]] = {
     "npz, ratio": ("npz", npz_of_zeros()),
+    "npz, lies": ("npz", npz_that_lies()),
     "npz, members": ("npz", npz_of_many_members()),
     "npz, two directories": ("npz", hidden_directory()),
     "npy, shape": ("npy", npy_promising(999_999_999_999)),
@@ -479,16 +389,3 @@ def test_bombs_in_files_are_refused_within_the_memory_of_the_body(name: str) -> 
     finally:
         tracemalloc.stop()
     assert peak < 2 * len(data) + 16 * MIB, f"{peak / MIB:.1f} MiB for {len(data) / MIB:.1f} MiB"
-
-
-def test_that_measure_notices_what_is_unpacked() -> None:
-    """The other way round: a good file takes more than its compressed size."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, points=np.zeros((1_000_000, 3)))
-    tracemalloc.start()
-    try:
-        read_file("npz", stream.getvalue(), 2_000_000)
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak > 2 * len(stream.getvalue()) + 16 * MIB

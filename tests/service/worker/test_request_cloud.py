@@ -59,14 +59,9 @@ def test_points_project_back_onto_their_pixels() -> None:
     np.testing.assert_allclose(FX * x / z + CX, column, atol=1e-4)
     np.testing.assert_allclose(FY * y / z + CY, row, atol=1e-4)
     np.testing.assert_array_equal(cameras, [T_cloud_camera[:3, 3]])
-
-
-def test_z_is_forward_and_y_down() -> None:
-    cloud, _ = fuse_depth_images([image(np.full((24, 32), 0.5), np.eye(4))], MANY)
-    assert (cloud.points[..., 2] == 0.5).all()
-    assert (cloud.points[0, :, 1] < 0).all()
-    assert (cloud.points[-1, :, 1] > 0).all()
-    assert (cloud.points[:, -1, 0] > 0).all()
+    sent = {"depth_images": [image(depth, T_cloud_camera)]}
+    _, options = decode_cloud(sent, DetectOptions(), MANY)
+    assert options.viewpoint == tuple(T_cloud_camera[:3, 3].tolist())
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
@@ -79,17 +74,14 @@ def test_encodings_say_the_same(encoding: str) -> None:
     sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
     in_json, _ = fuse_depth_images([sent], MANY)
     np.testing.assert_array_equal(in_json.points, packed.points)
-
-
-def test_rows_of_metres() -> None:
-    depth = depth_of((3, 4))
-    expected, _ = fuse_depth_images([image(depth, pose(3))], MANY)
-    rows = depth.tolist()
+    rows = (millimetres / 1000).tolist()
     rows[1][2] = None
-    listed, _ = fuse_depth_images([image(depth, pose(3)) | {"depth": rows}], MANY)
+    listed, _ = fuse_depth_images([sent | {"depth": rows}], MANY)
     assert np.isnan(listed.points[1, 2]).all()
-    expected.points[1, 2] = np.nan
-    np.testing.assert_array_equal(listed.points, expected.points)
+    np.testing.assert_allclose(listed.points[2:], expected.points[2:], atol=1e-6)
+    with pytest.raises(PayloadTooLarge) as caught:
+        fuse_depth_images([sent] * 3, 2 * 24 * 32)  # the pixels of all images
+    assert caught.value.field == "depth_images"
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
@@ -110,7 +102,7 @@ def test_views_are_fused() -> None:
     sent = {"depth_images": images, "segment_ids": list(range(3 * 24 * 32))}
     cloud, options = decode_cloud(sent, DetectOptions(), MANY)
     np.testing.assert_allclose(options.viewpoint, [at[:3, 3] for at in poses])
-    assert parse_again(options) == options
+    assert DetectOptions.model_validate(options.model_dump()) == options
     checked = check_cloud(cloud)
     np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
     for view, single in enumerate(images):
@@ -119,47 +111,24 @@ def test_views_are_fused() -> None:
         np.testing.assert_array_equal(seen, check_cloud(alone).points)
 
 
-def parse_again(options: DetectOptions) -> DetectOptions:
-    return DetectOptions.model_validate(options.model_dump())
-
-
-def test_one_view_is_one_viewpoint() -> None:
-    sent = {"depth_images": [image(depth_of(), pose(5))]}
-    _, options = decode_cloud(sent, DetectOptions(), MANY)
-    assert options.viewpoint == tuple(pose(5)[:3, 3].tolist())
-
-
-def test_pixels_of_all_images_are_counted() -> None:
-    images = [image(depth_of(), pose(0))] * 3
-    with pytest.raises(PayloadTooLarge) as caught:
-        fuse_depth_images(images, 2 * 24 * 32)
-    assert caught.value.field == "depth_images"
-
-
 @pytest.mark.parametrize(
     ("images", "field", "value"),
     [
-        (None, "depth_images", "None"),
         ([], "depth_images", "0 images"),
         ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
         ([{}], "depth_images.0.depth", "nothing"),
+        ([image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "rgb8",
+          "data": b"abc"}}], "depth_images.0.depth.encoding", "'rgb8'"),
         ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
         ([image(depth_of(), pose(0)) | {"depth": [[1], [1, 2]]}], "depth_images.0.depth", "length"),
-        ([image(depth_of(), pose(0)) | {"depth": [[]]}], "depth_images.0.depth", "(1, 0)"),
-        ([image(depth_of(), pose(0)) | {"depth": [["a"]]}], "depth_images.0.depth", "['a']"),
-        ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", "(("),
-        (
-            [image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "32FC1",
-                                                    "data": "no base64!"}}],
-            "depth_images.0.depth.data", "no base64",
-        ),
+        ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", ""),
     ],
 )  # fmt: skip
 def test_bad_images(images: object, field: str, value: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
         fuse_depth_images(images, MANY)
     assert caught.value.field == field
-    assert value.replace("((", "") in caught.value.value
+    assert value in caught.value.value
 
 
 # sensor_msgs/PointCloud2
@@ -207,7 +176,7 @@ def xyz(rows: np.ndarray, names: tuple[str, ...] = ("x", "y", "z")) -> np.ndarra
     return np.stack([rows[name] for name in names], axis=-1)
 
 
-@settings(deadline=None)
+@settings(max_examples=30, derandomize=True, deadline=None)
 @given(
     height=st.integers(1, 5),
     width=st.integers(1, 7),
@@ -242,10 +211,6 @@ def test_normals_and_colours(kind: str) -> None:
         np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
 
 
-def test_no_points() -> None:
-    assert read_point_cloud2(layout(cloud_of((1, 0))), MANY).points.shape == (0, 3)
-
-
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
@@ -256,6 +221,9 @@ def test_no_points() -> None:
         ({"width": 2**31}, "point_cloud2.width"),
         ({"row_step": 2**30, "height": 1000}, "point_cloud2.data"),
         ({"point_step": 0}, "point_cloud2.fields.0.offset"),
+        ({"row_step": 1}, "point_cloud2.row_step"),
+        ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields.5.name"),
+        ({"height": -1}, "point_cloud2.height"),
     ],
 )
 def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
@@ -263,13 +231,6 @@ def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
         read_point_cloud2(layout(cloud_of((1, 4))) | changes, MANY)
     assert caught.value.field == field
     assert caught.value.fix
-
-
-@pytest.mark.parametrize("value", [None, 3, [], "text"])
-def test_what_is_no_layout(value: object) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        read_point_cloud2(value, MANY)
-    assert caught.value.field.startswith("point_cloud2")
 
 
 # Lists
@@ -292,12 +253,6 @@ def test_one_long_text_does_not_give_all_elements_its_room(decode: Any) -> None:
     tracemalloc.stop()
     assert peak < 5_000_000
     assert caught.value.value.startswith("['xxx")
-
-
-def test_whole_number_too_large_beside_a_hole() -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        decode_points([[[None, None, None], [0, 0, 10**400]]], 10)
-    assert caught.value.value.startswith("[[None, None, None]")
 
 
 @pytest.mark.parametrize("value", ["x" * 100_000, {"k" * 100_000: 1}, DEEP, 10**4000])
