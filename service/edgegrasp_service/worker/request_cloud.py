@@ -18,9 +18,8 @@ from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
-    PCL_COLORS,
-    PCL_NORMALS,
-    cloud_of_pcl_fields,
+    PCL_FIELDS,
+    cloud_of_records,
     read_file,
     read_npy,
     too_many,
@@ -232,7 +231,7 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
     if 0 in shape:
         return CloudInput(np.empty((0, 3), np.float32))
     rows = np.ndarray(shape, record, layout.data, strides=strides).astype(record.newbyteorder("="))
-    return cloud_of_pcl_fields(rows[0] if layout.height == 1 else rows)
+    return cloud_of_records(rows[0] if layout.height == 1 else rows)
 
 
 def _record(layout: PointCloud2) -> np.dtype[Any]:
@@ -260,7 +259,7 @@ def _record(layout: PointCloud2) -> np.dtype[Any]:
     if missing:
         value = ", ".join(found)[:80] or "no single numbers"
         raise InvalidRequest("point_cloud2.fields", value, f"Send {', '.join(missing)} too.")
-    names = [name for name in ("x", "y", "z", *PCL_NORMALS, *PCL_COLORS) if name in found]
+    names = [name for name in PCL_FIELDS if name in found]
     return np.dtype(
         {
             "names": names,
