@@ -19,11 +19,11 @@ import orjson
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_model.results import Detection, Grasp, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.schemas import FILE_TYPES, GIVEN, PER_POINT
-from edgegrasp_service.worker.job import Method
-from edgegrasp_service.worker.request_cloud import SOURCES, File
+from edgegrasp_service.schemas import FILE_TYPES, DetectRequest, ScoreRequest
+from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.request_cloud import File
 
 JSON, FORM = "application/json", "multipart/form-data"
 MAX_QUERY_FIELDS = 64
@@ -31,66 +31,60 @@ MAX_PART_HEADER = 8192  # bytes
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
-def read_body(method: Method, content_type: str, query: str, body: bytes) -> dict[str, Any]:
+def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
-    Args:
-        method: What is asked for; ScoreGrasps has the fields GIVEN and takes no bare file.
-        content_type: The header as sent.
-        query: The query string: the options of a bare file.
-        body: The whole body.
-
     Returns:
-        Those of SOURCES, PER_POINT and GIVEN that were sent, JSON or File; and `options`, a dict.
+        Those of the body's model that were sent, JSON or File, or `cloud`, a File; and `options`.
 
     Raises:
         InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
             there are query parameters beside one that has its own options.
         UnsupportedMediaType: There is no reader for the content type.
     """
-    header = _header(f"Content-Type: {content_type}")
-    media_type = content_type.partition(";")[0].strip().lower()
-    scores = method == "ScoreGrasps"
+    header = _header(f"Content-Type: {job.content_type}")
+    media_type = job.content_type.partition(";")[0].strip().lower()
+    scores = job.method == "ScoreGrasps"
     accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
     if media_type not in accepted:
         fix = f"Send one of: {', '.join(accepted)}."
         raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
-    parameters = _query_fields(query)
+    parameters = _query_fields(job.query)
     if media_type in FILE_TYPES:
-        file = File(FILE_TYPES[media_type], body)
+        file = File(FILE_TYPES[media_type], job.body)
         return {"cloud": file, "options": options_from_query(parameters)}
     if parameters:
         fix = "Send options in the part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
-    known = ("points", *SOURCES[2:], *PER_POINT, *(GIVEN if scores else ()), "options")
+    known = tuple((ScoreRequest if scores else DetectRequest).model_fields)
     if media_type == JSON:
-        fields: dict[str, Any] = read_json("body", body)
+        fields: dict[str, Any] = read_json("body", job.body)
         if not isinstance(fields, dict):
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
         known = ("cloud", *known[1:])
-        parts = list(_parts(body, header.get_boundary(), len(known) + 1))
+        parts = list(_parts(job.body, header.get_boundary(), len(known) + 1))
         fields = _fields_of_form(parts, known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
 
 
-def write_detection(detection: Detection) -> bytes:
-    """A detection as DetectionBody; every float is a float32 written out exactly."""
-    debug = None if detection.debug is None else _plain(detection.debug)
-    grasps = [_plain(grasp) for grasp in detection.grasps]
-    return orjson.dumps(vars(detection) | {"grasps": grasps, "debug": debug})
+def write(result: Detection | Scoring) -> bytes:
+    """A result as DetectionBody or ScoringBody; its floats are float32 written out exactly."""
+    return orjson.dumps(result, default=_plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
 
 
-def write_scoring(scoring: Scoring) -> bytes:
-    """Evaluations as ScoringBody."""
-    evaluations = [
-        {"grasp": None if each.grasp is None else _plain(each.grasp), "reason": each.reason}
-        for each in scoring.evaluations
-    ]
-    return orjson.dumps(vars(scoring) | {"evaluations": evaluations})
+def _plain(value: Any) -> Any:
+    """What JSON has instead of it; orjson writes NaN as null."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    fields = vars(value)
+    if not isinstance(value, Grasp):
+        return fields
+    floats = {name: one for name, one in fields.items() if isinstance(one, float)}
+    return fields | {name: float(np.float32(one)) for name, one in floats.items()}
 
 
 def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
@@ -254,20 +248,4 @@ def _fields_of_form(parts: list[Part], known: tuple[str, ...]) -> dict[str, Any]
             fields[name] = File(file_format, data)
         else:
             fields[name] = read_json(name, data)
-    return fields
-
-
-# Answers
-
-
-def _plain(result: Grasp | DebugInfo) -> dict[str, Any]:
-    """Its fields as JSON has them; orjson writes NaN as null."""
-    fields: dict[str, Any] = {}
-    for name, value in vars(result).items():
-        if isinstance(value, np.ndarray | np.bool_):
-            fields[name] = value.tolist()
-        elif isinstance(value, float | np.floating):
-            fields[name] = float(np.float32(value))
-        else:
-            fields[name] = value
     return fields

@@ -5,7 +5,7 @@ a form or a message carries it; or bytes, little-endian numbers that a message c
 arrays suit is for the detector to say.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
+from edgegrasp_service.schemas import PACKED, PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
     PCL_FIELDS,
     cloud_of_records,
@@ -105,7 +105,7 @@ def _source(fields: Mapping[str, Any]) -> str:
 
 
 def decode_points(points: object, max_points: int) -> Array:
-    """Read points: packed float32 x, y, z; or lists, with [null, null, null] for a hole.
+    """Read points as `decode_array` does; [null, null, null] in an organised list is a hole.
 
     Returns:
         (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
@@ -114,33 +114,19 @@ def decode_points(points: object, max_points: int) -> Array:
         InvalidRequest: No whole number of points, no list, or lists that are no array of numbers.
         PayloadTooLarge: More than `max_points` points.
     """
-    if isinstance(points, bytes):
-        if len(points) % 12:
-            raise InvalidRequest(
-                "points",
-                f"{len(points)} bytes, which are no whole number of points",
-                "Send 12 bytes a point: little-endian float32 x, y, z.",
-            )
-        if len(points) // 12 > max_points:
-            raise too_many(len(points) // 12, max_points)
-        return np.frombuffer(points, dtype="<f4").reshape(-1, 3)
-    if not isinstance(points, list):
-        raise InvalidRequest("points", brief(points), "Send a list of [x, y, z] in metres.")
-    if len(points) > max_points:
-        raise too_many(len(points), max_points)
-    if not points:
-        return np.empty((0, 3))
-    array = _numbers("points", points, holes=True)
+    array = decode_array("points", points, max_points)
     if array.size // 3 > max_points:
         raise too_many(array.size // 3, max_points)
-    return array.astype(np.float64)
+    if not array.size:
+        return np.empty((0, 3))
+    return array if isinstance(points, bytes) else array.astype(np.float64)
 
 
 def decode_array(field: str, value: object, max_points: int) -> Array:
-    """Read an array other than the points: packed numbers, an .npy file or lists.
+    """Read an array: packed numbers, an .npy file or lists.
 
     Returns:
-        Of bytes (N, 3) float32 or (N,) int32, as PER_POINT says; of lists int64 where all numbers
+        Of bytes (N, 3) float32 or (N,) int32, as PACKED says; of lists int64 where all numbers
         are whole, else float64; of a file whatever is in it.
 
     Raises:
@@ -150,51 +136,43 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
     if isinstance(value, File):
         return read_npy(value.data, max_points, field)
     if isinstance(value, bytes):
-        width, dtype, _ = PER_POINT[field]
+        width, kind = PACKED[field]
         if len(value) % (4 * width):
-            kind = "float32" if dtype == "<f4" else "int32"
+            found = f"{len(value)} bytes, which are no whole number of rows"
             fix = f"Send {4 * width} bytes a row: little-endian {kind}."
-            raise InvalidRequest(
-                field, f"{len(value)} bytes, which are no whole number of rows", fix
-            )
-        array = np.frombuffer(value, dtype=dtype)
+            raise InvalidRequest(field, found, fix)
+        array = np.frombuffer(value, np.dtype(kind).newbyteorder("<"))
         return array.reshape(-1, 3) if width == 3 else array
     if not isinstance(value, list):
         raise InvalidRequest(field, brief(value), "Send a list of numbers, or of lists of them.")
     return _numbers(field, value) if value else np.empty(0)
 
 
-def _numbers(field: str, values: list[Any], holes: bool = False) -> Array:
-    """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
-    one_length = "Send [x, y, z] rows." if holes else "Send rows of one length."
+def _numbers(field: str, values: list[Any]) -> Array:
+    """Lists as an array: int64 or float64; None is NaN in lists of points that are three deep."""
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
+        numbers = array.ravel().tolist()
+        kinds = set(map(type, numbers))
+        if list in kinds:
+            raise ValueError("a ragged list")
     except ValueError:
-        raise InvalidRequest(field, "rows of different lengths", one_length) from None
-    kinds = set(map(type, array.ravel().tolist()))
-    if list in kinds:
-        raise InvalidRequest(field, "rows of different lengths", one_length)
-    allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
-    if not kinds <= allowed:
-        bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
-        raise InvalidRequest(field, brief(bad), "Send numbers only.")
+        fix = "Send [x, y, z] rows." if field == "points" else "Send rows of one length."
+        raise InvalidRequest(field, "rows of different lengths", fix) from None
+    allowed = {int, float} | ({type(None)} if field == "points" and array.ndim == 3 else set())
     try:
-        return array.astype(np.int64 if kinds == {int} else np.float64)
+        if kinds <= allowed:
+            return array.astype(np.int64 if kinds == {int} else np.float64)
     except OverflowError:
-        bad = next(row for row in values if _holds(row, _too_large))
-        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
-
-
-def _holds(value: object, of_kind: Callable[[object], bool]) -> bool:
-    """Whether any number in lists of any depth is of a kind."""
-    if isinstance(value, list):
-        return any(_holds(part, of_kind) for part in value)
-    return of_kind(value)
-
-
-def _too_large(value: object) -> bool:
-    return isinstance(value, int) and not -(2**63) <= value < 2**63
+        pass
+    bad = next(
+        place
+        for place, number in enumerate(numbers)
+        if type(number) not in allowed or (type(number) is int and abs(number) >= 2**63)
+    )
+    row = values[bad * len(values) // len(numbers)]
+    raise InvalidRequest(field, brief(row), "Send numbers only, whole ones of 64 bits.")
 
 
 # sensor_msgs/PointCloud2
