@@ -2,7 +2,7 @@
 
 import base64
 import binascii
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, StrictBool
@@ -83,7 +83,9 @@ class Depth(Strict):
 
     height: Pixels
     width: Pixels
-    encoding: str = Field(description="32FC1 or 64FC1, metres; 16UC1, millimetres")
+    encoding: Literal["32FC1", "64FC1", "16UC1"] = Field(
+        description="32FC1 or 64FC1, metres; 16UC1, millimetres"
+    )
     data: Bytes = Field(description="packed little-endian pixels, as base64 in JSON")
 
 

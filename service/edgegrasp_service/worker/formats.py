@@ -264,11 +264,7 @@ def _read_ply(data: bytes, max_points: int) -> CloudInput:
 
 # .pcd
 
-PCD_TYPES = {
-    "F4": "f4", "F8": "f8",
-    "I1": "i1", "I2": "i2", "I4": "i4", "I8": "i8",
-    "U1": "u1", "U2": "u2", "U4": "u4", "U8": "u8",
-}  # fmt: skip
+PCD_TYPES = {"F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8"}
 PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r]*\n", re.MULTILINE)
 
 
@@ -281,10 +277,12 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
     names = header["FIELDS"]
     counts = header.get("COUNT", ["1"] * len(names))
-    columns = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
+    kinds = [kind + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    if not PCD_TYPES.issuperset(kinds):
+        raise ValueError(f"fields of TYPE and SIZE {', '.join(kinds)}")
     fields = [
-        (name if name in PCL_FIELDS else "", PCD_TYPES[kind + size], int(count))
-        for name, kind, size, count in columns
+        (name if name in PCL_FIELDS else "", kind.lower(), int(count))
+        for name, kind, count in zip(names, kinds, counts, strict=True)
     ]
     record, count, body = _record(fields, "<"), int(header["POINTS"][0]), data[end.end() :]
     if end[1] == b"binary_compressed":

@@ -6,11 +6,9 @@ that one schema checks both.
 
 from collections.abc import Callable
 from dataclasses import is_dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
@@ -93,28 +91,18 @@ def _check(message: Message, name: str) -> None:
         numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
         fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
         raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
-    for field, is_repeated, is_message in _composite_fields(message.DESCRIPTOR):
-        here = f"{name}.{field}"
-        if is_repeated:
-            parts = getattr(message, field)
-            most = MAX_GIVEN.get(field, MAX_PARTS) if is_message else MAX_ROWS
+    for field in message.DESCRIPTOR.fields:
+        here, is_message = f"{name}.{field.name}", field.message_type is not None
+        if field.is_repeated:
+            parts = getattr(message, field.name)
+            most = MAX_GIVEN.get(field.name, MAX_PARTS) if is_message else MAX_ROWS
             if len(parts) > most:
                 here = here.removeprefix("request.")
                 raise InvalidRequest(here, f"{len(parts)} of them", f"Send at most {most}.")
             for row, part in enumerate(parts if is_message else ()):
                 _check(part, f"{here}.{row}")
-        elif message.HasField(field):
-            _check(getattr(message, field), here)
-
-
-@cache
-def _composite_fields(descriptor: Descriptor) -> list[tuple[str, bool, bool]]:
-    """Fields that are repeated or messages; asking for bytes would copy them."""
-    return [
-        (field.name, field.is_repeated, field.message_type is not None)
-        for field in descriptor.fields
-        if field.is_repeated or field.message_type is not None
-    ]
+        elif is_message and message.HasField(field.name):
+            _check(getattr(message, field.name), here)
 
 
 def _cloud(message: Any) -> dict[str, Any]:

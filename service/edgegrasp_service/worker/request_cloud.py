@@ -145,11 +145,11 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
         return array.reshape(-1, 3) if width == 3 else array
     if not isinstance(value, list):
         raise InvalidRequest(field, brief(value), "Send a list of numbers, or of lists of them.")
-    return _numbers(field, value) if value else np.empty(0)
+    return _numbers(field, value, holes=field == "points") if value else np.empty(0)
 
 
-def _numbers(field: str, values: list[Any]) -> Array:
-    """Lists as an array: int64 or float64; None is NaN in lists of points that are three deep."""
+def _numbers(field: str, values: list[Any], holes: bool) -> Array:
+    """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
@@ -160,7 +160,7 @@ def _numbers(field: str, values: list[Any]) -> Array:
     except ValueError:
         fix = "Send [x, y, z] rows." if field == "points" else "Send rows of one length."
         raise InvalidRequest(field, "rows of different lengths", fix) from None
-    allowed = {int, float} | ({type(None)} if field == "points" and array.ndim == 3 else set())
+    allowed = {int, float} | ({type(None)} if holes and array.ndim == 3 else set())
     try:
         if kinds <= allowed:
             return array.astype(np.int64 if kinds == {int} else np.float64)
@@ -282,7 +282,9 @@ def fuse_depth_images(
         if pixels > max_points:
             raise too_many(pixels, max_points, "depth_images")
     clouds = [_points_of_pixels(depth, view) for depth, view in zip(depths, views, strict=True)]
-    cameras = [_position(view) for view in views]
+    cameras = [
+        (x, y, z) for (*_, x), (*_, y), (*_, z), _ in (view.T_cloud_camera for view in views)
+    ]
     if len(views) == 1:
         return CloudInput(clouds[0]), cameras
     points = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
@@ -290,43 +292,27 @@ def fuse_depth_images(
     return CloudInput(points, view_ids=view_ids), cameras
 
 
-def _position(view: DepthImage) -> tuple[float, float, float]:
-    (*_, x), (*_, y), (*_, z), _ = view.T_cloud_camera
-    return x, y, z
-
-
 def _depth(depth: object, field: str) -> NDArray[np.float64]:
     """(H, W) metres, NaN where there is no reading."""
     if isinstance(depth, list):
-        array = decode_array(field, [_nan_for_none(row) for row in depth], 0)
+        array: Array = _numbers(field, [depth], holes=True)[0]
         if array.ndim != 2 or 0 in array.shape:
             raise InvalidRequest(field, f"shape {array.shape}", "Send rows of one length.")
         metres = array.astype(np.float64)
     else:
-        metres = _unpacked_depth(depth, field)
+        image = _parse(Depth, depth, field)
+        dtype, unit = DEPTH_ENCODINGS[image.encoding]
+        expected = image.height * image.width * np.dtype(dtype).itemsize
+        if len(image.data) != expected:
+            value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
+            raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
+        pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
+        metres = pixels.astype(np.float64) * unit
     if (metres < 0).any():
         worst = float(np.nanmin(metres))
         raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
     metres[~(np.isfinite(metres) & (metres > 0))] = np.nan
     return metres
-
-
-def _unpacked_depth(depth: object, field: str) -> NDArray[np.float64]:
-    image = _parse(Depth, depth, field)
-    if image.encoding not in DEPTH_ENCODINGS:
-        fix = f"Send one of: {', '.join(DEPTH_ENCODINGS)}."
-        raise InvalidRequest(f"{field}.encoding", brief(image.encoding), fix)
-    dtype, metres = DEPTH_ENCODINGS[image.encoding]
-    expected = image.height * image.width * np.dtype(dtype).itemsize
-    if len(image.data) != expected:
-        value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
-        raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
-    pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
-    return pixels.astype(np.float64) * metres
-
-
-def _nan_for_none(row: object) -> object:
-    return [np.nan if value is None else value for value in row] if isinstance(row, list) else row
 
 
 def _points_of_pixels(depth: NDArray[np.float64], view: DepthImage) -> NDArray[np.float32]:
