@@ -6,12 +6,12 @@ A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 import gc
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from email.message import Message
 from email.parser import HeaderParser
 from functools import partial
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -49,7 +49,11 @@ def read_request(job: Job) -> dict[str, Any]:
     if media_type not in accepted:
         fix = f"Send one of: {', '.join(accepted)}."
         raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
-    parameters = _query_fields(job.query)
+    try:
+        parameters = parse_qsl(job.query, True, max_num_fields=MAX_QUERY_FIELDS)
+    except ValueError:
+        value = f"more than {MAX_QUERY_FIELDS} parameters"
+        raise InvalidRequest("query", value, "Send each option once.") from None
     if media_type in FILE_TYPES:
         file = File(FILE_TYPES[media_type], job.body)
         return {"cloud": file, "options": options_from_query(parameters)}
@@ -64,8 +68,7 @@ def read_request(job: Job) -> dict[str, Any]:
         _refuse_unknown(fields, known, "field")
     else:
         known = ("cloud", *known[1:])
-        parts = list(_parts(job.body, header.get_boundary(), len(known) + 1))
-        fields = _fields_of_form(parts, known)
+        fields = _fields_of_form(job, header.get_boundary(), known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
@@ -136,14 +139,6 @@ def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 # Options in a query
 
 
-def _query_fields(query: str) -> list[tuple[str, str]]:
-    try:
-        return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS)
-    except ValueError:
-        value = f"more than {MAX_QUERY_FIELDS} parameters"
-        raise InvalidRequest("query", value, "Send each option once.") from None
-
-
 def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
     """Decode query parameters, or what the command line takes; one an option.
 
@@ -183,16 +178,28 @@ def _value(name: str, text: str) -> object:
 # Forms
 
 
-class Part(NamedTuple):
-    """One part of a form."""
+def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> dict[str, Any]:
+    """Files as File, other parts as the JSON that they hold."""
+    fields: dict[str, Any] = {}
+    for name, file_format, data in _parts(job.body, boundary, len(known) + 1):
+        _refuse_unknown([name], known, "part")
+        if name in fields:
+            raise InvalidRequest(name, "two parts", "Send one.")
+        if name == "cloud" and file_format is None:
+            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+        # curl sends `-F options=@file;type=application/json` as a file too.
+        if name == "cloud" or (file_format == "npy" and name != "options"):
+            fields[name] = File(file_format or "", data)
+        else:
+            fields[name] = read_json(name, data)
+    return fields
 
-    name: str
-    file_format: str | None  # None: it is no file
-    data: bytes
 
+def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[tuple[str, str | None, bytes]]:
+    """Name, file format (None: no file) and data of the parts of a multipart body.
 
-def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[Part]:
-    """The parts of a multipart body; what is no such body costs no more than one look at it."""
+    What is no such body costs no more than one look at it.
+    """
     if not boundary:
         raise _no_form("no boundary in its Content-Type")
     delimiter = b"\r\n--" + boundary.encode("utf-8", "replace")
@@ -210,8 +217,7 @@ def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[Part]:
         name = header.get_param("name", header="Content-Disposition")
         if not isinstance(name, str):
             raise _no_form("a part without a name")
-        is_file = header.get_filename() is not None
-        yield Part(name, _format_of(header) if is_file else None, rest[end + 4 :])
+        yield name, _format_of(header), rest[end + 4 :]
     raise _no_form("no boundary at its end")
 
 
@@ -225,27 +231,10 @@ def _header(text: str) -> Message:
     return HeaderParser().parsestr(whole_characters, headersonly=True)
 
 
-def _format_of(header: Message) -> str:
-    """The format a part's content type names, or else its file name's ending."""
-    suffix = PurePath(header.get_filename("").replace("\0", "")).suffix
+def _format_of(header: Message) -> str | None:
+    """The format a part's content type names, or else its file name's ending; None: no file."""
+    file_name = header.get_filename()
+    if file_name is None:
+        return None
+    suffix = PurePath(file_name.replace("\0", "")).suffix
     return FILE_TYPES.get(header.get_content_type()) or suffix[1:].lower()
-
-
-def _fields_of_form(parts: list[Part], known: tuple[str, ...]) -> dict[str, Any]:
-    """Files as File, other parts as the JSON that they hold."""
-    counts: Mapping[str, int] = Counter(part.name for part in parts)
-    _refuse_unknown(counts, known, "part")
-    for name, count in counts.items():
-        if count > 1:
-            raise InvalidRequest(name, f"{count} parts", "Send one.")
-    fields: dict[str, Any] = {}
-    for name, file_format, data in parts:
-        if name == "cloud" and file_format is None:
-            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-        # curl sends `-F options=@file;type=application/json` as a file too.
-        is_array = file_format == "npy" and name != "options"
-        if file_format is not None and (name == "cloud" or is_array):
-            fields[name] = File(file_format, data)
-        else:
-            fields[name] = read_json(name, data)
-    return fields
