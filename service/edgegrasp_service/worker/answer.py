@@ -140,10 +140,9 @@ class _Work:
         limits = self._limits
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
-        _limit(
-            "options.num_approach_points", options.num_approach_points, limits.max_approach_points
-        )
-        _limit("options.num_candidates", options.num_candidates, limits.max_candidates)
+        for name in ("approach_points", "candidates"):
+            most = getattr(limits, f"max_{name}")
+            _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
         detector = self._catalogue.get(options.model)
         given = {} if self._job.method == "DetectGrasps" else _given(fields, limits)
         cloud, options = decode_cloud(fields, options, limits.max_points)

@@ -207,7 +207,7 @@ def _read_records(
     columns = sum(math.prod(record[name].shape) for name in record.names or ())
     if count > max_points:
         raise too_many(count, max_points)
-    if count < 0 or max(count, 1) * (columns if text else record.itemsize) > len(body):
+    if count < 1 or count * (columns if text else record.itemsize) > len(body):
         raise ValueError(f"{len(body)} bytes of data where the header promises {count} rows")
     if not text:
         return np.frombuffer(body, record, count).astype(record.newbyteorder("="))
@@ -275,6 +275,8 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
         raise ValueError("no header")
     lines = data[: end.start()].decode("latin-1").splitlines()
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
+        raise ValueError(f"no line {', '.join(missing)}")
     names = header["FIELDS"]
     counts = header.get("COUNT", ["1"] * len(names))
     kinds = [kind + size for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]

@@ -93,12 +93,7 @@ def _source(fields: Mapping[str, Any]) -> str:
         raise InvalidRequest("points", "nothing", fix)
     if len(sources) > 1:
         raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
-    name = sources[0]
-    if isinstance(fields[name], File) != (name == "cloud"):
-        if name == "cloud":
-            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-        raise InvalidRequest(name, "an .npy file", "Send JSON, or the part `cloud`.")
-    return name
+    return sources[0]
 
 
 # Points and arrays beside them
