@@ -154,8 +154,8 @@ def _field(message: Message, field: Any) -> Any:
 def _plain(value: Any) -> Any:
     if not isinstance(value, Message):
         return value
-    form = _FORMS.get(type(value))
-    return _plain_fields(value) if form is None else form(value)
+    form: Callable[[Any], Any] = _FORMS.get(type(value), _plain_fields)
+    return form(value)
 
 
 def _coordinates(message: Message) -> list[float]:
