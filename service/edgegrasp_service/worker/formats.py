@@ -29,6 +29,7 @@ Array = NDArray[Any]
 Records = NDArray[np.void]
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
+MAX_LINE = 65536  # bytes of a line of numbers, which takes 15 times its size to read
 MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own
 MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
 
@@ -211,6 +212,8 @@ def _read_records(
         raise ValueError(f"{len(body)} bytes of data where the header promises {count} rows")
     if not text:
         return np.frombuffer(body, record, count).astype(record.newbyteorder("="))
+    if columns > MAX_LINE:
+        raise ValueError(f"rows of {columns} numbers")
     table = _read_text(body, usecols=range(columns), max_rows=count, comments=None)
     if len(table) < count:
         raise ValueError(f"{len(table)} rows where the header promises {count}")
@@ -219,6 +222,9 @@ def _read_records(
 
 
 def _read_text(data: bytes, **options: Any) -> NDArray[np.float64]:
+    for start in range(0, len(data) - MAX_LINE, MAX_LINE):
+        if data.find(b"\n", start, start + MAX_LINE) < 0:
+            raise ValueError(f"a line of more than {MAX_LINE} characters")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there are no numbers: a caller counts the rows
         return np.loadtxt(io.BytesIO(data), ndmin=2, encoding="latin-1", **options)

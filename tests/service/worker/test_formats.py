@@ -466,6 +466,14 @@ BOMBS: dict[str, tuple[str, bytes]] = {
     "ply, count": ("ply", PLY.format(1_999_999).encode() + b"0 0 0"),
     "pcd, header": ("pcd", b"".join(b"%x\n" % n for n in range(MIB)) + b"DATA ascii\n"),
     "pcd, compressed": ("pcd", pcd_bomb()),
+    "ply, line": ("ply", PLY.format(2).encode() + b"1 " * (4 * MIB)),
+    "xyz, line": ("xyz", b"1 " * (4 * MIB)),
+    "xyz, word": ("xyz", b"1" * (8 * MIB)),
+    "pcd, columns": (
+        "pcd",
+        pcd(POINTS, "ascii", 1).replace(b"1 1 1 2 1", b"1 1 1 %d 1" % (4 * MIB))
+        + b"1 " * (4 * MIB),
+    ),
 }  # fmt: skip
 
 
