@@ -7,7 +7,6 @@ usage: scripts/contract.py [FOLDER]    writes edgegrasp/v1/contract.json there, 
 """
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ CONTRACT = Path("edgegrasp/v1/contract.json")
 
 File = descriptor_pb2.FileDescriptorProto
 Message = descriptor_pb2.DescriptorProto
-Field = descriptor_pb2.FieldDescriptorProto
 
 
 def current() -> File:
@@ -42,97 +40,54 @@ def text(file: File) -> str:
 
 def breaks(old: File, new: File) -> list[str]:
     """What of `old` a caller of `new` would miss; empty: compatible, on the wire and in source."""
-    return list(_breaks(old, new))
+    now = promises(new)
+    return [
+        f"{name} ({said}) is {f'now {now[name]}' if name in now else 'gone'}"
+        for name, said in promises(old).items()
+        if now.get(name) != said
+    ]
 
 
-def _breaks(old: File, new: File) -> Iterator[str]:
-    if old.package != new.package:
-        yield f"package {old.package} is now {new.package}"
-    if old.syntax != new.syntax:
-        yield f"syntax {old.syntax} is now {new.syntax}"
-    for service, now in _pairs(old.service, new.service):
-        if now is None:
-            yield f"service {service.name} is gone"
-        else:
-            yield from _of_service(service, now)
-    for message, now in _pairs(old.message_type, new.message_type):
-        yield from _of_message(message.name, message, now)
-    for enum, now in _pairs(old.enum_type, new.enum_type):
-        yield from _of_enum(enum.name, enum, now)
+def promises(file: File) -> dict[str, str]:
+    """Everything that a caller may rely on, by its name or number; each in words."""
+    found = {"package": file.package, "syntax": file.syntax}
+    for service in file.service:
+        for method in service.method:
+            found[f"rpc {service.name}.{method.name}"] = _said(method)
+    for enum in file.enum_type:
+        found |= _of_enum(enum.name, enum)
+    for message in file.message_type:
+        found |= _of_message(message.name, message)
+    return found
 
 
-def _of_service(old: Any, new: Any) -> Iterator[str]:
-    for method, now in _pairs(old.method, new.method):
-        name = f"rpc {old.name}.{method.name}"
-        if now is None:
-            yield f"{name} is gone"
-            continue
-        for part in ("input_type", "output_type", "client_streaming", "server_streaming"):
-            before, after = getattr(method, part), getattr(now, part)
-            if before != after:
-                yield f"{name}: {part} {before} is now {after}"
+def _of_message(name: str, message: Message) -> dict[str, str]:
+    found = {f"message {name}": ""}
+    for field in message.field:
+        # The oneof of an `optional` field is made up.
+        is_choice = field.HasField("oneof_index") and not field.proto3_optional
+        oneof = f", in oneof {message.oneof_decl[field.oneof_index].name}" if is_choice else ""
+        found[f"{name} = {field.number}"] = _said(field) + oneof
+    for numbers in message.reserved_range:
+        found |= {f"{name} reserves {n}": "" for n in range(numbers.start, numbers.end)}
+    found |= {f"{name} reserves {word}": "" for word in message.reserved_name}
+    for inner in message.nested_type:
+        found |= _of_message(f"{name}.{inner.name}", inner)
+    for enum in message.enum_type:
+        found |= _of_enum(f"{name}.{enum.name}", enum)
+    return found
 
 
-def _of_message(name: str, old: Message, new: Message | None) -> Iterator[str]:
-    if new is None:
-        yield f"message {name} is gone"
-        return
-    by_number = {field.number: field for field in new.field}
-    for field in old.field:
-        yield from _of_field(name, (old, field), (new, by_number.get(field.number)))
-    for numbers in old.reserved_range:
-        still = new.reserved_range
-        if not any(now.start <= numbers.start and numbers.end <= now.end for now in still):
-            yield f"{name}: {numbers.start} to {numbers.end - 1} is no longer reserved"
-    for word in old.reserved_name:
-        if word not in new.reserved_name:
-            yield f"{name}: {word!r} is no longer reserved"
-    for inner, now in _pairs(old.nested_type, new.nested_type):
-        yield from _of_message(f"{name}.{inner.name}", inner, now)
-    for enum, now in _pairs(old.enum_type, new.enum_type):
-        yield from _of_enum(f"{name}.{enum.name}", enum, now)
+def _of_enum(name: str, enum: Any) -> dict[str, str]:
+    values = {f"{name}.{value.name}": f"= {value.number}" for value in enum.value}
+    return {f"enum {name}": ""} | values
 
 
-def _of_field(
-    message: str, old: tuple[Message, Field], new: tuple[Message, Field | None]
-) -> Iterator[str]:
-    field, now = old[1], new[1]
-    name = f"{message}.{field.name} = {field.number}"
-    if now is None:
-        yield f"{name} is gone"
-        return
-    for part in ("name", "json_name", "type", "type_name", "label", "proto3_optional"):
-        before, after = getattr(field, part), getattr(now, part)
-        if before != after:
-            yield f"{name}: {part} {before!r} is now {after!r}"
-    before, after = _oneof(*old), _oneof(new[0], now)
-    if before != after:
-        yield f"{name}: oneof {before!r} is now {after!r}"
-
-
-def _of_enum(name: str, old: Any, new: Any) -> Iterator[str]:
-    if new is None:
-        yield f"enum {name} is gone"
-        return
-    numbers = {value.name: value.number for value in new.value}
-    for value in old.value:
-        if value.name not in numbers:
-            yield f"{name}.{value.name} is gone"
-        elif numbers[value.name] != value.number:
-            yield f"{name}.{value.name} = {value.number} is now {numbers[value.name]}"
-
-
-def _oneof(message: Message, field: Field) -> str:
-    """The oneof a field is in; none for `optional`, whose oneof is made up."""
-    if not field.HasField("oneof_index") or field.proto3_optional:
-        return ""
-    return message.oneof_decl[field.oneof_index].name
-
-
-def _pairs(old: Any, new: Any) -> Iterator[tuple[Any, Any]]:
-    """What was there, and what bears its name now."""
-    by_name = {one.name: one for one in new}
-    return ((one, by_name.get(one.name)) for one in old)
+def _said(part: Any) -> str:
+    """The properties of a field or method, but for its number and its options."""
+    properties = ((field.name, value) for field, value in part.ListFields())
+    skipped = ("number", "oneof_index", "options")
+    return ", ".join(f"{name} {value}" for name, value in properties if name not in skipped)
 
 
 def main() -> None:

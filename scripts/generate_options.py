@@ -261,21 +261,15 @@ def _typed_dict(name: str, schema: Schema) -> str:
     required = {*schema.get("required", ()), *({"kind"} if name != PLAIN_KIND else ())}
     required &= schema["properties"].keys()
     total = "" if required else ", total=False"
-    lines = [f"class {name}(TypedDict{total}):"]
-    lines += textwrap.wrap(f'"""{_first_paragraph(schema)}"""', 96)
-    lines[1:] = textwrap.indent("\n".join(lines[1:]), "    ").splitlines()
-    lines.append("")
+    lines = [*textwrap.wrap(f'"""{_first_paragraph(schema)}"""', 96), ""]
     for field, part in schema["properties"].items():
         kind = _python_type(field, part)
         if required and field not in required:
             kind = f"NotRequired[{kind}]"
-        if "description" in part:
-            said = re.sub(r"\bnull:", "None:", part["description"])
-            lines += textwrap.wrap(said, 96, initial_indent="# ", subsequent_indent="# ")
+        said = re.sub(r"\bnull:", "None:", part.get("description", ""))
+        lines += textwrap.wrap(said, 96, initial_indent="# ", subsequent_indent="# ")
         lines.append(f"{field}: {kind}")
-    start = lines.index("") + 1
-    lines[start:] = [f"    {line}" for line in lines[start:]]
-    return "\n".join(lines) + "\n"
+    return f"class {name}(TypedDict{total}):\n{textwrap.indent(chr(10).join(lines), '    ')}\n"
 
 
 def _python_type(name: str, schema: Schema) -> str:
@@ -303,7 +297,7 @@ def _one_python_type(schema: Schema) -> str:
 
 # docs/options.md
 
-HEADER = ["option", "in JSON", "in gRPC", "unit", "default", "meaning"]
+HEADER = ["option", "in JSON", "in gRPC", "default", "meaning"]
 INTRODUCTION = """\
 # Options
 
@@ -336,18 +330,17 @@ def _table() -> Iterator[list[str]]:
         prefix = "" if name == "DetectOptions" else f"{name}."
         if prefix:
             message = MESSAGES.get(name, name)
-            yield [f"**{name}**", "object", f"`{message}`", "", "", _cell(schema)]
+            yield [f"**{name}**", "object", f"`{message}`", "", _cell(schema)]
         for field, part in schema["properties"].items():
             if field == "kind":
                 kind = f'`"{part["const"]}"`'
-                yield [f"`{prefix}kind`", kind, "the field of that name", "", "", ""]
+                yield [f"`{prefix}kind`", kind, "the field of that name", "", ""]
                 continue
             repeated = "repeated " if _label(part) == "repeated " else ""
             yield [
                 f"`{prefix}{field}`",
                 _json_type(part),
                 f"`{repeated}{_proto_type(field, part)}`",
-                _unit(part),
                 _default(field, part, schema),
                 _cell(part),
             ]
@@ -399,13 +392,6 @@ def _number(bound: float) -> str:
     if abs(bound) >= 2**31:
         return f"{'-' if bound < 0 else ''}2^{int(abs(bound)).bit_length() - 1}"
     return "π" if math.isclose(bound, math.pi) else f"{bound:g}"
-
-
-def _unit(field: Schema) -> str:
-    described = json.dumps({**field, "default": None})
-    return " ".join(
-        unit for word, unit in (("metres", "m"), ("radians", "rad")) if word in described
-    )
 
 
 def _default(name: str, field: Schema, parent: Schema) -> str:

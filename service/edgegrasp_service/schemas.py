@@ -1,11 +1,10 @@
 """Bodies of the HTTP API: the JSON objects of requests and answers, and their OpenAPI document."""
 
 import base64
-import binascii
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, StrictBool
+from pydantic import AfterValidator, BeforeValidator, Field, SkipValidation, StrictBool
 
 from edgegrasp_model.options import FARTHEST, DetectOptions, Finite, Integer, Strict, numeric
 from edgegrasp_model.results import NoGrasp, Outcome
@@ -14,27 +13,23 @@ KIND_PREFIX = "urn:edgegrasp:error:"
 TIMEOUT = "X-Request-Timeout"
 
 FILE_TYPES = {f"application/x-{name}": name for name in ("npy", "npz", "ply", "pcd", "xyz")}
-# Arrays beside a cloud: numbers for each of its rows, their type where they come packed, and what
-# they are.
-PER_POINT = {
-    "normals": (3, "<f4", "for each row of the cloud, outward, any length"),
-    "colors": (3, "<f4", "for each row of the cloud"),
-    "segment_ids": (1, "<i4", "for each row of the cloud"),
-    "view_ids": (1, "<i4", "for each row of the cloud: which of options.viewpoint saw it"),
+# Points and arrays beside them, where they come packed: numbers a row, and their type.
+PACKED = {
+    "points": (3, "float32"),
+    "normals": (3, "float32"),
+    "colors": (3, "float32"),
+    "segment_ids": (1, "int32"),
+    "view_ids": (1, "int32"),
 }
+PER_POINT = tuple(PACKED)[1:]
 GIVEN = ("edges", "hand_poses")  # what a caller may want scored
 
-# Requests: what stands beside the options
+# Requests
 
 
 def _from_base64(value: object) -> object:
     """JSON has no bytes; gRPC does."""
-    if not isinstance(value, str):
-        return value
-    try:
-        return base64.b64decode(value, validate=True)
-    except (binascii.Error, ValueError):
-        raise ValueError("must be base64") from None
+    return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
 
 Bytes = Annotated[bytes, BeforeValidator(_from_base64, json_schema_input_type=str)]
@@ -82,7 +77,9 @@ class Depth(Strict):
 
     height: Pixels
     width: Pixels
-    encoding: str = Field(description="32FC1 or 64FC1, metres; 16UC1, millimetres")
+    encoding: Literal["32FC1", "64FC1", "16UC1"] = Field(
+        description="32FC1 or 64FC1, metres; 16UC1, millimetres"
+    )
     data: Bytes = Field(description="packed little-endian pixels, as base64 in JSON")
 
 
@@ -98,24 +95,43 @@ class Intrinsics(Strict):
 class DepthImage(Strict):
     """What a camera saw. Camera frame: x right, y down, z forward."""
 
-    depth: Any = Field(description="rows of metres, or an object as Depth")
+    depth: SkipValidation[list[list[float]] | Depth] = Field(
+        description="rows of metres, or an object as Depth"
+    )
     intrinsics: Intrinsics
     T_cloud_camera: Pose = Field(description="maps camera coordinates to cloud coordinates, metres")
-
-
-# Answers
 
 
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Edge = Annotated[list[int], Field(min_length=2, max_length=2)]
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class DetectRequest(Strict):
+    """The JSON body of `POST /v1/grasps`, for its document; the worker reads each field alone."""
+
+    points: list[Vector] | None = Field(None, description="x, y, z in metres, or rows of them")
+    point_cloud2: PointCloud2 | None = None
+    depth_images: list[DepthImage] | None = Field(None, description="their cameras are viewpoints")
+    normals: list[Vector] | None = Field(None, description="of each point, outward, any length")
+    colors: list[Vector] | None = Field(None, description="of each point")
+    segment_ids: list[int] | None = Field(None, description="of each point")
+    view_ids: list[int] | None = Field(None, description="which of options.viewpoint saw a point")
+    options: DetectOptions = Field(default_factory=DetectOptions)
 
 
-class GraspBody(_Body):
+class ScoreRequest(DetectRequest):
+    """The JSON body of `POST /v1/grasps:score`."""
+
+    edges: list[Edge] | None = Field(None, description="approach and contact points, rows")
+    hand_poses: list[Matrix] | None = Field(None, description="T_cloud_hand")
+
+
+# Answers
+
+
+class GraspBody(Strict):
     """One grasp: move to T_cloud_hand along approach_direction, then close."""
 
     score: float = Field(description="probability that the grasp holds")
@@ -135,7 +151,7 @@ class GraspBody(_Body):
     )
 
 
-class DebugBody(_Body):
+class DebugBody(Strict):
     """The processed cloud and every candidate, whatever became of it."""
 
     points: list[Vector] = Field(description="metres, cloud frame")
@@ -148,35 +164,34 @@ class DebugBody(_Body):
     support_plane: Row | None = Field(description="unit normal and offset, metres")
 
 
-class DetectionBody(_Body):
-    """Ranked grasps of one cloud, and how they came about."""
-
-    grasps: list[GraspBody] = Field(description="best first")
+class _ResultBody(Strict):
     counts: dict[str, int] = Field(description="what passed each stage")
     seconds: dict[str, float] = Field(description="spent in each stage, and their total")
     model: str = Field(description="name of the weights used")
     warnings: list[str]
+
+
+class DetectionBody(_ResultBody):
+    """Ranked grasps of one cloud, and how they came about."""
+
+    grasps: list[GraspBody] = Field(description="best first")
     debug: DebugBody | None = Field(description="null but where options.debug is set")
 
 
-class EvaluationBody(_Body):
+class EvaluationBody(Strict):
     """What the network says of one edge or hand pose."""
 
     grasp: GraspBody | None = Field(description="null where it defines none")
     reason: NoGrasp | None = Field(description="why it defines none")
 
 
-class ScoringBody(_Body):
+class ScoringBody(_ResultBody):
     """Evaluations of what the caller gave."""
 
     evaluations: list[EvaluationBody] = Field(description="in the order of the request")
-    counts: dict[str, int] = Field(description="what passed each stage")
-    seconds: dict[str, float] = Field(description="spent in each stage, and their total")
-    model: str = Field(description="name of the weights used")
-    warnings: list[str]
 
 
-class ModelBody(_Body):
+class ModelBody(Strict):
     """Loaded weights."""
 
     name: str
@@ -193,19 +208,19 @@ class ModelBody(_Body):
     device: str = Field(description='where it computes: "cpu", or a GPU such as "cuda:0"')
 
 
-class ModelsBody(_Body):
+class ModelsBody(Strict):
     """The weights a request can name."""
 
     models: list[ModelBody]
 
 
-class HealthBody(_Body):
+class HealthBody(Strict):
     """State of the server."""
 
     status: str
 
 
-class ProblemBody(_Body):
+class ProblemBody(Strict):
     """An error (RFC 9457)."""
 
     type: str = Field(description=f"{KIND_PREFIX} and the kind, e.g. invalid-request")
@@ -220,16 +235,18 @@ class ProblemBody(_Body):
     )
 
 
-# The OpenAPI document of the request bodies, which the service reads itself
+# The OpenAPI document of the requests, which the service reads itself
 
-NUMBER, INTEGER = {"type": "number"}, {"type": "integer"}
 FILE = {"type": "string", "format": "binary"}
 AS_TEXT = "With a point cloud file as body. As JSON; lists of numbers also as 0.1,0.2,0.3."
 
 
 def openapi_detect() -> dict[str, Any]:
     """Parameters and body of `POST /v1/grasps`, as FastAPI's `openapi_extra`."""
-    options = _inline_schema(DetectOptions)
+    body = _request_body(DetectRequest)
+    content = body["requestBody"]["content"]
+    content |= {media_type: {"schema": FILE} for media_type in FILE_TYPES}
+    options = content["application/json"]["schema"]["properties"]["options"]
     parameters = [
         {
             "name": name,
@@ -240,82 +257,40 @@ def openapi_detect() -> dict[str, Any]:
         }
         for name, schema in options["properties"].items()
     ]
-    body = _request_body(options, {}, files=True)
-    return body | {"parameters": [*parameters, _TIMEOUT_HEADER]}
+    return body | {"parameters": parameters + body["parameters"]}
 
 
 def openapi_score() -> dict[str, Any]:
     """Parameters and body of `POST /v1/grasps:score`, as FastAPI's `openapi_extra`."""
-    edges = _list(_list(INTEGER, 2), description="approach and contact point, rows of the cloud")
-    poses = _list(_list(_list(NUMBER, 4), 4), description="T_cloud_hand")
-    given = dict(zip(GIVEN, (edges, poses), strict=True))
-    body = _request_body(_inline_schema(DetectOptions), given, files=False)
-    return body | {"parameters": [_TIMEOUT_HEADER]}
+    return _request_body(ScoreRequest)
 
 
-_TIMEOUT_HEADER = {
-    "name": TIMEOUT,
-    "in": "header",
-    "required": False,
-    "description": "Seconds from now until nobody wants the answer any more.",
-    "schema": {"type": "number", "exclusiveMinimum": 0},
-}
-
-
-def _request_body(
-    options: dict[str, Any], given: dict[str, Any], files: bool
-) -> dict[str, dict[str, Any]]:
-    points = _list(_list(NUMBER, 3), description="x, y, z in metres; organised: rows of points")
-    beside = {
-        name: _list(_list(NUMBER, 3) if width == 3 else INTEGER, description=description)
-        for name, (width, _, description) in PER_POINT.items()
+def _request_body(model: type[DetectRequest]) -> dict[str, Any]:
+    """A body as JSON, or as a form with files; and the header beside it."""
+    schema = model.model_json_schema()
+    # Without references: the document then needs no component that FastAPI does not know of.
+    body: dict[str, Any] = _inlined(schema, schema.pop("$defs"))
+    fields = body["properties"]
+    files = {
+        name: {"anyOf": [FILE, fields[name]]} for name in (*PER_POINT, *GIVEN) if name in fields
     }
-    shared = _clouds() | beside | given | {"options": options}
-    body = {
-        "type": "object",
-        "additionalProperties": False,
-        "properties": {"points": points} | shared,
+    form = body | {"properties": {"cloud": FILE} | fields | files}
+    del form["properties"]["points"]
+    timeout = {
+        "name": TIMEOUT,
+        "in": "header",
+        "required": False,
+        "description": "Seconds from now until nobody wants the answer any more.",
+        "schema": {"type": "number", "exclusiveMinimum": 0},
     }
-    arrays = {name: {"anyOf": [FILE, schema]} for name, schema in (beside | given).items()}
-    form = {
-        "type": "object",
-        "additionalProperties": False,
-        "properties": {"cloud": FILE} | shared | arrays,
+    content = {
+        "application/json": {"schema": body},
+        "multipart/form-data": {
+            "schema": form,
+            "encoding": {"options": {"contentType": "application/json"}},
+        },
     }
-    content: dict[str, Any] = {"application/json": {"schema": body}}
-    if files:
-        content |= {media_type: {"schema": FILE} for media_type in FILE_TYPES}
-    content["multipart/form-data"] = {
-        "schema": form,
-        "encoding": {"options": {"contentType": "application/json"}},
-    }
-    return {"requestBody": {"required": True, "content": content}}
-
-
-def _clouds() -> dict[str, Any]:
-    image = _inline_schema(DepthImage)
-    rows = _list(_list(NUMBER), description="metres")
-    image["properties"]["depth"] = {"anyOf": [rows, _inline_schema(Depth)]}
-    text = "views to fuse; their cameras are the viewpoints"
-    return {
-        "point_cloud2": _inline_schema(PointCloud2),
-        "depth_images": _list(image, description=text),
-    }
-
-
-def _list(items: dict[str, Any], size: int | None = None, description: str = "") -> dict[str, Any]:
-    schema: dict[str, Any] = {"type": "array", "items": items}
-    if size is not None:
-        schema |= {"minItems": size, "maxItems": size}
-    return schema | ({"description": description} if description else {})
-
-
-def _inline_schema(model: type[BaseModel]) -> dict[str, Any]:
-    """Without references: the document then needs no component that FastAPI does not know of."""
-    schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
-    definitions = schema.pop("$defs", {})
-    inlined: dict[str, Any] = _inlined(schema, definitions)
-    return inlined
+    return {"requestBody": {"required": True, "content": content}, "parameters": [timeout]}
 
 
 def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
@@ -325,8 +300,12 @@ def _inlined(schema: Any, definitions: dict[str, Any]) -> Any:
         return schema
     if "$ref" in schema:
         target = definitions[schema["$ref"].rpartition("/")[2]]
-        rest = {name: value for name, value in schema.items() if name != "$ref"}
-        return _inlined(target | rest, definitions)
-    if "discriminator" in schema:  # it maps to components; every `kind` has its const anyway
-        schema = {name: value for name, value in schema.items() if name != "discriminator"}
-    return {name: _inlined(value, definitions) for name, value in schema.items()}
+        return _inlined(
+            target | {name: schema[name] for name in schema if name != "$ref"}, definitions
+        )
+    # The discriminator maps to components; every `kind` has its const anyway.
+    return {
+        name: _inlined(value, definitions)
+        for name, value in schema.items()
+        if name != "discriminator"
+    }

@@ -96,7 +96,7 @@ def test_bad_options(options: list[str], sentence: str, file: str, dummy_server,
     [
         ("absent.npy", None, (), "No such file"),
         ("cloud.las", b"0 0 0", (), "Send one of: npy, npz, ply, pcd, xyz."),
-        ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no .npy file."),
+        ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no whole .npy file"),
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],
 )

@@ -6,9 +6,9 @@ connections or the servers of either transport.
 
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,14 @@ from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
+from edgegrasp_service.worker.dummy import DummyCatalogue
 from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
 from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
 
-Result = TypeVar("Result", Detection, Scoring)
+if TYPE_CHECKING:
+    from edgegrasp_model.detector import ModelCatalogue
 
-
-class Catalogue(Protocol):
-    """Detectors by the name of their weights: a ModelCatalogue, or the dummy's."""
-
-    def get(self, name: str = "") -> Any:
-        """The detector of that name, the default for ""; raises UnknownModel."""
-
-    def describe(self) -> Sequence[Mapping[str, Any]]:
-        """The facts of each set of weights."""
-
-    def warm_up(self) -> None:
-        """Run every detector once, so that the first request is not the slowest."""
+Catalogue = Union["ModelCatalogue", DummyCatalogue]  # detectors by the name of their weights
 
 
 def load_catalogue(settings: Settings) -> Catalogue:
@@ -48,18 +39,13 @@ def load_catalogue(settings: Settings) -> Catalogue:
         EdgeGraspError: Weights cannot be used, or the device is not there.
     """
     if settings.backend == "dummy":
-        from edgegrasp_service.worker.dummy import DummyCatalogue
-
         return DummyCatalogue(settings.dummy_seconds)
     # Torch takes seconds to import, and the dummy does without.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
-    catalogue: Catalogue = ModelCatalogue.load(
-        settings.weights,
-        settings.default_model,
-        choose_device(settings.device),
-        settings.grippers,
-        settings.max_voxels,
+    device = choose_device(settings.device)
+    catalogue = ModelCatalogue.load(
+        settings.weights, settings.default_model, device, settings.grippers, settings.max_voxels
     )
     catalogue.warm_up()
     return catalogue
@@ -113,16 +99,19 @@ class _Work:
         self.facts = Facts()
         self.options: DetectOptions | None = None  # known once they are parsed
         self._job = job
+        self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
         self._limits = limits
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
         """The body of the answer; raises any error that there may be."""
-        encoding: Any = messages if self._job.transport == "grpc" else http_bodies
-        if self._job.method == "DetectGrasps":
-            return self._encoded(self._detect(), encoding.write_detection)
-        return self._encoded(self._score(), encoding.write_scoring)
+        result = self._detect() if self._job.method == "DetectGrasps" else self._score()
+        self.facts.model = result.model
+        self._count(result.counts)
+        with self._stage("encode"):
+            body: bytes = self._encoding.write(result)
+        return body
 
     def _detect(self) -> Detection:
         with self._stage("decode"):
@@ -146,26 +135,16 @@ class _Work:
         self.facts.grasps = len(scoring.evaluations)
         return scoring
 
-    def _encoded(self, result: Result, write: Callable[[Result], bytes]) -> bytes:
-        self.facts.model = result.model
-        self._count(result.counts)
-        with self._stage("encode"):
-            return write(result)
-
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
-        job, limits = self._job, self._limits
-        if job.transport == "grpc":
-            fields = messages.read_request(job.method, job.body)
-        else:
-            fields = http_bodies.read_body(job.method, job.content_type, job.query, job.body)
+        limits = self._limits
+        fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
-        _limit(
-            "options.num_approach_points", options.num_approach_points, limits.max_approach_points
-        )
-        _limit("options.num_candidates", options.num_candidates, limits.max_candidates)
+        for name in ("approach_points", "candidates"):
+            most = getattr(limits, f"max_{name}")
+            _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
         detector = self._catalogue.get(options.model)
-        given = {} if job.method == "DetectGrasps" else _given(fields, limits)
+        given = {} if self._job.method == "DetectGrasps" else _given(fields, limits)
         cloud, options = decode_cloud(fields, options, limits.max_points)
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0

@@ -20,15 +20,11 @@ from edgegrasp_model.results import (
     Outcome,
     Scoring,
 )
-from edgegrasp_model.scene.cloud import (
-    CloudInput,
-    check_cloud,
-    check_edges,
-    check_hand_poses,
-)
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud, check_edges, check_hand_poses
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
+DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 GRASPS = 10  # made at most
 WARNING = "The dummy detector made these grasps up."
 
@@ -46,25 +42,13 @@ class DummyPrepared:
 
 
 class DummyDetector:
-    """Puts top-down grasps on points drawn by the seed; they hold nothing.
-
-    Args:
-        seconds: What the network takes for one request.
-    """
+    """Puts top-down grasps on points drawn by the seed; its network takes `seconds`."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
 
     def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
-        """Draw approach points, the same ones for the same cloud and options.
-
-        Args:
-            cloud: As for a real detector.
-            options: `num_approach_points`, `min_score`, `top_k`, `seed` and `debug` have an effect.
-
-        Raises:
-            InvalidRequest: The cloud cannot be used, as for a real detector.
-        """
+        """Draw approach points, the same ones for the same cloud and options."""
         points = check_cloud(cloud, options.num_approach_points).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), options.num_approach_points, replace=False)
@@ -80,16 +64,26 @@ class DummyDetector:
 
     def finish(self, prepared: DummyPrepared, logits: Float32) -> Detection:
         """Put a grasp on each of the best approach points."""
-        options, points, drawn = prepared.options, prepared.points, prepared.drawn
+        options, drawn = prepared.options, prepared.points[prepared.drawn]
+        returned = (logits >= options.min_score) & (np.arange(len(drawn)) < GRASPS)
+        returned[options.top_k :] = False  # scores descend
         grasps = [
-            _top_down(points[row], float(score))
-            for row, score in zip(drawn[:GRASPS], logits[:GRASPS], strict=True)
-            if score >= options.min_score
-        ][: options.top_k]
+            _top_down(point, float(score))
+            for point, score in zip(drawn[returned], logits[returned], strict=True)
+        ]
+        debug = DebugInfo(
+            points=prepared.points,
+            normals=np.tile(-DOWN, (len(prepared.points), 1)),
+            approach_index=prepared.drawn,
+            contact_index=prepared.drawn,
+            T_cloud_hand=np.stack([_top_down(point, 0.0).T_cloud_hand for point in drawn]),
+            score=np.where(returned, logits, np.float32(np.nan)),
+            outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
+            support_plane=None,
+        )
         counts = prepared.counts | {"returned": len(grasps)}
         seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
-        debug = _debug(points, drawn, logits) if options.debug else None
-        return Detection(grasps, counts, seconds, NAME, [WARNING], debug)
+        return Detection(grasps, counts, seconds, NAME, [WARNING], debug if options.debug else None)
 
     def score(
         self,
@@ -99,11 +93,7 @@ class DummyDetector:
         edges: NDArray[Any] | None = None,
         hand_poses: NDArray[Any] | None = None,
     ) -> Scoring:
-        """Make up scores; an edge from a row to itself defines no grasp.
-
-        Raises:
-            InvalidRequest: The cloud, an edge or a pose cannot be used, as for a real detector.
-        """
+        """Make up scores; an edge from a row to itself defines no grasp."""
         checked = check_cloud(cloud)
         if edges is not None:
             rows = check_edges(edges, checked.rows_sent)
@@ -114,10 +104,9 @@ class DummyDetector:
             contacts = (poses @ np.array([0.0, 0.0, TCP_Z, 1.0], np.float32))[:, :3]
             is_grasp = np.ones(len(poses), dtype=bool)
         scores = np.random.default_rng(options.seed).random(len(contacts), dtype=np.float32)
+        none = Evaluation(None, NoGrasp.TOO_SHORT)
         evaluations = [
-            Evaluation(_top_down(contact, float(score)), None)
-            if grasps
-            else Evaluation(None, NoGrasp.TOO_SHORT)
+            Evaluation(_top_down(contact, float(score)), None) if grasps else none
             for contact, score, grasps in zip(contacts, scores, is_grasp, strict=True)
         ]
         counts = {"points": len(checked.points), "scored": int(is_grasp.sum())}
@@ -141,28 +130,10 @@ class DummyCatalogue:
         facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
         return [facts | {"device": "cpu"}]
 
-    def warm_up(self) -> None:
-        """There is nothing to warm up."""
-
 
 def _top_down(point: Float32, score: float) -> Grasp:
-    T_cloud_hand = np.diag(np.array([1, -1, -1, 1], dtype=np.float32))
-    T_cloud_tcp = T_cloud_hand.copy()
+    T_cloud_tcp = np.diag(np.array([1, -1, -1, 1], np.float32))
     T_cloud_tcp[:3, 3] = point
-    T_cloud_hand[:3, 3] = point + np.array([0.0, 0.0, TCP_Z], dtype=np.float32)
-    down = np.array([0.0, 0.0, -1.0], dtype=np.float32)
-    return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, down, True, 0.0)
-
-
-def _debug(points: Float32, drawn: NDArray[np.int64], scores: Float32) -> DebugInfo:
-    returned = np.arange(len(drawn)) < GRASPS
-    return DebugInfo(
-        points=points,
-        normals=np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(points), 1)),
-        approach_index=drawn,
-        contact_index=drawn,
-        T_cloud_hand=np.stack([_top_down(points[row], 0.0).T_cloud_hand for row in drawn]),
-        score=np.where(returned, scores, np.float32(np.nan)),
-        outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
-        support_plane=None,
-    )
+    T_cloud_hand = T_cloud_tcp.copy()
+    T_cloud_hand[:3, 3] -= TCP_Z * DOWN
+    return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, DOWN, True, 0.0)

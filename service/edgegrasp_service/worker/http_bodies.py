@@ -6,12 +6,12 @@ A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 import gc
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from email.message import Message
 from email.parser import HeaderParser
 from functools import partial
 from pathlib import PurePath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -19,11 +19,11 @@ import orjson
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_model.results import Detection, Grasp, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.schemas import FILE_TYPES, GIVEN, PER_POINT
-from edgegrasp_service.worker.job import Method
-from edgegrasp_service.worker.request_cloud import SOURCES, File
+from edgegrasp_service.schemas import FILE_TYPES, DetectRequest, ScoreRequest
+from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.request_cloud import File
 
 JSON, FORM = "application/json", "multipart/form-data"
 MAX_QUERY_FIELDS = 64
@@ -31,66 +31,63 @@ MAX_PART_HEADER = 8192  # bytes
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
-def read_body(method: Method, content_type: str, query: str, body: bytes) -> dict[str, Any]:
+def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
-    Args:
-        method: What is asked for; ScoreGrasps has the fields GIVEN and takes no bare file.
-        content_type: The header as sent.
-        query: The query string: the options of a bare file.
-        body: The whole body.
-
     Returns:
-        Those of SOURCES, PER_POINT and GIVEN that were sent, JSON or File; and `options`, a dict.
+        Those of the body's model that were sent, JSON or File, or `cloud`, a File; and `options`.
 
     Raises:
         InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
             there are query parameters beside one that has its own options.
         UnsupportedMediaType: There is no reader for the content type.
     """
-    header = _header(f"Content-Type: {content_type}")
-    media_type = content_type.partition(";")[0].strip().lower()
-    scores = method == "ScoreGrasps"
+    header = _header(f"Content-Type: {job.content_type}")
+    media_type = job.content_type.partition(";")[0].strip().lower()
+    scores = job.method == "ScoreGrasps"
     accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
     if media_type not in accepted:
         fix = f"Send one of: {', '.join(accepted)}."
         raise UnsupportedMediaType("Content-Type", repr(media_type), fix)
-    parameters = _query_fields(query)
+    try:
+        parameters = parse_qsl(job.query, True, max_num_fields=MAX_QUERY_FIELDS)
+    except ValueError:
+        value = f"more than {MAX_QUERY_FIELDS} parameters"
+        raise InvalidRequest("query", value, "Send each option once.") from None
     if media_type in FILE_TYPES:
-        file = File(FILE_TYPES[media_type], body)
+        file = File(FILE_TYPES[media_type], job.body)
         return {"cloud": file, "options": options_from_query(parameters)}
     if parameters:
         fix = "Send options in the part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
-    known = ("points", *SOURCES[2:], *PER_POINT, *(GIVEN if scores else ()), "options")
+    known = tuple((ScoreRequest if scores else DetectRequest).model_fields)
     if media_type == JSON:
-        fields: dict[str, Any] = read_json("body", body)
+        fields: dict[str, Any] = read_json("body", job.body)
         if not isinstance(fields, dict):
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
         known = ("cloud", *known[1:])
-        parts = list(_parts(body, header.get_boundary(), len(known) + 1))
-        fields = _fields_of_form(parts, known)
+        fields = _fields_of_form(job, header.get_boundary(), known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
 
 
-def write_detection(detection: Detection) -> bytes:
-    """A detection as DetectionBody; every float is a float32 written out exactly."""
-    debug = None if detection.debug is None else _plain(detection.debug)
-    grasps = [_plain(grasp) for grasp in detection.grasps]
-    return orjson.dumps(vars(detection) | {"grasps": grasps, "debug": debug})
+def write(result: Detection | Scoring) -> bytes:
+    """A result as DetectionBody or ScoringBody; its floats are float32 written out exactly."""
+    return orjson.dumps(result, default=_plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
 
 
-def write_scoring(scoring: Scoring) -> bytes:
-    """Evaluations as ScoringBody."""
-    evaluations = [
-        {"grasp": None if each.grasp is None else _plain(each.grasp), "reason": each.reason}
-        for each in scoring.evaluations
-    ]
-    return orjson.dumps(vars(scoring) | {"evaluations": evaluations})
+def _plain(value: Any) -> Any:
+    """What JSON has instead of it; orjson writes NaN as null."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    fields = vars(value)
+    if not isinstance(value, Grasp):
+        return fields
+    floats = {name: one for name, one in fields.items() if isinstance(one, float)}
+    return fields | {name: float(np.float32(one)) for name, one in floats.items()}
 
 
 def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) -> None:
@@ -142,14 +139,6 @@ def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 # Options in a query
 
 
-def _query_fields(query: str) -> list[tuple[str, str]]:
-    try:
-        return parse_qsl(query, keep_blank_values=True, max_num_fields=MAX_QUERY_FIELDS)
-    except ValueError:
-        value = f"more than {MAX_QUERY_FIELDS} parameters"
-        raise InvalidRequest("query", value, "Send each option once.") from None
-
-
 def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
     """Decode query parameters, or what the command line takes; one an option.
 
@@ -189,16 +178,28 @@ def _value(name: str, text: str) -> object:
 # Forms
 
 
-class Part(NamedTuple):
-    """One part of a form."""
+def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> dict[str, Any]:
+    """Files as File, other parts as the JSON that they hold."""
+    fields: dict[str, Any] = {}
+    for name, file_format, data in _parts(job.body, boundary, len(known) + 1):
+        _refuse_unknown([name], known, "part")
+        if name in fields:
+            raise InvalidRequest(name, "two parts", "Send one.")
+        if name == "cloud" and file_format is None:
+            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
+        # curl sends `-F options=@file;type=application/json` as a file too.
+        if name == "cloud" or (file_format == "npy" and name != "options"):
+            fields[name] = File(file_format or "", data)
+        else:
+            fields[name] = read_json(name, data)
+    return fields
 
-    name: str
-    file_format: str | None  # None: it is no file
-    data: bytes
 
+def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[tuple[str, str | None, bytes]]:
+    """Name, file format (None: no file) and data of the parts of a multipart body.
 
-def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[Part]:
-    """The parts of a multipart body; what is no such body costs no more than one look at it."""
+    What is no such body costs no more than one look at it.
+    """
     if not boundary:
         raise _no_form("no boundary in its Content-Type")
     delimiter = b"\r\n--" + boundary.encode("utf-8", "replace")
@@ -216,8 +217,7 @@ def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[Part]:
         name = header.get_param("name", header="Content-Disposition")
         if not isinstance(name, str):
             raise _no_form("a part without a name")
-        is_file = header.get_filename() is not None
-        yield Part(name, _format_of(header) if is_file else None, rest[end + 4 :])
+        yield name, _format_of(header), rest[end + 4 :]
     raise _no_form("no boundary at its end")
 
 
@@ -231,43 +231,10 @@ def _header(text: str) -> Message:
     return HeaderParser().parsestr(whole_characters, headersonly=True)
 
 
-def _format_of(header: Message) -> str:
-    """The format a part's content type names, or else its file name's ending."""
-    suffix = PurePath(header.get_filename("").replace("\0", "")).suffix
+def _format_of(header: Message) -> str | None:
+    """The format a part's content type names, or else its file name's ending; None: no file."""
+    file_name = header.get_filename()
+    if file_name is None:
+        return None
+    suffix = PurePath(file_name.replace("\0", "")).suffix
     return FILE_TYPES.get(header.get_content_type()) or suffix[1:].lower()
-
-
-def _fields_of_form(parts: list[Part], known: tuple[str, ...]) -> dict[str, Any]:
-    """Files as File, other parts as the JSON that they hold."""
-    counts: Mapping[str, int] = Counter(part.name for part in parts)
-    _refuse_unknown(counts, known, "part")
-    for name, count in counts.items():
-        if count > 1:
-            raise InvalidRequest(name, f"{count} parts", "Send one.")
-    fields: dict[str, Any] = {}
-    for name, file_format, data in parts:
-        if name == "cloud" and file_format is None:
-            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-        # curl sends `-F options=@file;type=application/json` as a file too.
-        is_array = file_format == "npy" and name != "options"
-        if file_format is not None and (name == "cloud" or is_array):
-            fields[name] = File(file_format, data)
-        else:
-            fields[name] = read_json(name, data)
-    return fields
-
-
-# Answers
-
-
-def _plain(result: Grasp | DebugInfo) -> dict[str, Any]:
-    """Its fields as JSON has them; orjson writes NaN as null."""
-    fields: dict[str, Any] = {}
-    for name, value in vars(result).items():
-        if isinstance(value, np.ndarray | np.bool_):
-            fields[name] = value.tolist()
-        elif isinstance(value, float | np.floating):
-            fields[name] = float(np.float32(value))
-        else:
-            fields[name] = value
-    return fields

@@ -5,20 +5,19 @@ that one schema checks both.
 """
 
 from collections.abc import Callable
-from functools import cache
+from dataclasses import is_dataclass
 from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.unknown_fields import UnknownFieldSet
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
-from edgegrasp_model.results import DebugInfo, Detection, Grasp, Scoring
+from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.schemas import PER_POINT
-from edgegrasp_service.worker.job import Method
+from edgegrasp_service.worker.job import Job
 from edgegrasp_service.worker.request_cloud import File
 
 MAX_PARTS = 64  # messages in a repeated field; no option takes more
@@ -26,12 +25,8 @@ MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
 CLOUD_FIX = "Send one of points, encoded, point_cloud2 and depth_images."
 
 
-def read_request(method: Method, body: bytes) -> dict[str, Any]:
-    """The fields of a request, as `http_bodies.read_body` gives them.
-
-    Args:
-        method: Whose request it is.
-        body: The serialized message.
+def read_request(job: Job) -> dict[str, Any]:
+    """The fields of a request, as `http_bodies.read_request` gives them.
 
     Returns:
         Plain values, with bytes where the message has bytes; edges (M, 2) and hand poses (M, 4, 4)
@@ -41,12 +36,12 @@ def read_request(method: Method, body: bytes) -> dict[str, Any]:
         InvalidRequest: It is no such message, has no cloud or two, a pose that is none, more parts
             than any request needs, or a field that this server does not know.
     """
-    scores = method == "ScoreGrasps"
+    scores = job.method == "ScoreGrasps"
     kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
     try:
-        message: Any = kind.FromString(body)
+        message: Any = kind.FromString(job.body)
     except DecodeError:
-        value = f"{len(body)} bytes that are no message of this method"
+        value = f"{len(job.body)} bytes that are no message of this method"
         fix = "Send a message as the .proto file has it."
         raise InvalidRequest("request", value, fix) from None
     _check(message, "request")
@@ -69,33 +64,22 @@ def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
     return {field.name: _field(message, field) for field, _ in message.ListFields()}
 
 
-def write_detection(detection: Detection) -> bytes:
-    """A detection as DetectGraspsResponse."""
-    return grasp_pb2.DetectGraspsResponse(
-        grasps=[grasp_pb2.Grasp(**_flat(grasp)) for grasp in detection.grasps],
-        counts=detection.counts,
-        seconds=detection.seconds,
-        model=detection.model,
-        warnings=detection.warnings,
-        debug=None if detection.debug is None else grasp_pb2.DebugInfo(**_flat(detection.debug)),
-    ).SerializeToString()
+def write(result: Detection | Scoring) -> bytes:
+    """A result as DetectGraspsResponse or ScoreGraspsResponse."""
+    if isinstance(result, Detection):
+        return grasp_pb2.DetectGraspsResponse(**_flat(result)).SerializeToString()
+    return grasp_pb2.ScoreGraspsResponse(**_flat(result)).SerializeToString()
 
 
-def write_scoring(scoring: Scoring) -> bytes:
-    """Evaluations as ScoreGraspsResponse."""
-    return grasp_pb2.ScoreGraspsResponse(
-        evaluations=[
-            grasp_pb2.Evaluation(
-                grasp=None if each.grasp is None else grasp_pb2.Grasp(**_flat(each.grasp)),
-                reason=each.reason,
-            )
-            for each in scoring.evaluations
-        ],
-        counts=scoring.counts,
-        seconds=scoring.seconds,
-        model=scoring.model,
-        warnings=scoring.warnings,
-    ).SerializeToString()
+def _flat(value: Any) -> Any:
+    """Fields as messages have them: arrays flat, in row-major order."""
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist()
+    if isinstance(value, list):
+        return [_flat(part) for part in value]
+    if is_dataclass(value):
+        return {name: _flat(part) for name, part in vars(value).items()}
+    return value
 
 
 # Requests
@@ -107,28 +91,18 @@ def _check(message: Message, name: str) -> None:
         numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
         fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
         raise InvalidRequest(name, f"unknown fields numbered {numbers}", fix)
-    for field, is_repeated, is_message in _composite_fields(message.DESCRIPTOR):
-        here = f"{name}.{field}"
-        if is_repeated:
-            parts = getattr(message, field)
-            most = MAX_GIVEN.get(field, MAX_PARTS) if is_message else MAX_ROWS
+    for field in message.DESCRIPTOR.fields:
+        here, is_message = f"{name}.{field.name}", field.message_type is not None
+        if field.is_repeated:
+            parts = getattr(message, field.name)
+            most = MAX_GIVEN.get(field.name, MAX_PARTS) if is_message else MAX_ROWS
             if len(parts) > most:
                 here = here.removeprefix("request.")
                 raise InvalidRequest(here, f"{len(parts)} of them", f"Send at most {most}.")
             for row, part in enumerate(parts if is_message else ()):
                 _check(part, f"{here}.{row}")
-        elif message.HasField(field):
-            _check(getattr(message, field), here)
-
-
-@cache
-def _composite_fields(descriptor: Descriptor) -> list[tuple[str, bool, bool]]:
-    """Fields that are repeated or messages; asking for bytes would copy them."""
-    return [
-        (field.name, field.is_repeated, field.message_type is not None)
-        for field in descriptor.fields
-        if field.is_repeated or field.message_type is not None
-    ]
+        elif is_message and message.HasField(field.name):
+            _check(getattr(message, field.name), here)
 
 
 def _cloud(message: Any) -> dict[str, Any]:
@@ -180,8 +154,8 @@ def _field(message: Message, field: Any) -> Any:
 def _plain(value: Any) -> Any:
     if not isinstance(value, Message):
         return value
-    form = _FORMS.get(type(value))
-    return _plain_fields(value) if form is None else form(value)
+    form: Callable[[Any], Any] = _FORMS.get(type(value), _plain_fields)
+    return form(value)
 
 
 def _coordinates(message: Message) -> list[float]:
@@ -225,14 +199,3 @@ _FORMS: dict[type[Message], Callable[[Any], Any]] = {
     grasp_pb2.Support: _support,
     grasp_pb2.Suppression: _suppression,
 }
-
-
-# Answers
-
-
-def _flat(result: Grasp | DebugInfo) -> dict[str, Any]:
-    """Its fields as messages have them: arrays flat, in row-major order."""
-    return {
-        name: value.ravel().tolist() if isinstance(value, np.ndarray) else value
-        for name, value in vars(result).items()
-    }

@@ -5,7 +5,7 @@ a form or a message carries it; or bytes, little-endian numbers that a message c
 arrays suit is for the detector to say.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,11 +16,10 @@ from pydantic import BaseModel, ValidationError
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.schemas import PER_POINT, Depth, DepthImage, PointCloud2
+from edgegrasp_service.schemas import PACKED, PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
-    PCL_COLORS,
-    PCL_NORMALS,
-    cloud_of_pcl_fields,
+    PCL_FIELDS,
+    cloud_of_records,
     read_file,
     read_npy,
     too_many,
@@ -94,19 +93,14 @@ def _source(fields: Mapping[str, Any]) -> str:
         raise InvalidRequest("points", "nothing", fix)
     if len(sources) > 1:
         raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
-    name = sources[0]
-    if isinstance(fields[name], File) != (name == "cloud"):
-        if name == "cloud":
-            raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-        raise InvalidRequest(name, "an .npy file", "Send JSON, or the part `cloud`.")
-    return name
+    return sources[0]
 
 
 # Points and arrays beside them
 
 
 def decode_points(points: object, max_points: int) -> Array:
-    """Read points: packed float32 x, y, z; or lists, with [null, null, null] for a hole.
+    """Read points as `decode_array` does; [null, null, null] in an organised list is a hole.
 
     Returns:
         (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
@@ -115,33 +109,19 @@ def decode_points(points: object, max_points: int) -> Array:
         InvalidRequest: No whole number of points, no list, or lists that are no array of numbers.
         PayloadTooLarge: More than `max_points` points.
     """
-    if isinstance(points, bytes):
-        if len(points) % 12:
-            raise InvalidRequest(
-                "points",
-                f"{len(points)} bytes, which are no whole number of points",
-                "Send 12 bytes a point: little-endian float32 x, y, z.",
-            )
-        if len(points) // 12 > max_points:
-            raise too_many(len(points) // 12, max_points)
-        return np.frombuffer(points, dtype="<f4").reshape(-1, 3)
-    if not isinstance(points, list):
-        raise InvalidRequest("points", brief(points), "Send a list of [x, y, z] in metres.")
-    if len(points) > max_points:
-        raise too_many(len(points), max_points)
-    if not points:
-        return np.empty((0, 3))
-    array = _numbers("points", points, holes=True)
+    array = decode_array("points", points, max_points)
     if array.size // 3 > max_points:
         raise too_many(array.size // 3, max_points)
-    return array.astype(np.float64)
+    if not array.size:
+        return np.empty((0, 3))
+    return array if isinstance(points, bytes) else array.astype(np.float64)
 
 
 def decode_array(field: str, value: object, max_points: int) -> Array:
-    """Read an array other than the points: packed numbers, an .npy file or lists.
+    """Read an array: packed numbers, an .npy file or lists.
 
     Returns:
-        Of bytes (N, 3) float32 or (N,) int32, as PER_POINT says; of lists int64 where all numbers
+        Of bytes (N, 3) float32 or (N,) int32, as PACKED says; of lists int64 where all numbers
         are whole, else float64; of a file whatever is in it.
 
     Raises:
@@ -151,51 +131,43 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
     if isinstance(value, File):
         return read_npy(value.data, max_points, field)
     if isinstance(value, bytes):
-        width, dtype, _ = PER_POINT[field]
+        width, kind = PACKED[field]
         if len(value) % (4 * width):
-            kind = "float32" if dtype == "<f4" else "int32"
+            found = f"{len(value)} bytes, which are no whole number of rows"
             fix = f"Send {4 * width} bytes a row: little-endian {kind}."
-            raise InvalidRequest(
-                field, f"{len(value)} bytes, which are no whole number of rows", fix
-            )
-        array = np.frombuffer(value, dtype=dtype)
+            raise InvalidRequest(field, found, fix)
+        array = np.frombuffer(value, np.dtype(kind).newbyteorder("<"))
         return array.reshape(-1, 3) if width == 3 else array
     if not isinstance(value, list):
         raise InvalidRequest(field, brief(value), "Send a list of numbers, or of lists of them.")
-    return _numbers(field, value) if value else np.empty(0)
+    return _numbers(field, value, holes=field == "points") if value else np.empty(0)
 
 
-def _numbers(field: str, values: list[Any], holes: bool = False) -> Array:
+def _numbers(field: str, values: list[Any], holes: bool) -> Array:
     """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
-    one_length = "Send [x, y, z] rows." if holes else "Send rows of one length."
     # As objects: an array of text would give every element the room of the longest.
     try:
         array = np.array(values, dtype=object)
+        numbers = array.ravel().tolist()
+        kinds = set(map(type, numbers))
+        if list in kinds:
+            raise ValueError("a ragged list")
     except ValueError:
-        raise InvalidRequest(field, "rows of different lengths", one_length) from None
-    kinds = set(map(type, array.ravel().tolist()))
-    if list in kinds:
-        raise InvalidRequest(field, "rows of different lengths", one_length)
-    allowed = {int, float, type(None)} if holes and array.ndim == 3 else {int, float}
-    if not kinds <= allowed:
-        bad = next(row for row in values if _holds(row, lambda part: type(part) not in allowed))
-        raise InvalidRequest(field, brief(bad), "Send numbers only.")
+        fix = "Send [x, y, z] rows." if field == "points" else "Send rows of one length."
+        raise InvalidRequest(field, "rows of different lengths", fix) from None
+    allowed = {int, float} | ({type(None)} if holes and array.ndim == 3 else set())
     try:
-        return array.astype(np.int64 if kinds == {int} else np.float64)
+        if kinds <= allowed:
+            return array.astype(np.int64 if kinds == {int} else np.float64)
     except OverflowError:
-        bad = next(row for row in values if _holds(row, _too_large))
-        raise InvalidRequest(field, brief(bad), "Send whole numbers of 64 bits.") from None
-
-
-def _holds(value: object, of_kind: Callable[[object], bool]) -> bool:
-    """Whether any number in lists of any depth is of a kind."""
-    if isinstance(value, list):
-        return any(_holds(part, of_kind) for part in value)
-    return of_kind(value)
-
-
-def _too_large(value: object) -> bool:
-    return isinstance(value, int) and not -(2**63) <= value < 2**63
+        pass
+    bad = next(
+        place
+        for place, number in enumerate(numbers)
+        if type(number) not in allowed or (type(number) is int and abs(number) >= 2**63)
+    )
+    row = values[bad * len(values) // len(numbers)]
+    raise InvalidRequest(field, brief(row), "Send numbers only, whole ones of 64 bits.")
 
 
 # sensor_msgs/PointCloud2
@@ -232,7 +204,7 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
     if 0 in shape:
         return CloudInput(np.empty((0, 3), np.float32))
     rows = np.ndarray(shape, record, layout.data, strides=strides).astype(record.newbyteorder("="))
-    return cloud_of_pcl_fields(rows[0] if layout.height == 1 else rows)
+    return cloud_of_records(rows[0] if layout.height == 1 else rows)
 
 
 def _record(layout: PointCloud2) -> np.dtype[Any]:
@@ -260,7 +232,7 @@ def _record(layout: PointCloud2) -> np.dtype[Any]:
     if missing:
         value = ", ".join(found)[:80] or "no single numbers"
         raise InvalidRequest("point_cloud2.fields", value, f"Send {', '.join(missing)} too.")
-    names = [name for name in ("x", "y", "z", *PCL_NORMALS, *PCL_COLORS) if name in found]
+    names = [name for name in PCL_FIELDS if name in found]
     return np.dtype(
         {
             "names": names,
@@ -305,7 +277,9 @@ def fuse_depth_images(
         if pixels > max_points:
             raise too_many(pixels, max_points, "depth_images")
     clouds = [_points_of_pixels(depth, view) for depth, view in zip(depths, views, strict=True)]
-    cameras = [_position(view) for view in views]
+    cameras = [
+        (x, y, z) for (*_, x), (*_, y), (*_, z), _ in (view.T_cloud_camera for view in views)
+    ]
     if len(views) == 1:
         return CloudInput(clouds[0]), cameras
     points = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
@@ -313,43 +287,27 @@ def fuse_depth_images(
     return CloudInput(points, view_ids=view_ids), cameras
 
 
-def _position(view: DepthImage) -> tuple[float, float, float]:
-    (*_, x), (*_, y), (*_, z), _ = view.T_cloud_camera
-    return x, y, z
-
-
 def _depth(depth: object, field: str) -> NDArray[np.float64]:
     """(H, W) metres, NaN where there is no reading."""
     if isinstance(depth, list):
-        array = decode_array(field, [_nan_for_none(row) for row in depth], 0)
+        array: Array = _numbers(field, [depth], holes=True)[0]
         if array.ndim != 2 or 0 in array.shape:
             raise InvalidRequest(field, f"shape {array.shape}", "Send rows of one length.")
         metres = array.astype(np.float64)
     else:
-        metres = _unpacked_depth(depth, field)
+        image = _parse(Depth, depth, field)
+        dtype, unit = DEPTH_ENCODINGS[image.encoding]
+        expected = image.height * image.width * np.dtype(dtype).itemsize
+        if len(image.data) != expected:
+            value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
+            raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
+        pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
+        metres = pixels.astype(np.float64) * unit
     if (metres < 0).any():
         worst = float(np.nanmin(metres))
         raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
     metres[~(np.isfinite(metres) & (metres > 0))] = np.nan
     return metres
-
-
-def _unpacked_depth(depth: object, field: str) -> NDArray[np.float64]:
-    image = _parse(Depth, depth, field)
-    if image.encoding not in DEPTH_ENCODINGS:
-        fix = f"Send one of: {', '.join(DEPTH_ENCODINGS)}."
-        raise InvalidRequest(f"{field}.encoding", brief(image.encoding), fix)
-    dtype, metres = DEPTH_ENCODINGS[image.encoding]
-    expected = image.height * image.width * np.dtype(dtype).itemsize
-    if len(image.data) != expected:
-        value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
-        raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
-    pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
-    return pixels.astype(np.float64) * metres
-
-
-def _nan_for_none(row: object) -> object:
-    return [np.nan if value is None else value for value in row] if isinstance(row, list) else row
 
 
 def _points_of_pixels(depth: NDArray[np.float64], view: DepthImage) -> NDArray[np.float32]:

@@ -159,7 +159,7 @@ def test_ply_headers_without_points(header: bytes) -> None:
     data = b"ply\nformat binary_little_endian 1.0\n" + header + b"end_header\n" + bytes(100)
     with pytest.raises(InvalidRequest) as caught:
         read_file("ply", data, MANY)
-    assert "vert" in caught.value.value
+    assert "vertices" in caught.value.fix
 
 
 def test_compressed_pcd(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,11 +248,11 @@ def test_organised_clouds() -> None:
 @pytest.mark.parametrize(
     ("data", "value"),
     [
-        (b"", "0 bytes without a line"),
-        (b"# only\n", "without a line"),
-        (b"0 0 0\n0 0\n", "line 2 with 2 words"),
-        (b"0 0 0 1 0 0\n", "line 1 with 6 words"),
-        (b"0 0 a\n", "text among the numbers"),
+        (b"", "no line of numbers"),
+        (b"# only\n", "no line of numbers"),
+        (b"0 0 0\n0 0\n", "from 3 to 2 at row 2"),
+        (b"0 0 0 1 0 0\n", "6 numbers in a line"),
+        (b"0 0 a\n", "'a'"),
     ],
 )
 def test_bad_xyz_files(data: bytes, value: str) -> None:
@@ -270,29 +270,30 @@ def npy_of(header: str, body: bytes = b"") -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("descr", "shape", "value"),
+    ("descr", "shape"),
     [
-        ("'<f4'", "(True, 3)", "shape (True, 3)"),
-        ("'<f4'", "(-1, 3)", "shape (-1, 3)"),
-        ("'<f4'", "(99999999999999999999999999, 0, 3)", "shape (99999999999999999999999999, 0, 3)"),
-        ("'<f4'", "(1" + ", 1" * 99 + ")", "shape (1, 1"),
-        ("('<f4',(3,))", "(1,)", "dtype ('<f4', (3,))"),
-        ("'|O'", "(1, 3)", "dtype object"),
+        ("'<f4'", "(True, 3)"),
+        ("'<f4'", "(-1, 3)"),
+        ("'<f4'", "(99999999999999999999999999, 0, 3)"),
+        ("'<f4'", "(1" + ", 1" * 99 + ")"),
+        ("('<f4',(3,))", "(1,)"),
+        ("'|O'", "(1, 3)"),
+        ("'|V0'", "(1, 3)"),
     ],
 )
-def test_npy_headers_of_no_array(descr: str, shape: str, value: str) -> None:
+def test_npy_headers_of_no_array(descr: str, shape: str) -> None:
     header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
     with pytest.raises(InvalidRequest) as caught:
         read_file("npy", npy_of(header, bytes(12)), MANY)
     assert caught.value.field == "cloud"
-    assert caught.value.value.startswith(value)
 
 
-def test_a_count_of_thousands_of_digits() -> None:
-    data = pcd(POINTS).replace(b"COUNT 1 1 1 2 1", b"COUNT 1 1 1 2 " + b"1" * 5000)
-    with pytest.raises(InvalidRequest) as caught:
-        read_file("pcd", data, MANY)
-    assert caught.value.value.endswith("COUNT 11111111")
+@pytest.mark.parametrize("count", ["1" * 5000, "1" * 4000, "99999999", "-1"])
+def test_counts_that_no_point_has(count: str) -> None:
+    for points in (-1, 0):
+        data = pcd(POINTS, "ascii", points).replace(b"COUNT 1 1 1 2 1", b"COUNT 1 1 1 2 %a" % count)
+        with pytest.raises(InvalidRequest):
+            read_file("pcd", data.replace(b"'", b""), MANY)
 
 
 def test_a_comment_that_names_the_end_of_the_header() -> None:
@@ -302,12 +303,12 @@ def test_a_comment_that_names_the_end_of_the_header() -> None:
         np.testing.assert_array_equal(np.asarray(points, np.float32), POINTS)
 
 
-def test_numbers_are_read_whole_or_not_at_all() -> None:
+def test_numbers_are_read_whole() -> None:
     """The exponent comes last."""
-    written = b"0.12345678901234567890123456789012e-05 0 0\n"
-    assert read_file("xyz", written, 10).points[0, 0] == 0.12345678901234567890123456789012e-05
-    with pytest.raises(InvalidRequest, match="a word of 66 characters"):
-        read_file("xyz", b"0." + b"1" * 60 + b"e-05 0 0\n", 10)
+    for digits in (32, 60, 1000):
+        written = "0." + "1" * digits + "e-05"
+        points = read_file("xyz", f"{written} 0 0\n".encode(), 10).points
+        assert points[0, 0] == float(written)
 
 
 # What is small on the way in and large inside is refused before it is large.
@@ -375,6 +376,14 @@ BOMBS: dict[str, tuple[str, bytes]] = {
     "ply, count": ("ply", PLY.format(1_999_999).encode() + b"0 0 0"),
     "pcd, header": ("pcd", b"".join(b"%x\n" % n for n in range(MIB)) + b"DATA ascii\n"),
     "pcd, compressed": ("pcd", pcd_bomb()),
+    "ply, line": ("ply", PLY.format(2).encode() + b"1 " * (4 * MIB)),
+    "xyz, line": ("xyz", b"1 " * (4 * MIB)),
+    "xyz, word": ("xyz", b"1" * (8 * MIB)),
+    "pcd, columns": (
+        "pcd",
+        pcd(POINTS, "ascii", 1).replace(b"1 1 1 2 1", b"1 1 1 %d 1" % (4 * MIB))
+        + b"1 " * (4 * MIB),
+    ),
 }  # fmt: skip
 
 
