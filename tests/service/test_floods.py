@@ -87,6 +87,7 @@ async def test_messages_that_never_end(serve, cloud) -> None:
         assert resident_bytes() - before < 500 * MIB
         connection.stop.set()
         await asyncio.to_thread(sending.join, PATIENCE)
+    await running.until_idle()
     client = running.connect("grpc")
     assert (await client.detect(cloud)).fine
     await client.close()
