@@ -1,20 +1,16 @@
 """Measure servers under load: `python -m benchmarks.load` writes load.json.
 
-Clients in processes of their own send clouds of 20,000 points. In the closed loop each sends its
-next request once it has an answer: latency and throughput by the number of clients. In the open
-loop requests are due at random moments, more than the server sustains, with a deadline: what
-becomes of those that are refused.
-
-Without `--server` one is started, and measured over both transports. Several servers take turns,
-so that other work on the machine meets all alike: a new design beside the old one.
+Clients in processes of their own send clouds of 20,000 points, each its next request once it has an
+answer: latency and throughput by the number of clients. Without `--server` one is started, and
+measured over both transports. Several servers take turns, so that other work on the machine meets
+all alike: a new design beside the old one.
 """
 
 import argparse
 import statistics
-import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -31,47 +27,29 @@ from edgegrasp_client import DetectOptions, GraspClient, GraspClientError
 POINTS = 20_000
 OPTIONS: DetectOptions = {"num_approach_points": 32, "num_candidates": 500}
 PROCESSES = 2  # that the clients are shared among
-OPEN_CLIENTS = 96  # connections of an open loop
+TIMEOUT = 120.0  # seconds until a request is given up
 START_SECONDS = 1.0  # from the order to the first request: clouds are made
 OK = "OK"
 
 
 @dataclass(frozen=True)
 class Task:
-    """What one process sends.
+    """What one process sends."""
 
-    Attributes:
-        address: of the server.
-        clients: requests at a time, at most.
-        start: moment of `time.monotonic` of the first request.
-        seconds: how long requests are sent.
-        rate: requests a second on average, an open loop; None: a closed one.
-        timeout: seconds until a request is given up.
-        seed: of the cloud and of the moments.
-    """
-
-    address: str
-    clients: int
-    start: float
-    seconds: float
-    rate: float | None = None
-    timeout: float = 120.0
-    seed: int = 0
+    address: str  # of the server
+    clients: int  # requests at a time
+    start: float  # moment of `time.monotonic` of the first request
+    seconds: float  # how long requests are sent
+    seed: int = 0  # of the cloud
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What became of one request.
+    """What became of one request."""
 
-    Attributes:
-        seconds: from the moment it was due until its answer or error.
-        detector_seconds: of the detection, as the answer says; None without an answer.
-        code: OK, or the name of the client's error.
-    """
-
-    seconds: float
-    detector_seconds: float | None
-    code: str
+    seconds: float  # until its answer or error
+    detector_seconds: float | None  # of the detection, as the answer says; None without an answer
+    code: str  # OK, or the name of the client's error
 
 
 def main() -> None:
@@ -79,25 +57,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.load")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--server", action="append", help="host:port or http://host:port")
-    parser.add_argument("--dummy", type=float, help="service seconds of a made-up detector")
     parser.add_argument("--clients", type=int, nargs="+", default=[1, 2, 8])
     parser.add_argument("--seconds", type=float, default=8.0, help="of each run")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each server")
-    parser.add_argument("--overload", type=float, default=2.0, help="times what is sustained")
-    parser.add_argument("--deadline", type=float, default=5.0, help="of requests in the open loop")
     given = parser.parse_args()
     results: dict[str, Any] = {"machine": machine(), "points": POINTS, **OPTIONS}
     with ExitStack() as stack:
         servers = {address: address for address in given.server or ()}
         if not servers:
-            flags = () if given.dummy is None else ("--backend", "dummy")
-            flags += () if given.dummy is None else ("--dummy-seconds", str(given.dummy))
-            own = stack.enter_context(served(*flags))
+            own = stack.enter_context(served())
             servers = {"grpc": own.grpc_address, "rest": own.http_url}
         pool = stack.enter_context(ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")))
         list(pool.map(time.sleep, [START_SECONDS] * PROCESSES))  # until all processes have started
-        results["closed"] = closed_loops(pool, servers, given)
-        results["open"] = open_loops(pool, servers, results["closed"], given)
+        results["servers"] = closed_loops(pool, servers, given)
     write_results(given.output, "load", results)
 
 
@@ -120,84 +92,40 @@ def closed_loops(
     return rows
 
 
-def open_loops(
-    pool: ProcessPoolExecutor,
-    servers: dict[str, str],
-    closed: Sequence[dict[str, Any]],
-    given: argparse.Namespace,
-) -> list[dict[str, Any]]:
-    """A row for each server, at a multiple of its best rate in the closed loop."""
-    rows = []
-    for name, address in servers.items():
-        rate = given.overload * max(row["per_second"] for row in closed if row["server"] == name)
-        if rate == 0.0:
-            continue
-        task = Task(address, OPEN_CLIENTS, 0.0, given.seconds, rate, given.deadline)
-        rows.append({"server": name, "rate": rate} | summary(send(pool, task)))
-        print(rows[-1], flush=True)
-    return rows
-
-
 def send(pool: ProcessPoolExecutor, task: Task) -> list[Sample]:
     """Share a task among the processes, as many as it has clients at most."""
     processes = min(PROCESSES, task.clients)
     start = time.monotonic() + START_SECONDS
-    shares = [
-        replace(
-            task,
-            clients=task.clients // processes,
-            start=start,
-            rate=None if task.rate is None else task.rate / processes,
-            seed=number,
-        )
-        for number in range(processes)
-    ]
+    share = replace(task, clients=task.clients // processes, start=start)
+    shares = [replace(share, seed=number) for number in range(processes)]
     return [sample for samples in pool.map(run_clients, shares) for sample in samples]
 
 
 def run_clients(task: Task) -> list[Sample]:
     """Send until the time is over; every request that was sent has its sample."""
     points = cloud(POINTS, task.seed)
-    samples: list[Sample] = []
-    moments = due_moments(task)
-    lock = threading.Lock()
 
-    def work() -> None:
-        with GraspClient(task.address, timeout=task.timeout, retry=False) as client:
-            while True:
-                with lock:
-                    due = next(moments, None)
-                if due is None:
-                    return
-                time.sleep(max(0.0, due - time.monotonic()))
-                samples.append(request(client, points, due))
+    def work() -> list[Sample]:
+        samples = []
+        with GraspClient(task.address, timeout=TIMEOUT, retry=False) as client:
+            time.sleep(max(0.0, task.start - time.monotonic()))
+            while time.monotonic() < task.start + task.seconds:
+                samples.append(request(client, points))
+        return samples
 
     with ThreadPoolExecutor(task.clients) as threads:
-        for future in [threads.submit(work) for _ in range(task.clients)]:
-            future.result()
-    return samples
+        work_of_each = [threads.submit(work) for _ in range(task.clients)]
+        return [sample for one in work_of_each for sample in one.result()]
 
 
-def request(client: GraspClient, points: NDArray[np.float32], due: float) -> Sample:
-    """Send one request; its seconds count from when it was due."""
+def request(client: GraspClient, points: NDArray[np.float32]) -> Sample:
+    """Send one request."""
+    begun = time.monotonic()
     try:
         answer = client.detect(points, **OPTIONS)
     except GraspClientError as error:
-        return Sample(time.monotonic() - due, None, type(error).__name__)
-    return Sample(time.monotonic() - due, answer.seconds["total"], OK)
-
-
-def due_moments(task: Task) -> Iterator[float]:
-    """When requests are due; in an open loop whatever became of those before."""
-    end = task.start + task.seconds
-    if task.rate is None:
-        while (now := time.monotonic()) < end:
-            yield max(now, task.start)
-        return
-    random = np.random.default_rng([task.seed, 1])
-    moment = task.start
-    while (moment := moment + random.exponential(1.0 / task.rate)) < end:
-        yield moment
+        return Sample(time.monotonic() - begun, None, type(error).__name__)
+    return Sample(time.monotonic() - begun, answer.seconds["total"], OK)
 
 
 def summary(samples: Sequence[Sample]) -> dict[str, Any]:
@@ -208,7 +136,6 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
         "codes": dict(Counter(one.code for one in samples)),
         "answered_ms": percentiles([one.seconds for one in answered]),
         "beyond_the_detector_ms": percentiles(beyond),
-        "refused_ms": percentiles([one.seconds for one in samples if one.code != OK]),
     }
 
 

@@ -81,7 +81,6 @@ def benchmark(
     gate: Annotated[
         Path | None, Option(help="summary.json of a result that this one must not fall below.")
     ] = None,
-    gui: Annotated[bool, Option(help="Show the simulator's window (one worker).")] = False,
     *,
     connection: dict[str, Any],
     options: dict[str, Any],
@@ -117,9 +116,9 @@ def benchmark(
             patience,
         )
         own_server = planner == "server" and server is None
-        processes = _processes(workers, gui=gui, ray=ray, own_server=own_server)
+        processes = _processes(workers, ray=ray, own_server=own_server)
         folder = ResultFolder(output) if output is not None else None
-        done, title = run_rounds(config, choice, folder, workers=processes, ray=ray, gui=gui)
+        done, title = run_rounds(config, choice, folder, workers=processes, ray=ray)
     summary = {"scene": scene, "protocol": rules.name, "protocol_version": rules.version}
     summary |= summarise(done)
     if folder is not None:
@@ -184,7 +183,6 @@ def run_rounds(
     *,
     workers: int,
     ray: str | None = None,
-    gui: bool = False,
 ) -> "tuple[list[Round], str]":
     """Run what is left of a benchmark behind a progress bar.
 
@@ -210,7 +208,6 @@ def run_rounds(
                 ray=ray,
                 folder=folder,
                 on_round=on_round,
-                gui=gui,
             )
     return done, planner.title
 
@@ -241,7 +238,7 @@ def _progress(
         yield on_round
 
 
-def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: bool) -> int:
+def _processes(workers: int | None, *, ray: str | None, own_server: bool) -> int:
     """How many worker processes to use.
 
     Raises:
@@ -249,17 +246,11 @@ def _processes(workers: int | None, *, gui: bool, ray: str | None, own_server: b
     """
     from edgegrasp_sim.benchmark import available_cores
 
-    if gui and (workers or 1) > 1:
-        raise ValueError(f"workers is {workers}; the window shows one: use 1")
-    if gui and ray is not None:
-        raise ValueError(f"ray is {ray!r}; the window is this machine's: leave it out")
     if ray not in (None, "local") and own_server:
         raise ValueError(
             f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
             "--server, or --planner in-process"
         )
-    if gui:
-        return 1
     if workers is None:
         return MAX_RAY_WORKERS if ray is not None else available_cores()
     return workers

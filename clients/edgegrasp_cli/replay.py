@@ -30,7 +30,6 @@ def attempt(
     picture: Annotated[
         Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
     ] = None,
-    gui: Annotated[bool, Option(help="Show the simulator's window.")] = False,
 ) -> None:
     """Make one recorded attempt again, in the scene and view it was made in."""
     from edgegrasp_sim.picture import draw_grasps
@@ -40,7 +39,7 @@ def attempt(
 
     folder = ResultFolder(results)
     first = folder.manifest()["seeds"][0]
-    with Replay(folder, objects, gui=gui) as repeated:
+    with Replay(folder, objects) as repeated:
         done = repeated.find(first if seed is None else seed, round, number)
         now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)

@@ -21,7 +21,6 @@ from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PATIENCE, Planner, Round, run_round
-from edgegrasp_sim.window import Window
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
@@ -95,7 +94,6 @@ def run_benchmark(
     ray: str | None = None,
     folder: ResultFolder | None = None,
     on_round: Callable[[Round], None] | None = None,
-    gui: bool = False,
 ) -> list[Round]:
     """Run all rounds that `folder` does not hold yet; outcomes do not depend on where.
 
@@ -107,7 +105,6 @@ def run_benchmark(
         ray: address of a Ray cluster to run the workers on; see `_run_on_ray`.
         folder: keeps each round as it finishes; opened by the caller.
         on_round: called with every round as it finishes, in any order.
-        gui: show the simulator's window; with one worker only.
 
     Returns:
         All rounds of `config`, by seed and index.
@@ -129,7 +126,7 @@ def run_benchmark(
     if ray is not None:
         run = _run_on_ray(ray, config, make_planner, missing, workers)
     elif workers == 1:
-        run = _run_here(config, make_planner, missing, gui)
+        run = _run_here(config, make_planner, missing)
     else:
         run = _run_in_processes(config, make_planner, missing, workers)
     for done in run:
@@ -189,7 +186,6 @@ class RoundRunner:
     Args:
         config: what to run.
         make_planner: called once.
-        gui: show the simulator's window.
         digest: that the objects must have, if they are read on another machine.
 
     Raises:
@@ -201,7 +197,6 @@ class RoundRunner:
         config: BenchmarkConfig,
         make_planner: PlannerFactory,
         *,
-        gui: bool = False,
         digest: str | None = None,
     ) -> None:
         objects = config.object_set()
@@ -212,8 +207,7 @@ class RoundRunner:
             )
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: objects}, gui=gui)
-        self.window = Window(self.simulation.world) if gui else None
+        self.simulation = ClutterSimulation({config.scene: objects})
 
     def run(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
@@ -227,7 +221,6 @@ class RoundRunner:
             seed=seed,
             index=index,
             patience=config.patience,
-            on_grasp=self.window.show if self.window is not None else None,
         )
 
     def close(self) -> None:
@@ -238,11 +231,11 @@ class RoundRunner:
 
 
 def _run_here(
-    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], gui: bool
+    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task]
 ) -> Iterator[Round]:
     if not tasks:
         return
-    runner = RoundRunner(config, make_planner, gui=gui)
+    runner = RoundRunner(config, make_planner)
     try:
         yield from map(runner.run, tasks)
     finally:

@@ -3,7 +3,7 @@
 PyBullet is named in this file alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -19,7 +19,6 @@ TIME_STEP = 1.0 / 80.0  # seconds
 SOLVER_ITERATIONS = 100
 GRAVITY = 9.81  # m/s²
 ASSETS = Path(pybullet_data.getDataPath())  # meshes and URDF files that come with the engine
-SPACE = ord(" ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +50,12 @@ class Contact:
 class World:
     """One physics server; a process may have several.
 
-    Args:
-        gui: open PyBullet's window instead of running without a display.
-
     Raises:
-        RuntimeError: PyBullet could not start a server (no display for the window, or no
-            free server left in this process).
+        RuntimeError: PyBullet could not start a server: none is left in this process.
     """
 
-    def __init__(self, *, gui: bool = False) -> None:
-        self.on_step: Callable[[], None] | None = None  # called after every time step
-        self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+    def __init__(self) -> None:
+        self.client: int = pybullet.connect(pybullet.DIRECT)
         if self.client < 0:
             raise RuntimeError("PyBullet did not start a physics server; close unused worlds")
         self.reset()
@@ -94,8 +88,6 @@ class World:
         """Advance the world by `steps` time steps of 1/80 s."""
         for _ in range(steps):
             pybullet.stepSimulation(physicsClientId=self.client)
-            if self.on_step is not None:
-                self.on_step()
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
         """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
@@ -214,28 +206,6 @@ class World:
         )
         z = np.asarray(z_buffer, dtype=np.float64).reshape(camera.height, camera.width)
         return camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
-
-    def aim_window(
-        self, target: Sequence[float], distance: float, yaw: float, pitch: float
-    ) -> None:
-        """Point the window's camera at `target` from `distance` metres; angles in degrees."""
-        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=self.client)
-        pybullet.resetDebugVisualizerCamera(
-            distance, yaw, pitch, target, physicsClientId=self.client
-        )
-
-    def draw_lines(self, lines: Matrix, colour: Sequence[float]) -> None:
-        """Draw lines (L, 2, 3), world frame, metres, in the window, and erase earlier ones."""
-        pybullet.removeAllUserDebugItems(physicsClientId=self.client)
-        for start, end in lines.tolist():
-            pybullet.addUserDebugLine(
-                start, end, colour, lineWidth=4.0, physicsClientId=self.client
-            )
-
-    def space_pressed(self) -> bool:
-        """Whether the space bar was pressed in the window since the last call."""
-        keys = pybullet.getKeyboardEvents(physicsClientId=self.client)
-        return bool(keys.get(SPACE, 0) & pybullet.KEY_WAS_TRIGGERED)
 
     def _hull(self, mesh: Path, quaternion_xyzw: Sequence[float]) -> int:
         """A collision shape: the convex hull of a mesh, turned."""

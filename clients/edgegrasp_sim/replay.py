@@ -9,7 +9,6 @@ from edgegrasp_sim.protocol import protocol_from
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
-from edgegrasp_sim.window import Window
 
 
 class Replay:
@@ -18,16 +17,13 @@ class Replay:
     Args:
         folder: a benchmark's.
         objects: where its object folder is now; by default where it was.
-        gui: show the simulator's window.
 
     Raises:
         FileNotFoundError: the folder holds no benchmark, or its objects are not there.
         ValueError: the objects are not those of the benchmark.
     """
 
-    def __init__(
-        self, folder: ResultFolder, objects: Path | None = None, *, gui: bool = False
-    ) -> None:
+    def __init__(self, folder: ResultFolder, objects: Path | None = None) -> None:
         facts = folder.manifest()
         run = facts["run"]
         self.scene = SceneKind(run["scene"])
@@ -45,8 +41,7 @@ class Replay:
                 "pass the folder it was run with"
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
-        self.simulation = ClutterSimulation({self.scene: models}, gui=gui)
-        self.window = Window(self.simulation.world) if gui else None
+        self.simulation = ClutterSimulation({self.scene: models})
 
     def __enter__(self) -> Self:
         return self
@@ -87,7 +82,5 @@ class Replay:
             while driver.view < recorded.view:  # views in which no grasp was found
                 seen = driver.look()
             grasp = PlannedGrasp(recorded.T_world_hand, recorded.score, recorded.width)
-            if self.window is not None:
-                self.window.show(grasp)
             repeated = driver.execute(grasp)
         return repeated, seen

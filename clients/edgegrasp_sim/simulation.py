@@ -83,7 +83,6 @@ class ClutterSimulation:
 
     Args:
         objects: what to make scenes from, for each kind; the built-in sets by default.
-        gui: show the engine's window.
         start_contact_fails: call a grasp failed (`PREGRASP`) if the open hand overlaps anything
             at its start pose. The reference simulator asks for contacts there before the engine
             has looked for any, so that it never fails a grasp for this and lets the engine push
@@ -94,7 +93,6 @@ class ClutterSimulation:
         self,
         objects: Mapping[SceneKind, ObjectSet] | None = None,
         *,
-        gui: bool = False,
         start_contact_fails: bool = False,
     ) -> None:
         self.object_sets = (
@@ -103,7 +101,7 @@ class ClutterSimulation:
             else {kind: ObjectSet.builtin(kind) for kind in SceneKind}
         )
         self.start_contact_fails = start_contact_fails
-        self.world = World(gui=gui)
+        self.world = World()
         self._objects: list[SceneObject] = []
         self._gripper: Gripper | None = None
         self._rest_state: int | None = None

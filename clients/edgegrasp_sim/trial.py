@@ -142,9 +142,8 @@ def run_round(
     seed: int,
     index: int,
     patience: float = PATIENCE,
-    on_grasp: Callable[[PlannedGrasp], None] | None = None,
 ) -> Round:
-    """Run one round with a planner; `on_grasp` is called with every grasp before it is executed.
+    """Run one round with a planner.
 
     See `RoundDriver` for the other arguments, and errors.
     """
@@ -157,8 +156,6 @@ def run_round(
             break
         grasp = driver.plan(planner, observation)
         if grasp is not None:
-            if on_grasp is not None:
-                on_grasp(grasp)
             driver.execute(grasp)
     return driver.result()
 

@@ -87,8 +87,6 @@ PROTOCOLS = "edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, vgn"
         (("benchmark", "--collision", "dodge"), "options.collision: got 'dodge'"),
         (("benchmark", "--planner", "guess"), "edge-sample"),
         (("benchmark", "--planner", "no_such:planner"), "cannot be loaded"),
-        (("benchmark", "--gui", "--workers", "2"), "workers is 2"),
-        (("benchmark", "--gui", "--ray", "local"), "ray is 'local'"),
         (("benchmark", "--ray", "10.0.0.1:6379"), "pass --server"),
         (("benchmark", "--model", "absent.safetensors"), "no such file"),
         (("benchmark", "--server", "127.0.0.1:1"), "UNAVAILABLE"),

@@ -18,7 +18,6 @@ def _simulation() -> Iterator[ClutterSimulation]:
 def simulation(_simulation: ClutterSimulation) -> ClutterSimulation:
     """A simulation that all tests share, with its settings as they are at first."""
     _simulation.start_contact_fails = False
-    _simulation.world.on_step = None
     return _simulation
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from edgegrasp_sim import trial, window
+from edgegrasp_sim import trial
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
@@ -24,7 +23,6 @@ from edgegrasp_sim.trial import (
     RoundEnd,
     run_round,
 )
-from edgegrasp_sim.window import Window
 
 MakeProtocol = Callable[[int], Protocol]
 PACKED, PILE = SceneKind
@@ -165,14 +163,3 @@ def test_other_protocols_run(simulation: ClutterSimulation, name: str) -> None:
     assert set(seen.view_ids) == set(range(rules.camera.views))
     on_table = np.abs(seen.cloud[:, 2] - seen.table_height) < 0.003
     assert (on_table.mean() > 0.3) == (name == "robot")
-
-
-def test_a_watched_round_is_the_same(run, simulation, monkeypatch) -> None:
-    monkeypatch.setattr(window, "SHOW_SECONDS", 0.0)
-    monkeypatch.setattr(window, "TIME_STEP", 0.0)
-    drawn: list[np.ndarray] = []  # there is no window to draw in
-    monkeypatch.setattr(World, "draw_lines", lambda world, lines, colour: drawn.append(lines))
-    plain = run(plan_top_down, PACKED, 2)
-    watched = run(plan_top_down, PACKED, 2, on_grasp=Window(simulation.world).show)
-    assert attempts_digest([plain]) == attempts_digest([watched])
-    assert [lines.shape for lines in drawn] == [(4, 2, 3)] * len(plain.attempts)
