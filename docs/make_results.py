@@ -203,7 +203,7 @@ def _published_table(methods: Sequence[str]) -> Iterator[str]:
 
 
 def _curve(file: Path) -> list[dict[str, float]]:
-    """A training log, thinned: numbers by column, the last among them."""
+    """Some rows of a training log, the last among them: numbers by column."""
     with file.open(newline="") as opened:
         rows = [
             {name: round(float(value), 5) for name, value in row.items() if value}

@@ -172,13 +172,13 @@ def two_views() -> Case:
 def given_normals() -> Case:
     name = "pile_7-000009_0"
     down = {"direction": (0.0, 0.0, -1.0), "max_angle": 0.5}
-    aslant = {"direction": (1.0, 0.5, -1.0), "max_angle": 0.6}
+    slanted = {"direction": (1.0, 0.5, -1.0), "max_angle": 0.6}
     ball = {"kind": "sphere", "center": (0.12, 0.1, 0.08), "radius": 0.03}
     above = {"kind": "half_space", "normal": (0.0, 0.0, 1.0), "offset": 0.065}
     options = {
         "model": "vn-edgegrasp",
         "viewpoint": None,
-        "approach_direction": {"cones": [down, aslant]},
+        "approach_direction": {"cones": [down, slanted]},
         "contact_region": {"include": [above], "exclude": [ball]},
     }
     case = seen(name, seed=4, **FEW, **options)

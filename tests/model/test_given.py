@@ -42,7 +42,7 @@ def test_edges_of_detected_grasps_get_the_scores_they_were_detected_with() -> No
         if mine.grasp is None or not np.allclose(
             mine.grasp.T_cloud_hand, theirs.T_cloud_hand, atol=1e-5
         ):
-            continue  # a level grasp, or a row that went into a neighbouring voxel
+            continue  # a top-down grasp, or a row that went into a neighbouring voxel
         same += 1
         np.testing.assert_allclose(mine.grasp.score, theirs.score, atol=1e-5)
         np.testing.assert_allclose(mine.grasp.clearance, theirs.clearance, atol=1e-6)
