@@ -96,7 +96,7 @@ def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> 
     found = np.asarray(reference_logits(network))
     expected = np.asarray(metadata.reference_logits or found)
     tolerance = MAX_DIFFERENCE * np.ptp(expected) + 1e-3
-    if not np.abs(found - expected).mean() <= tolerance:  # NaN is no number at all
+    if not np.abs(found - expected).mean() <= tolerance:  # so written, NaN fails too
         raise InvalidCheckpoint(
             f"checkpoint: the network of {metadata.name!r} does not give the logits it was written "
             "with. Check this installation of PyTorch and Numba, or restore the file from a copy."
