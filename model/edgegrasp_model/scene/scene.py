@@ -44,6 +44,7 @@ class Scene:
     point_of_row: Int64  # (R,) point that each row of the cloud as sent went into; -1: none
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
+    object_of_point: Int64  # (V,) number of the object that each point is of; -1: of none
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
@@ -114,6 +115,7 @@ def build_scene(
         point_of_row=point_of_row,
         approach_allowed=approach,
         contact_allowed=allowed(options.contact_region),
+        object_of_point=np.zeros(counts["kept"], dtype=np.int64),
         support=None if support is None else plane_in_frame(support, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
         viewpoint=single_viewpoint(viewpoints, frame),
