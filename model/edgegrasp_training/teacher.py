@@ -12,8 +12,8 @@ from edgegrasp_model.candidates.edge_grasps import (
     crop_balls,
     edge_grasps,
     retract,
-    top_down_grasps,
 )
+from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud
@@ -73,12 +73,13 @@ class Teacher:
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
         cloud = Cloud(view.points, view.normals)
-        candidates = self._candidates(cloud, balls, rng) if len(balls) else None
+        camera = view.camera_position
+        candidates = self._candidates(cloud, balls, camera, rng) if len(balls) else None
         if candidates is None or len(candidates) == 0:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
             return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
-        hands = hand_batch(cloud, candidates, self.gripper, view.camera_position, max_points)
+        hands = hand_batch(cloud, candidates, self.gripper, camera, max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
         return SoftLabels(
@@ -90,13 +91,21 @@ class Teacher:
         )
 
     def _candidates(
-        self, cloud: Cloud, balls: NDArray[np.int64], rng: np.random.Generator
+        self,
+        cloud: Cloud,
+        balls: NDArray[np.int64],
+        camera: NDArray[np.float32],
+        rng: np.random.Generator,
     ) -> Candidates:
         """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
-        level = top_down_grasps(cloud, *pairs, SUPPORT, self.gripper)
-        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), level])
+        every = np.arange(len(crop.ball_rows))
+        across = [
+            outline_grasps(cloud.points, crop, balls, every, seen, SUPPORT, self.gripper)
+            for seen in outlines(cloud.points, camera, np.ones(len(cloud.points), dtype=bool))
+        ]
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), *across])
         both, clear = retract(both, SUPPORT, self.gripper)
         both = both.take(rng.permutation(np.flatnonzero(clear)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))
