@@ -92,7 +92,8 @@ def test_a_turned_scene_has_the_same_grasps_turned(request_of, seed) -> None:
         CloudInput(turned.points(cloud)), DetectOptions.model_validate(request_of(turned))
     )
     assert len(here.grasps) >= 5
-    assert there.counts == here.counts
+    for name, count in here.counts.items():  # a point on a border may fall on either side
+        assert abs(there.counts[name] - count) <= 1 + 0.02 * count, name
     for a, b in zip(here.grasps, there.grasps, strict=True):
         np.testing.assert_allclose(b.score, a.score, atol=4e-3)
         np.testing.assert_allclose(b.clearance, a.clearance, atol=1e-4)
