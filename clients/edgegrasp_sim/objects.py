@@ -39,10 +39,21 @@ logger = logging.getLogger(__name__)
 
 
 class SceneKind(StrEnum):
-    """How a scene is made: objects stood upright one by one, or dropped on a heap."""
+    """How a scene is made.
+
+    Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, or put on a
+    table among larger things.
+    """
 
     PACKED = "packed"
     PILE = "pile"
+    BIN = "bin"
+    TABLE = "table"
+
+    @property
+    def objects(self) -> "SceneKind":
+        """The kind whose objects it is made of where it has none of its own."""
+        return {SceneKind.BIN: SceneKind.PILE, SceneKind.TABLE: SceneKind.PACKED}.get(self, self)
 
     @classmethod
     def _missing_(cls, value: object) -> Never:
@@ -113,8 +124,9 @@ class ObjectSet:
     def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name.
 
-        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), or in `root` itself
-        where there is no such folder. Where there are none, they are the meshes there, `.obj` or
+        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins and tables
+        those of piles and packed scenes where they have no such folder, or in `root` itself where
+        there is none at all. Where there are none, they are the meshes there, `.obj` or
         `.stl`: see `prepare_mesh`.
 
         Raises:
@@ -122,9 +134,10 @@ class ObjectSet:
             ValueError: two meshes have one name, or one cannot be used.
             RuntimeError: there are meshes, and what prepares them is not installed.
         """
-        folder, name = root / scene / split, f"{scene}/{split}"
-        if not folder.is_dir():
-            folder, name = root, root.name
+        folder, name = root, root.name
+        for kind in (scene.objects, scene):
+            if (root / kind / split).is_dir():
+                folder, name = root / kind / split, f"{kind}/{split}"
         urdfs = sorted(folder.glob("*.urdf"))
         if urdfs:
             return cls(name, tuple(ObjectModel(path.stem, path) for path in urdfs))
@@ -153,7 +166,7 @@ class ObjectSet:
         models = tuple(
             ObjectModel(name, ASSETS / file, scale)
             for name, file, scale, stands in known
-            if stands or scene is SceneKind.PILE
+            if stands or scene.objects is SceneKind.PILE
         )
         return cls(f"builtin/{scene}", models)
 

@@ -6,7 +6,6 @@ import pytest
 from edgegrasp_sim.camera import (
     EVALUATION_VIEWS,
     TRAINING_VIEWS,
-    WORKSPACE,
     ViewRange,
     look_at,
     points_of,
@@ -16,6 +15,7 @@ from edgegrasp_sim.engine import Intrinsics, World
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.surroundings import WORKSPACE
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])
