@@ -93,9 +93,8 @@ class ViewRange:
         return poses
 
 
-# The views of the reference evaluation, and the wider ones to draw training views from.
+# The views of the reference evaluation.
 EVALUATION_VIEWS = ViewRange((0.6, 0.75), (np.pi / 4, np.pi / 3), (0.0, np.pi))
-TRAINING_VIEWS = ViewRange((0.45, 0.75), (np.pi / 6, np.pi * 5 / 12), (0.0, 2 * np.pi))
 
 
 def look_at(eye: Matrix, target: Matrix) -> Matrix:

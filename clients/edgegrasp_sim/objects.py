@@ -158,17 +158,21 @@ class ObjectSet:
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that ship with the engine, scaled to the hand."""
-        known = list(_BUILTIN)
+        known = [
+            (ObjectModel(name, ASSETS / file, scale), stands)
+            for name, file, scale, stands in _BUILTIN
+        ]
         for blobs, stands in ((_STANDING_BLOBS, True), (_OTHER_BLOBS, False)):
-            for number, scale in blobs.items():
-                file = f"random_urdfs/{number:03d}/{number:03d}.urdf"
-                known.append((f"blob_{number:03d}", file, scale, stands))
-        models = tuple(
-            ObjectModel(name, ASSETS / file, scale)
-            for name, file, scale, stands in known
-            if stands or scene.objects is SceneKind.PILE
-        )
+            known += [(blob(number, scale), stands) for number, scale in blobs.items()]
+        lying = scene.objects is SceneKind.PILE
+        models = tuple(model for model, stands in known if stands or lying)
         return cls(f"builtin/{scene}", models)
+
+
+def blob(number: int, scale: float) -> ObjectModel:
+    """An object of random shape that ships with the engine, by its number below 1000."""
+    name = f"{number:03d}"
+    return ObjectModel(f"blob_{name}", ASSETS / "random_urdfs" / name / f"{name}.urdf", scale)
 
 
 def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:

@@ -105,7 +105,7 @@ class DepthSensor:
         if self.warp > 0:
             seen += np.float32(self.warp) * _smooth(true.shape, WARP_PIXELS, rng)
         if self.disparity_step > 0:
-            step = self.baseline * camera.focal_length / self.disparity_step
+            step = abs(self.baseline) * camera.focal_length / self.disparity_step
             seen = step / np.maximum(np.rint(step / seen), 1.0)
         seen[lost | (true >= 0.999 * camera.far)] = np.nan
         return seen.astype(np.float64)

@@ -141,6 +141,11 @@ class ClutterSimulation:
         return [item.model for item in self._objects]
 
     @property
+    def object_bounds(self) -> Matrix:
+        """The box around each object that is left: (K, 2, 3) metres, world frame."""
+        return np.array([item.body.bounds for item in self._objects]).reshape(-1, 2, 3)
+
+    @property
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [

@@ -16,27 +16,64 @@ from numpy.typing import NDArray
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.options import (
+    Box,
+    Collision,
+    DetectOptions,
+    Region,
+    SupportPlane,
+    Workspace,
+)
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import build_scene
-from edgegrasp_sim.camera import TRAINING_VIEWS, Observation
+from edgegrasp_sim.camera import Observation, ViewRange, crop
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
-from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
+from edgegrasp_sim.sensor import random_sensor
+from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
+from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
 from edgegrasp_training.views import LabelledView
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
-MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
+# Four in ten scenes are those of the benchmark of the paper.
+_P, _H, _B, _T = SceneKind
+MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
+FURTHER_OBJECTS = {  # a scene holds one object and Poisson(this) more
+    SceneKind.PACKED: 4,
+    SceneKind.PILE: 4,
+    SceneKind.BIN: 7,
+    SceneKind.TABLE: 5,
+}
+_ABOVE, _STEEP, _ANY_SIDE = (
+    (0.0, np.radians(40)),
+    (np.radians(20), np.radians(75)),
+    (0.0, 2 * np.pi),
+)
+_LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
+VIEWS = {
+    SceneKind.PACKED: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
+    SceneKind.PILE: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
+    SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
+    SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
+}
+NEARBY = np.array([[-0.12, -0.12, -0.03], [0.12, 0.12, 0.15]])  # metres around a workspace, kept
+AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
+AIMED_SHARE = 0.6  # of the views of bins and tables with grasps of the objects alone
+AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
+PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
 VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
 WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
 HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding network finds hard
 HARD_TRIES = 3  # scenes looked through for a hard one
-OTHER_NOISE = 0.3  # share of the views with another noise than the benchmark's
-MAX_NOISE = 0.003  # metres
+HARD_LOOKS = 6  # into each of them
+SENSOR_SHARE = 0.4  # of the views, with the faults of a depth camera
+OTHER_NOISE = 0.3  # of the views, with another noise than the benchmark's
+MAX_NOISE = 0.004  # metres
+EXACT_PLANE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=TABLE_HEIGHT)
 
 BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
 UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
@@ -55,11 +92,11 @@ class GenerationOptions:
     grasps_per_view: int = 100
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
-    kind: SceneKind | None = None  # of all scenes; None: packed where the index is even, else piles
+    kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
-        return self.kind or (SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE)
+        return self.kind or MIXTURE[index % len(MIXTURE)]
 
 
 class Query(NamedTuple):
@@ -124,8 +161,9 @@ def generate_scene(
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
     kind = options.kind_of(index)
     # Some scenes are made of the other kind's objects.
-    other = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
-    source = other if streams[SCENE_STREAM].random() < OTHER_OBJECTS else kind
+    source = kind.objects
+    if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
+        source = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
     tried = held = 0
     with TemporaryDirectory() as shapes:
         drawn = None
@@ -138,7 +176,7 @@ def generate_scene(
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             for number in range(options.views_per_scene):
-                query = hard if hard and number == 0 else _ask(simulation, streams)
+                query = hard if hard and number == 0 else _ask(simulation, kind, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 view = replace(view, objects=names, object_digests=digests)
@@ -156,14 +194,14 @@ def _make_scene(
 ) -> Query | None:
     """Make a scene; with weights mostly one that they find hard, and return the hard view."""
     rng = streams[SCENE_STREAM]
-    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
+    low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
     scales = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
     for _ in range(1 if guide is None else HARD_TRIES):
-        simulation.reset(kind, rng, 1 + int(rng.poisson(MEAN_FURTHER_OBJECTS)), scales)
-        hard = None if guide is None else _hard_view(simulation, guide, streams)
+        simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), scales)
+        hard = None if guide is None else _hard_view(simulation, kind, guide, streams)
         if hard is not None:
             return hard
     return None
@@ -171,6 +209,7 @@ def _make_scene(
 
 def _hard_view(
     simulation: ClutterSimulation,
+    kind: SceneKind,
     guide: GraspDetector,
     streams: list[np.random.Generator],
 ) -> Query | None:
@@ -178,8 +217,8 @@ def _hard_view(
 
     Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
-    for _ in range(simulation.num_objects):
-        query = _ask(simulation, streams)
+    for _ in range(min(simulation.num_objects, HARD_LOOKS)):
+        query = _ask(simulation, kind, streams)
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
@@ -193,23 +232,60 @@ def _hard_view(
     return None
 
 
-def _ask(simulation: ClutterSimulation, streams: list[np.random.Generator]) -> Query:
-    """Look at the scene, and request grasps as a benchmark does, around fewer points."""
-    noise = streams[NOISE_STREAM]
-    std = noise.uniform(0.0, MAX_NOISE) if noise.random() < OTHER_NOISE else NOISE_STD
-    observation = simulation.observe(
-        streams[CAMERA_STREAM], noise, views=TRAINING_VIEWS, noise_std=std
-    )
+def _ask(
+    simulation: ClutterSimulation, kind: SceneKind, streams: list[np.random.Generator]
+) -> Query:
+    """Look at the scene, and request grasps as a benchmark does, around fewer points.
+
+    In bins, on tables and in some of the other views the cloud holds what is around the workspace.
+    """
+    noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
+    open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
+    around = not open_table or noise.random() < AROUND_SHARE
+    seen = _noise(noise)
+    seen["table"] = "around" if around else "known"
+    observation = simulation.observe(streams[CAMERA_STREAM], noise, views=VIEWS[kind], **seen)
+    if around:
+        near = crop(observation.cloud, observation.workspace + NEARBY)
+        observation = replace(observation, cloud=near, view_ids=observation.view_ids[: len(near)])
     low, high = observation.workspace.tolist()
+    aimed = not open_table and choice.random() < AIMED_SHARE
     request = DetectOptions(
         num_approach_points=APPROACH_POINTS,
-        seed=int(streams[CHOICE_STREAM].integers(2**32)),
+        seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
-        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=observation.table_height),
-        workspace=Workspace(min=tuple(low), max=tuple(high)),
+        support=_plane(noise) if around else EXACT_PLANE,
+        workspace=None if around else Workspace(min=tuple(low), max=tuple(high)),
+        approach_region=_objects_of(simulation) if aimed else None,
         collision=Collision(mode="penalise"),
     )
     return Query(observation, request)
+
+
+def _noise(rng: np.random.Generator) -> Seeing:
+    """The benchmark's noise, more or less of it, or a camera's faults."""
+    draw = rng.random()
+    if draw < SENSOR_SHARE:
+        return {"noise_std": 0.0, "sensor": random_sensor(rng)}
+    if draw < SENSOR_SHARE + OTHER_NOISE:
+        return {"noise_std": rng.uniform(0.0, MAX_NOISE)}
+    return {"noise_std": NOISE_STD}
+
+
+def _plane(rng: np.random.Generator) -> SupportPlane:
+    """The table as it is measured or found: not quite where it is."""
+    tilted = np.array([*rng.normal(0.0, PLANE_TILT, size=2), 1.0])
+    x, y, z = (tilted / np.linalg.norm(tilted)).tolist()
+    height = TABLE_HEIGHT + rng.normal(0.0, PLANE_ERROR)
+    return SupportPlane(normal=(x, y, z), offset=float((x + y) * MIDDLE + z * height))
+
+
+def _objects_of(simulation: ClutterSimulation) -> Region:
+    """Where the objects are, without the things around them."""
+    boxes = simulation.object_bounds + AIM_MARGIN
+    return Region(
+        include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist())
+    )
 
 
 def label(
@@ -256,6 +332,9 @@ def label(
         T_world_hand=T_world_hand,
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
+        support=_plane_as_array(request),
+        at_side=scene.at_side,
+        object_of_point=scene.object_of_point.astype(np.int16),
     )
 
 
@@ -300,6 +379,11 @@ def _chosen(
     left[free] = False
     left[hit[: count - len(free)]] = False
     return np.flatnonzero(~left)
+
+
+def _plane_as_array(request: DetectOptions) -> NDArray[np.float32]:
+    assert isinstance(request.support, SupportPlane)
+    return np.array([*request.support.normal, request.support.offset], dtype=np.float32)
 
 
 def _empty(observation: Observation) -> LabelledView:

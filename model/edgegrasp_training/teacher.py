@@ -17,7 +17,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_training.examples import SUPPORT, SoftLabels, hand_batch
+from edgegrasp_training.examples import SoftLabels, hand_batch
 from edgegrasp_training.views import LabelledView, load_view
 
 OWN_BALLS = 16  # balls of a view around approach points of its tried grasps
@@ -72,13 +72,12 @@ class Teacher:
         others = np.setdiff1d(np.arange(len(view.points)), own)
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
-        cloud = Cloud(view.points, view.normals)
-        candidates = self._candidates(cloud, balls, rng) if len(balls) else None
+        candidates = self._candidates(view, balls, rng) if len(balls) else None
         if candidates is None or len(candidates) == 0:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
             return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
-        hands = hand_batch(cloud, candidates, self.gripper, view.camera_position, max_points)
+        hands = hand_batch(view, candidates, self.gripper, view.camera_position, max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
         return SoftLabels(
@@ -90,14 +89,15 @@ class Teacher:
         )
 
     def _candidates(
-        self, cloud: Cloud, balls: NDArray[np.int64], rng: np.random.Generator
+        self, view: LabelledView, balls: NDArray[np.int64], rng: np.random.Generator
     ) -> Candidates:
         """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
+        cloud, support = Cloud(view.points, view.normals), view.support_plane
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
-        level = top_down_grasps(cloud, *pairs, SUPPORT, self.gripper)
+        level = top_down_grasps(cloud, *pairs, support, self.gripper)
         both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), level])
-        both, clear = retract(both, SUPPORT, self.gripper)
+        both, clear = retract(both, support, self.gripper)
         both = both.take(rng.permutation(np.flatnonzero(clear)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))
         _, first = np.unique(both.approach_index, return_index=True)
