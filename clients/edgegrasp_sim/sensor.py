@@ -169,7 +169,7 @@ def random_sensor(rng: np.random.Generator) -> DepthSensor:
     """A camera of one of the three kinds, better or worse than its model."""
     typical = list(SENSORS.values())[int(rng.integers(len(SENSORS)))]
     side = float(rng.choice([-1.0, 1.0]))  # of the projector
-    worse = float(np.exp(rng.uniform(np.log(0.4), np.log(2.0))))
+    worse = float(np.exp(rng.uniform(np.log(0.4), np.log(1.6))))
     window = typical.window + 2 * int(rng.integers(-1, 2)) if typical.window > 1 else 1
     return replace(
         typical,

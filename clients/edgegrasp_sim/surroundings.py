@@ -23,7 +23,7 @@ WORKSPACE = (
 )
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
-BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.30, 0.45), (0.24, 0.35), (0.06, 0.16)  # metres, inside
+BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.30, 0.45), (0.24, 0.35), (0.05, 0.12)  # metres, inside
 BIN_WALL = (0.003, 0.008)  # metres; its floor is as thick
 BIN_STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
 BIN_STAND = (0.1, 0.4)  # metres

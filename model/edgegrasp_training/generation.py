@@ -20,6 +20,7 @@ from edgegrasp_model.options import (
     Box,
     Collision,
     DetectOptions,
+    OrientedBox,
     Region,
     SupportPlane,
     Workspace,
@@ -38,6 +39,7 @@ from edgegrasp_training.views import LabelledView
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
+BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
 # Four in ten scenes are those of the benchmark of the paper.
 _P, _H, _B, _T = SceneKind
 MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
@@ -61,8 +63,9 @@ VIEWS = {
 }
 NEARBY = np.array([[-0.12, -0.12, -0.03], [0.12, 0.12, 0.15]])  # metres around a workspace, kept
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
-AIMED_SHARE = 0.6  # of the views of bins and tables with grasps of the objects alone
+AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
+AROUND_MARGIN = 0.006  # metres around a thing that is no object
 PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
 VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
@@ -250,13 +253,15 @@ def _ask(
         observation = replace(observation, cloud=near, view_ids=observation.view_ids[: len(near)])
     low, high = observation.workspace.tolist()
     aimed = not open_table and choice.random() < AIMED_SHARE
+    objects = _objects_of(simulation) if aimed else None
     request = DetectOptions(
-        num_approach_points=APPROACH_POINTS,
+        num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
         support=_plane(noise) if around else EXACT_PLANE,
         workspace=None if around else Workspace(min=tuple(low), max=tuple(high)),
-        approach_region=_objects_of(simulation) if aimed else None,
+        approach_region=objects,
+        contact_region=objects,
         collision=Collision(mode="penalise"),
     )
     return Query(observation, request)
@@ -283,8 +288,15 @@ def _plane(rng: np.random.Generator) -> SupportPlane:
 def _objects_of(simulation: ClutterSimulation) -> Region:
     """Where the objects are, without the things around them."""
     boxes = simulation.object_bounds + AIM_MARGIN
+    around = []
+    for box in simulation.surroundings.boxes:
+        if box.obstacle:
+            x, y, z = (size / 2 + AROUND_MARGIN for size in box.size)
+            turn = 0.0, 0.0, float(np.sin(box.yaw / 2)), float(np.cos(box.yaw / 2))
+            around.append(OrientedBox(center=box.centre, half_extents=(x, y, z), quaternion=turn))
     return Region(
-        include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist())
+        include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist()),
+        exclude=tuple(around),
     )
 
 
@@ -377,7 +389,7 @@ def _chosen(
     hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
     free = free[: max(round(FREE_SHARE * count), count - len(hit))]
     left[free] = False
-    left[hit[: count - len(free)]] = False
+    left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
     return np.flatnonzero(~left)
 
 
