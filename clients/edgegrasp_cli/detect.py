@@ -2,8 +2,11 @@
 
 import json
 import sys
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -18,8 +21,20 @@ from edgegrasp_cli.flags import (
     takes_flags,
 )
 
+if TYPE_CHECKING:
+    from edgegrasp_client import Model
+    from edgegrasp_model.detector import ModelCatalogue
+
 Option = typer.Option
-WEIGHTS_HELP = "Weights file or folder besides those that ship, where there is no server."
+
+Weights = Annotated[
+    list[Path] | None,
+    Option(help="Weights file or folder besides those that ship, where there is no server."),
+]
+Grippers = Annotated[
+    list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
+]
+Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
 
 
 @takes_flags(connection=CONNECTION, options=option_flags())
@@ -27,13 +42,9 @@ def detect(
     file: Annotated[Path, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")],
     server: Server = None,
     timeout: Timeout = 60.0,
-    weights: Annotated[list[Path] | None, Option(help=WEIGHTS_HELP)] = None,
-    grippers: Annotated[
-        list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
-    ] = None,
-    device: Annotated[
-        str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")
-    ] = "cpu",
+    weights: Weights = None,
+    grippers: Grippers = None,
+    device: Device = "cpu",
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
@@ -47,11 +58,8 @@ def detect(
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
     fields = _options(options_file, options)
-    if server:
-        with connect(server, timeout, **connection) as client:
-            detection: Any = client.detect(file, **fields)
-    else:
-        detection = _detect_here(file, weights or [], grippers or [], device, fields)
+    with open_client(server, timeout, connection, weights, grippers, device) as client:
+        detection = client.detect(file, **fields)
     if as_document:
         print(json.dumps(_json_document(detection)))
     else:
@@ -62,7 +70,7 @@ def detect(
 def models(
     server: Server = None,
     timeout: Timeout = 60.0,
-    weights: Annotated[list[Path] | None, Option(help=WEIGHTS_HELP)] = None,
+    weights: Weights = None,
     *,
     connection: dict[str, Any],
 ) -> None:
@@ -73,15 +81,8 @@ def models(
     table = Table(
         "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
     )
-    if server:
-        with connect(server, timeout, **connection) as client:
-            found = client.models()
-    else:
-        from edgegrasp_client import Model
-        from edgegrasp_model.detector import ModelCatalogue
-
-        facts = ModelCatalogue.load(weights or []).describe()
-        found = [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in facts]
+    with open_client(server, timeout, connection, weights) as client:
+        found = client.models()
     for row in found:
         table.add_row(
             f"{row.name} (default)" if row.default else row.name,
@@ -95,6 +96,73 @@ def models(
     Console().print(table)
 
 
+def open_client(
+    server: str | None,
+    timeout: float,
+    connection: Mapping[str, Any],
+    weights: Sequence[Path] | None = None,
+    grippers: Sequence[Path] | None = None,
+    device: str = "cpu",
+) -> AbstractContextManager[Any]:
+    """A client of a server, or where there is none an OwnDetector.
+
+    Args:
+        server: Its address.
+        timeout: Seconds to wait for it.
+        connection: Keyword arguments of `connect`.
+        weights: As for OwnDetector.
+        grippers: As for OwnDetector.
+        device: As for OwnDetector.
+    """
+    if server:
+        return connect(server, timeout, **connection)
+    return nullcontext(OwnDetector(weights or (), grippers or (), device))
+
+
+class OwnDetector:
+    """A detector in this process, asked as `GraspClient` asks a server.
+
+    Args:
+        weights: Files or folders besides those that ship.
+        grippers: Gripper files that requests may name by their stem.
+        device: Where the networks run, as of `choose_device`.
+    """
+
+    def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
+        self._load = weights, grippers, device
+
+    def detect(self, cloud: Any = None, *, depth_images: Any = None, **options: Any) -> Any:
+        """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
+        from edgegrasp_client.clouds import depth_image_fields, npy_bytes
+        from edgegrasp_model.options import parse_options
+        from edgegrasp_service.worker.request_cloud import File, decode_cloud
+
+        fields: dict[str, Any] = {}
+        if depth_images is not None:
+            images = enumerate(depth_images)
+            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+        elif isinstance(cloud, Path):
+            fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
+        else:
+            fields["cloud"] = File("npy", npy_bytes(cloud))
+        sent, parsed = decode_cloud(fields, parse_options(options), sys.maxsize)
+        return self._catalogue.get(parsed.model).detect(sent, parsed)
+
+    def models(self) -> "list[Model]":
+        """The weights that can be used."""
+        from edgegrasp_client import Model
+
+        rows = self._catalogue.describe()
+        return [Model(**{name: row[name] for name in Model.__dataclass_fields__}) for row in rows]
+
+    @cached_property
+    def _catalogue(self) -> "ModelCatalogue":
+        from edgegrasp_model.detector import ModelCatalogue, choose_device
+
+        weights, grippers, device = self._load
+        return ModelCatalogue.load(weights, "", choose_device(device), grippers)
+
+
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     """The options of the flags, and of the file where there is no flag."""
     try:
@@ -104,21 +172,6 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     return fields | parse_option_flags(given)
-
-
-def _detect_here(
-    file: Path, weights: list[Path], grippers: list[Path], device: str, options: dict[str, Any]
-) -> Any:
-    from edgegrasp_model.options import parse_options
-    from edgegrasp_service.worker.formats import read_file
-
-    parsed = parse_options(options)
-    cloud = read_file(file.suffix[1:].lower(), file.read_bytes(), max_points=sys.maxsize)
-
-    from edgegrasp_model.detector import ModelCatalogue, choose_device
-
-    catalogue = ModelCatalogue.load(weights, "", choose_device(device), grippers)
-    return catalogue.get(parsed.model).detect(cloud, parsed)
 
 
 def _json_document(detection: Any) -> dict[str, Any]:

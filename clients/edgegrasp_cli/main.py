@@ -18,6 +18,7 @@ COMMANDS = {
     "detect": ("detect", "service", "Find grasps in a point cloud file."),
     "models": ("detect", "service", "List the weights that can be used."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
+    "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
     "experiment": ("experiment", "train", "Run benchmarks that differ in one thing each."),
     "compare": ("benchmark", "train", "Compare two benchmarks scene by scene."),
     "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),

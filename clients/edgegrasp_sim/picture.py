@@ -82,7 +82,7 @@ def draw_grasps(
     for rank, lines in reversed(list(enumerate(forks))):
         colour = colours.to_rgba(scores[rank])
         for axes, dimensions in ((perspective, 3), (above, 2)):
-            _draw_fork(axes, lines[..., :dimensions], colour, rank, labelled=len(forks) > 1)
+            draw_fork(axes, lines[..., :dimensions], colour, rank, labelled=len(forks) > 1)
     figure.text(0.5, 0.015, CAPTION, fontsize=12, ha="center")
     if len(forks) > 1:
         bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.14, 0.014, 0.68)))
@@ -161,7 +161,8 @@ def _draw_above(axes: Any, points: Points, low: Points, high: Points) -> None:
     axes.set_axisbelow(True)
 
 
-def _draw_fork(axes: Any, lines: Points, colour: Any, rank: int, *, labelled: bool) -> None:
+def draw_fork(axes: Any, lines: Points, colour: Any, rank: int, *, labelled: bool) -> None:
+    """Draw the pieces of a fork, (4, 2, 2) or (4, 2, 3), the best (rank 0) edged in red."""
     best = rank == 0
     layer = 1000 - rank
     for width, shade in (

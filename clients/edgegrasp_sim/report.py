@@ -1,11 +1,9 @@
 """The report of a benchmark: one HTML file with tables, plots and pictures."""
 
-import base64
 import tempfile
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from html import escape
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from textwrap import fill
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from edgegrasp_sim.page import Row, image, page, table
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.replay import Replay
 from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
@@ -25,17 +24,6 @@ BLUE, GREY = "#2f6db3", "#9aa3ad"
 BINS = 10
 LABEL_WIDTH = 13  # letters
 MIN_IN_BIN = 5  # attempts; fewer say nothing about a score
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; max-width: 1120px;
-       margin: 2em auto; padding: 0 1.2em; }
-h1 { font-size: 1.7em; margin-bottom: .1em; } h2 { font-size: 1.2em; margin-top: 2em;
-     border-bottom: 1px solid #d5dae0; padding-bottom: .2em; }
-table { border-collapse: collapse; margin: .8em 0; }
-th, td { padding: .28em .9em .28em 0; text-align: left; border-bottom: 1px solid #e6e9ed;
-         vertical-align: top; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
-img { max-width: 100%; margin: 1.2em 0; }
-"""
-Row = Sequence[object]
 
 
 def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
@@ -57,25 +45,23 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     plots_figure(summary, attempts, reported).savefig(plots, format="png")
     with Replay(folder, objects) as replay:
         pictures = list(_failure_pictures(replay, rounds))
-    title = escape(f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes")
-    head = "<!doctype html><html lang=en><head><meta charset=utf-8>"
+    title = f"{planner_title(facts['run']['planner'])} on {summary['scene']} scenes"
     parts = [
-        f"{head}<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
-        _table(_key_figures(summary)),
+        table(_key_figures(summary)),
         "<h2>Beside published figures</h2>",
-        _table(_published_rows(summary, reported)),
-        _image("png", plots.getvalue(), "plots"),
+        table(_published_rows(summary, reported)),
+        image("png", plots.getvalue(), "plots"),
         "<h2>Failures</h2>",
-        _table([("cause", "times"), *summary["failures"].items()]),
+        table([("cause", "times"), *summary["failures"].items()]),
         *pictures,
         "<h2>Objects</h2>",
-        _table(_object_rows(summary)),
+        table(_object_rows(summary)),
         "<h2>Conditions</h2><details><summary>every constant, version and digest</summary>",
-        _table([("name", "value"), *_flat("", facts)]),
-        "</details></body></html>\n",
+        table([("name", "value"), *_flat("", facts)]),
+        "</details>",
     ]
     path = folder.path / "report.html"
-    path.write_text("\n".join(parts))
+    path.write_text(page(title, parts))
     return path
 
 
@@ -167,15 +153,6 @@ def _draw_calibration(axes: Any, scores: Any, held: Any) -> None:
     axes.set(xlabel="score", ylabel="%", ylim=(0, 103))
 
 
-def _table(rows: Iterable[Row]) -> str:
-    """A table whose first row is its head."""
-    lines = []
-    for number, row in enumerate(rows):
-        kind = "td" if number else "th"
-        lines.append("".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in row))
-    return "<table><tr>" + "</tr>\n<tr>".join(lines) + "</tr></table>"
-
-
 def _key_figures(summary: dict[str, Any]) -> list[Row]:
     times, ends = summary["planning_seconds"], summary["round_ends"]
     names = ["GSR % [95 % interval]", "DR % [95 % interval]"]
@@ -244,9 +221,4 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
         with tempfile.TemporaryDirectory() as folder:
             file, grasps = Path(folder) / "failure.jpg", [done.attempts[number]]
             draw_grasps(file, seen.cloud, grasps, camera_position=seen.camera_position, title=title)
-            yield _image("jpeg", file.read_bytes(), title)
-
-
-def _image(kind: str, content: bytes, text: str) -> str:
-    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-    return f"<img src='{source}' alt='{escape(text, quote=True)}'>"
+            yield image("jpeg", file.read_bytes(), title)

@@ -242,13 +242,13 @@ class SupportPlane(Strict):
 class RansacPlane(Strict):
     """Look for the plane in the cloud: the largest of those near the level.
 
-    Found by RANSAC from the request's seed, within the workspace. Its points are removed before
-    anything else; the plane stays as an obstacle. None found: a warning, and no support plane.
+    Found from the request's seed, within the workspace. Its points are removed before anything
+    else; the plane stays as an obstacle. None found: a warning, and no support plane.
     """
 
     kind: Literal["ransac"] = "ransac"
     distance: Annotated[float, Field(gt=0.0, le=0.1), numeric] = Field(
-        default=0.005, description="metres from the plane within which points belong to it"
+        default=0.005, description="metres from the plane within which points belong to it at least"
     )
     max_tilt: Annotated[float, Field(ge=0.0, le=1.6), numeric] = Field(
         default=0.35, description="radians between its normal and up; a quarter turn: any plane"
@@ -256,6 +256,16 @@ class RansacPlane(Strict):
     min_share: Annotated[float, Field(gt=0.0, le=1.0), numeric] = Field(
         default=0.1, description="share of the seen surface it must hold"
     )
+
+
+class AutoPlane(Strict):
+    """Look for the plane that things stand on, and that faces the viewpoint.
+
+    Not the largest one: the floor under a table and the wall behind it are larger. Where `up` is
+    sent, it lies within 30 degrees of the level. None found: a warning, and no support plane.
+    """
+
+    kind: Literal["auto"] = "auto"
 
 
 class HandPart(Strict):
@@ -341,7 +351,10 @@ class GripperGeometry(Strict):
 
 
 class Workspace(Strict):
-    """An axis-aligned box in the cloud's frame; points outside are dropped first."""
+    """An axis-aligned box in the cloud's frame, where grasps may be.
+
+    Points outside stay: as obstacles, and as what the network sees.
+    """
 
     min: Vector = Field(description="lower corner, metres")
     max: Vector = Field(description="upper corner, metres")
@@ -420,6 +433,12 @@ def _support_kind(value: object) -> str | None:
     return getattr(value, "kind", None)
 
 
+def _kind_as_object(value: object) -> object:
+    if value == "none":
+        return None
+    return {"kind": value} if isinstance(value, str) else value
+
+
 def _gripper_form(value: object) -> str:
     return "name" if isinstance(value, str) else "inline"
 
@@ -463,19 +482,38 @@ class DetectOptions(Strict):
         description="camera position, metres; orients the normals. Several positions: "
         "`view_ids` beside the cloud says which one saw each point",
     )
-    up: Direction = Field(
-        default=(0.0, 0.0, 1.0), description="direction away from gravity; any length but zero"
+    up: Direction | None = Field(
+        default=None,
+        description="direction away from gravity; any length but zero; null: the support plane's "
+        "normal, else +z",
     )
-    support: (
+    support: Annotated[
         Annotated[
-            Annotated[SupportPlane, Tag("plane")] | Annotated[RansacPlane, Tag("ransac")],
+            Annotated[SupportPlane, Tag("plane")]
+            | Annotated[RansacPlane, Tag("ransac")]
+            | Annotated[AutoPlane, Tag("auto")],
             Discriminator(_support_kind),
         ]
-        | None
-    ) = Field(
-        default=None, description="plane the objects rest on; no part of the hand goes below it"
+        | None,
+        BeforeValidator(_kind_as_object),
+    ] = Field(
+        default=AutoPlane(),
+        description="plane the objects rest on; no part of the hand goes below it; a bare kind "
+        "will do; null: none",
     )
-    workspace: Workspace | None = Field(default=None, description="points outside are dropped")
+    objects: Literal["auto", "off"] = Field(
+        default="auto",
+        description="whether grasps are for the things that stand on the support plane only, or "
+        "for everything; all the rest is an obstacle. Where segment_ids are sent, they are the "
+        "objects, 0 and less none",
+    )
+    max_object_size: Number = Field(
+        default=0.4, gt=0.0, le=10.0, description="longest side of a thing, metres"
+    )
+    workspace: Workspace | None = Field(
+        default=None,
+        description="where grasps may be; points outside stay as obstacles; null: everywhere",
+    )
     approach_region: Region | None = Field(
         default=None, description="where approach points may lie; null: everywhere"
     )

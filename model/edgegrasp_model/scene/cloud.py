@@ -20,6 +20,8 @@ OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
+BORDER = 3  # pixels
+FRAME = 0.05  # of an image's width or height without depths along its border
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 
 
@@ -47,6 +49,7 @@ class CheckedCloud:
     normals: Float32 | None = None  # (N, 3)
     segment_ids: NDArray[np.int64] | None = None  # (N,)
     view_ids: NDArray[np.int64] | None = None  # (N,)
+    image_size: tuple[int, int] | None = None  # (H, W) where it is organised
 
     def take(self, kept: NDArray[np.bool_]) -> "CheckedCloud":
         """The points for which `kept` (N,) holds; rows are counted as before."""
@@ -57,7 +60,26 @@ class CheckedCloud:
             None if self.normals is None else self.normals[kept],
             None if self.segment_ids is None else self.segment_ids[kept],
             None if self.view_ids is None else self.view_ids[kept],
+            self.image_size,
         )
+
+    def at_border(self) -> NDArray[np.bool_] | None:
+        """Which points (N,) lie at the border of what the image shows; None: it is no image.
+
+        That is the first or last point of a row or column of pixels, with no more than a frame
+        without depths (as in one aligned to a colour image) between it and the image's border.
+        """
+        if self.image_size is None:
+            return None
+        held = np.zeros(self.image_size, dtype=bool)
+        held.reshape(-1)[self.row] = True
+        at_border = np.zeros(self.image_size, dtype=bool)
+        for image, marked in ((held, at_border), (held.T, at_border.T)):
+            frame = round(FRAME * image.shape[1])
+            for side in (np.s_[:, : frame + BORDER], np.s_[:, : -frame - BORDER - 1 : -1]):
+                before = np.cumsum(image[side], axis=1, dtype=np.int32)
+                marked[side] |= image[side] & (before <= BORDER)
+        return at_border.reshape(-1)[self.row]
 
 
 def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
@@ -73,8 +95,9 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
     points = sent.points
-    kept = None
+    kept = size_of_image = None
     if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
+        size_of_image = points.shape[:2]
         points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
             kept = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -92,6 +115,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         _floats("normals", sent.normals, size, row),
         _integers("segment_ids", sent.segment_ids, size, row),
         _integers("view_ids", sent.view_ids, size, row),
+        size_of_image,
     )
 
 

@@ -49,6 +49,11 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
                 raise InvalidRequest("segment_ids", "nothing", fix)
 
 
+def has_rows(region: Region | None) -> bool:
+    """Whether a region names rows of the cloud."""
+    return region is not None and any(isinstance(shape, Rows) for shape in region.include)
+
+
 def inside_region(region: Region, points: Float32, voxels: Voxels, cloud: CheckedCloud) -> Bools:
     """Which voxels of the processed cloud a region holds.
 

@@ -1,12 +1,20 @@
 """A request's scene: the small clean cloud in the canonical frame, and what else is there."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, Region, SupportPlane, Workspace
+from edgegrasp_model.options import (
+    DetectOptions,
+    RansacPlane,
+    Region,
+    SupportPlane,
+    Workspace,
+)
 from edgegrasp_model.scene.cloud import (
     UP,
     CanonicalFrame,
@@ -19,11 +27,14 @@ from edgegrasp_model.scene.cloud import (
     statistical_outlier_removal,
     voxelise,
 )
+from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
-from edgegrasp_model.scene.regions import check_region, inside_region
-from edgegrasp_model.scene.support import SUPPORT_MARGIN, correct_depth_scale, find_support_plane
+from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
+from edgegrasp_model.scene.support import Seen, Support, find_support, measured, thickness
+from edgegrasp_model.scene.things import PlaneView, find_things, plan_axes
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
@@ -32,6 +43,8 @@ MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
 SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
+REACH = 0.25  # metres around a thing in which a hand at it may meet something
+CELL = 0.05  # metres
 
 
 @dataclass(frozen=True)
@@ -46,6 +59,7 @@ class Scene:
     contact_allowed: Bools  # (V,) in the contact region
     object_of_point: Int64  # (V,) number of the object that each point is of; -1: of none
     support: SupportPlane | None
+    found_support: Support | None  # the same in the cloud's frame, and how well it is seen
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
@@ -59,11 +73,11 @@ def build_scene(
     warnings: list[str],
     max_voxels: int = MAX_VOXELS,
 ) -> Scene | None:
-    """Correct depths, crop, remove the support, voxelise, estimate normals, find the regions.
+    """Find the support and the things on it, drop what is far from them, voxelise the rest.
 
     Args:
         sent: N points.
-        options: workspace, support, viewpoint, up, regions and obstacles.
+        options: workspace, support, objects, viewpoint, up, regions and obstacles.
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
         warnings: Gets what the caller should know.
@@ -78,35 +92,37 @@ def build_scene(
             cloud has too many voxels.
     """
     viewpoints = camera_positions(sent, options)
-    sent, support = crop_cloud(sent, viewpoints, options, counts, warnings)
-    if len(sent.points) == 0:
+    points = select_points(sent, viewpoints, options, counts, warnings)
+    sent, support = points.sent, points.support
+    if len(sent.points) == 0 or not (points.number >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
     first_viewpoint = None if viewpoints is None else viewpoints[0]
-    frame = CanonicalFrame.of_scene(sent.points, options.up, first_viewpoint)
-    points = frame.points(sent.points)
-    voxels = voxelise(points, voxel_size)
+    frame = CanonicalFrame.of_scene(sent.points, points.up, first_viewpoint)
+    canonical = frame.points(sent.points)
+    voxels = voxelise(canonical, voxel_size)
     counts["voxels"] = len(voxels.size)
     if counts["voxels"] > max_voxels:
         raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
-    middles = voxels.mean(points)
+    middles = voxels.mean(canonical)
     kept = statistical_outlier_removal(middles)
     counts["kept"] = int(kept.sum())
     if counts["kept"] < MIN_POINTS:
         return None
     cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
     in_cloud = frame.points_in_cloud(middles)
+    number = voxels.commonest(points.number + 1, int(points.number.max()) + 2)[kept] - 1
 
     def allowed(region: Region | None) -> Bools:
         if region is None:
-            return np.ones(counts["kept"], dtype=bool)
-        return inside_region(region, in_cloud, voxels, sent)[kept]
+            return np.asarray(number >= 0)
+        return inside_region(region, in_cloud, voxels, sent)[kept] & (number >= 0)
 
     approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
-    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    place = np.where(kept, np.cumsum(kept) - 1, -1)
     point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
-    point_of_row[sent.row] = number[voxels.voxel]
+    point_of_row[sent.row] = place[voxels.voxel]
     obstacles = options.collision.obstacles
     return Scene(
         frame=frame,
@@ -115,9 +131,12 @@ def build_scene(
         point_of_row=point_of_row,
         approach_allowed=approach,
         contact_allowed=allowed(options.contact_region),
-        object_of_point=np.zeros(counts["kept"], dtype=np.int64),
-        support=None if support is None else plane_in_frame(support, frame),
-        at_side=near_workspace_side(in_cloud[kept], options.workspace, options.up),
+        object_of_point=number,
+        support=None if support is None else plane_in_frame(support.plane, frame),
+        found_support=support,
+        at_side=near_workspace_side(
+            in_cloud[kept], options.workspace, points.up, sent.points
+        ),
         viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )
@@ -135,14 +154,24 @@ def _too_many_voxels(
     )
 
 
-def crop_cloud(
+@dataclass(frozen=True)
+class SelectedPoints:
+    """What is left of a cloud: M points of things and of what is around them."""
+
+    sent: CheckedCloud  # M points
+    number: Int64  # (M,) the object that each is of; -1: an obstacle
+    support: Support | None
+    up: Float64  # (3,) unit, away from gravity, cloud frame
+
+
+def select_points(
     sent: CheckedCloud,
-    viewpoints: NDArray[np.float64] | None,
+    viewpoints: Float64 | None,
     options: DetectOptions,
     counts: dict[str, int],
     warnings: list[str],
-) -> tuple[CheckedCloud, SupportPlane | None]:
-    """Correct the depths, crop to the workspace and remove the support plane; returns both.
+) -> SelectedPoints:
+    """Correct depths, remove the support, number the objects, drop what no hand can meet.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
@@ -152,27 +181,128 @@ def crop_cloud(
         if (region := getattr(options, field)) is not None:
             check_region(region, sent, field)
     counts["points"] = len(sent.points)
-    support = options.support
-    if isinstance(support, SupportPlane) and support.max_depth_error > 0.0:
-        sent = correct_depth_scale(sent, support, viewpoints, warnings)
-    sent = crop_to_workspace(sent, options)
-    counts["in_workspace"] = len(sent.points)
-    support, sent = remove_support_plane(sent, options, warnings)
-    counts["above_support"] = len(sent.points)
-    return sent, support
+    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
+        sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
+    sent = near_workspace(sent, options.workspace, REACH)
+    inside = inside_workspace(sent.points, options.workspace)
+    counts["in_workspace"] = int(inside.sum())
+    camera = None if viewpoints is None else viewpoints.mean(axis=0)
+    seen = Seen(sent.points, camera, sent.at_border())
+    support = choose_support(seen, inside, options, warnings)
+    up = _up(options, support)
+    if support is None:
+        counts["above_support"] = int(inside.sum())
+        return SelectedPoints(sent, np.where(inside, _given_numbers(sent), -1), None, up)
+    height, margin = support.heights(sent.points), support.margin(seen.distance())
+    above = np.asarray(height > margin)
+    counts["above_support"] = int((above & inside).sum())
+    number = _numbers(seen, sent, height, margin, inside, support, options, warnings)
+    kept = above & near_things(seen, number, support)
+    return SelectedPoints(sent.take(kept), number[kept], support, up)
 
 
-def near_workspace_side(points: Float32, workspace: Workspace | None, up: ArrayLike) -> Bools:
-    """Which points (N, 3), in the cloud's frame, lie at a side of the workspace.
+def choose_support(
+    seen: Seen, inside: Bools, options: DetectOptions, warnings: list[str]
+) -> Support | None:
+    """The support plane, given or found."""
+    request = options.support
+    if request is None or len(seen.points) == 0:
+        return None
+    up = None if options.up is None else np.asarray(options.up, dtype=np.float64)
+    if isinstance(request, SupportPlane):
+        found: Support | None = measured(seen, request)
+    else:
+        where = seen.take(np.flatnonzero(inside)) if isinstance(request, RansacPlane) else seen
+        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
+        found = find_support(where, request, up, options.max_object_size, rng, warnings)
+    if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
+        warnings.append(
+            "the viewpoint lies below the support plane: check viewpoint, up and support."
+        )
+    return found
+
+
+def _up(options: DetectOptions, support: Support | None) -> Float64:
+    """Unit vector (3,) away from gravity: as sent, else the support's normal, else +z."""
+    given = options.up
+    if given is None:
+        given = (0.0, 0.0, 1.0) if support is None else support.plane.normal
+    up = np.asarray(given, dtype=np.float64)
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _given_numbers(sent: CheckedCloud) -> Int64:
+    """The segments (N,) that a caller sent, 0 and less none; else all points are one object."""
+    if sent.segment_ids is None:
+        return np.zeros(len(sent.points), dtype=np.int64)
+    return np.where(sent.segment_ids > 0, sent.segment_ids, -1)
+
+
+def _numbers(
+    seen: Seen,
+    sent: CheckedCloud,
+    height: NDArray[np.floating],
+    margin: NDArray[np.floating],
+    inside: Bools,
+    support: Support,
+    options: DetectOptions,
+    warnings: list[str],
+) -> Int64:
+    """The object (N,) of each point over the support; -1: none.
+
+    What the caller says are objects are: segments, or regions by rows.
+    """
+    above = np.asarray(height > margin)
+    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
+    if sent.segment_ids is not None or by_rows or options.objects == "off":
+        return np.where(above & inside, _given_numbers(sent), -1)
+    plan = seen.points @ plan_axes(support.normal, seen.viewpoint, seen.points).T
+    on = np.abs(height) < thickness(seen.distance())
+    sure = None if options.workspace is None else inside
+    view = PlaneView(plan, height, margin, on, seen.at_border)
+    number = np.where(inside, find_things(view, options.max_object_size, sure), -1)
+    if (number >= 0).any() or not (above & inside).any():
+        return number
+    warnings.append(
+        "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
+        "by the image, or not on the plane): all that is over it is taken for things."
+    )
+    number[above & inside] = 0
+    return number
+
+
+def near_things(seen: Seen, number: Int64, support: Support) -> Bools:
+    """Which points (N,) a hand at any of the things could meet."""
+    plan = seen.points @ plan_axes(support.normal, seen.viewpoint, seen.points).T
+    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    held = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    held[tuple(cell[number >= 0].T)] = True
+    near = ndimage.binary_dilation(held, np.ones((3, 3)), iterations=math.ceil(REACH / CELL))
+    return np.asarray(near[tuple(cell.T)])
+
+
+def near_workspace_side(
+    points: Float32, workspace: Workspace | None, up: ArrayLike, seen: Float32
+) -> Bools:
+    """Which points (V, 3) lie at a side of the workspace beyond which nothing was seen.
 
     An object there may be cut off, and wider than it seems. Floor and ceiling do not count.
+
+    Args:
+        points: Cloud frame, metres.
+        workspace: In the same frame.
+        up: (3,) away from gravity, of any length.
+        seen: (N, 3) the points of the cloud, some of which may lie outside of the workspace.
     """
     if workspace is None:
         return np.zeros(len(points), dtype=bool)
     level = np.abs(np.asarray(up)) < np.linalg.norm(up) / 2
-    beyond_low = points < np.asarray(workspace.min) + SIDE_DEPTH
-    beyond_high = points > np.asarray(workspace.max) - SIDE_DEPTH
-    return np.asarray(((beyond_low | beyond_high) & level).any(axis=1))
+    low, high = np.asarray(workspace.min), np.asarray(workspace.max)
+    cut_low = level & (seen.min(axis=0) >= low)
+    cut_high = level & (seen.max(axis=0) <= high)
+    at_low = (points < low + SIDE_DEPTH) & cut_low
+    at_high = (points > high - SIDE_DEPTH) & cut_high
+    return np.asarray((at_low | at_high).any(axis=1))
 
 
 def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
@@ -201,34 +331,17 @@ def single_viewpoint(
     return frame.points(viewpoints[0]).astype(np.float32)
 
 
-def crop_to_workspace(sent: CheckedCloud, options: DetectOptions) -> CheckedCloud:
-    """The part of a cloud within the workspace."""
-    if options.workspace is None:
-        return sent
-    box = options.workspace
-    inside = (sent.points >= np.asarray(box.min)) & (sent.points <= np.asarray(box.max))
-    return sent.take(np.asarray(inside.all(axis=1)))
+def inside_workspace(points: Float32, box: Workspace | None, around: float = 0.0) -> Bools:
+    """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
+    if box is None:
+        return np.ones(len(points), dtype=bool)
+    inside = (points >= np.asarray(box.min) - around) & (points <= np.asarray(box.max) + around)
+    return np.asarray(inside.all(axis=1))
 
 
-def remove_support_plane(
-    sent: CheckedCloud, options: DetectOptions, warnings: list[str]
-) -> tuple[SupportPlane | None, CheckedCloud]:
-    """The support plane, given or found, and the cloud above it."""
-    request = options.support
-    if request is None:
-        return None, sent
-    if isinstance(request, SupportPlane):
-        return request, _above(sent, request, SUPPORT_MARGIN)
-    rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
-    found = find_support_plane(sent.points, request, options.up, rng)
-    if found is None:
-        warnings.append("no support plane was found: the cloud is taken as it is.")
-        return None, sent
-    return found, _above(sent, found, request.distance)
-
-
-def _above(sent: CheckedCloud, plane: SupportPlane, margin: float) -> CheckedCloud:
-    return sent.take(np.asarray(plane.heights(sent.points) > margin))
+def near_workspace(sent: CheckedCloud, box: Workspace | None, around: float) -> CheckedCloud:
+    """The part of a cloud that a hand in the workspace could meet."""
+    return sent if box is None else sent.take(inside_workspace(sent.points, box, around))
 
 
 def _normals(

@@ -1,176 +1,345 @@
-"""The plane that objects rest on: found in the cloud, and used to correct the scale of depths."""
+"""The plane that things stand on: given, or found among the planes of what is seen."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import RansacPlane, SupportPlane
-from edgegrasp_model.scene.cloud import CheckedCloud
+from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane
+from edgegrasp_model.scene.things import PlaneView, find_things, plan_axes
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
-SUPPORT_MARGIN = 0.005  # metres above a given plane below which points belong to it
-TRIALS = 5000  # planes through three points
-JUDGED = 1000  # planes of the right tilt that are judged at most
-SAMPLE = 2000  # points that planes are judged by
+MAX_TILT = math.radians(30)  # between a plane that is looked for and an `up` that was sent
+SAMPLE = 2500  # points that planes are made of and judged by
+NEIGHBORS = 12  # points around one, itself included, that give its normal
+JUDGED = 150  # planes that are judged in search of the next one
+MAX_PLANES = 8
 CROWD_RADIUS = 0.02  # metres around a point in which others share its surface
-REFINEMENTS = 3  # least squares over the plane's points
-NEAR = 0.01  # metres from the plane within which points belong to it
-HIGHEST = 10.0  # metres over the plane, the highest camera
-STEP = 0.001  # metres that the plane moves between one factor that is tried and the next
-FLAT = 0.35  # of that distance: largest median distance of a plane's points (a wall's is 0.5)
-SCALE_REFINEMENTS = 20
-LEAST = 5e-4  # smaller corrections are left out
+SAME_WAY, ROUGHLY_SAME_WAY = 0.9, 0.75  # cosines between a plane's normal and those of its points
+REFINEMENTS = 4  # least squares over the plane's points
+MIN_SHARE = 0.02  # of the seen surface that a plane holds
+VIEW = 20_000  # points that say what stands on a plane
+CELL = 0.02  # metres
+NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
+MAX_BELOW = 0.5  # share of what is seen at and right under a plane that lies under it
+BARE = 0.5  # share of the seen surface from which a plane is a support with nothing on it
+NOTHING_ON_IT = 0.02  # weight of a plane's own points beside those of things
+ALIKE = 0.7  # share of the best plane's worth from which another one is a doubt
+USUAL_DISTANCE = 0.7  # metres to a camera that is not known
+MIN_MARGIN, MAX_MARGIN = 0.004, 0.02  # metres over the plane that still belong to it
+GIVEN_MARGIN = 0.005  # metres, over a plane that is given and not seen
+DEVIATIONS = 4.0  # of a plane's own points that still belong to it
+MAX_BOW = 0.025  # metres by which a support may rise over its plane, as seen
+MIN_SEEN = 200  # points of a given plane from which its residual is measured
 
 
-def find_support_plane(
-    points: Float32, request: RansacPlane, up: ArrayLike, rng: np.random.Generator
-) -> SupportPlane | None:
-    """Find the largest plane by RANSAC, then fit it to its points by least squares.
+@dataclass(frozen=True)
+class Support:
+    """A support plane, and how well what is seen agrees with it; the cloud's frame."""
 
-    Args:
-        points: (N, 3) metres.
-        request: How thick, how steep and how large it may be.
-        up: (3,) away from gravity, of any length; the normal is on this side.
-        rng: Source of the trials.
+    plane: SupportPlane
+    residual: float  # metres, median distance of its points; NaN where it is not seen
+    share: float  # of the seen surface that lies in it
+    spread: float  # standard deviation of its points at `distance`, metres; NaN: not seen
+    distance: float  # metres from the camera to its points, the median
+    least: float  # metres over it that belong to it anyway
+    bow: Float64  # (6,) rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2
+    axes: Float64  # (3, 3) rows x and y along the plane, and their origin; cloud frame
 
-    Returns:
-        The plane; None where none holds enough of the seen surface.
-    """
-    if len(points) < 3:
-        return None
-    upward: Float64 = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    judged = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
-    corners = judged[rng.integers(len(judged), size=(TRIALS, 3))].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    normals, corners = normals[lengths > 1e-12], corners[lengths > 1e-12]
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.where((normals @ upward < 0)[:, None], -normals, normals)
-    level = normals @ upward >= math.cos(min(request.max_tilt, math.pi / 2)) - 1e-9
-    normals, corners = normals[level][:JUDGED], corners[level][:JUDGED]
-    if len(normals) == 0:
-        return None
-    offsets = np.einsum("td,td->t", normals, corners[:, 0])
-    held = np.abs(judged @ normals.T - offsets) < request.distance  # (S, T)
-    # Surfaces near the camera have more points: weigh each point by the surface it stands for.
-    crowd = cKDTree(judged).query_ball_point(judged, CROWD_RADIUS, return_length=True)
-    share = (1.0 / crowd) @ held / (1.0 / crowd).sum()  # (T,)
-    best = int(share.argmax())
-    if share[best] < request.min_share:
-        return None
-    normal, offset = normals[best], float(offsets[best])
-    for _ in range(REFINEMENTS):
-        near = np.abs(points @ normal - offset) < request.distance
-        if near.sum() < 3:
-            return None
-        normal, offset = _fitted(points[near], upward)
-    if normal @ upward < math.cos(min(request.max_tilt, math.pi / 2)) - 1e-3:
-        return None
-    return SupportPlane(normal=_vector(normal), offset=offset)
+    def heights(self, points: NDArray[np.floating]) -> Float64:
+        """Heights (N,) of points (N, 3) over the support, which may be bowed, metres."""
+        plan = (points - self.axes[2]) @ self.axes[:2].T
+        rise = np.clip(_squares(plan) @ self.bow, -MAX_BOW, MAX_BOW)
+        return np.asarray(self.plane.heights(points) - rise)
+
+    @property
+    def normal(self) -> Float64:
+        """(3,) unit."""
+        return np.asarray(self.plane.normal, dtype=np.float64)
+
+    def margin(self, distance: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Metres over the plane below which points seen from `distance` (N,) belong to it.
+
+        The noise of depth cameras grows with the square of the distance.
+        """
+        if math.isnan(self.spread):
+            return np.full(len(distance), self.least, dtype=np.float32)
+        grown = DEVIATIONS * self.spread * np.square(distance / self.distance)
+        return np.clip(grown, self.least, max(MAX_MARGIN, self.least)).astype(np.float32)
 
 
-def _fitted(points: Float32, up: Float64) -> tuple[Float64, float]:
-    """Normal, on the side of `up`, and offset of the plane nearest to points (N, 3)."""
-    middle = points.mean(axis=0, dtype=np.float64)
-    around = points - middle
-    _, vectors = np.linalg.eigh(around.T @ around)  # ascending
-    normal: Float64 = vectors[:, 0] if vectors[:, 0] @ up >= 0 else -vectors[:, 0]
-    return normal, float(normal @ middle)
+class Seen(NamedTuple):
+    """N points and from where they were seen."""
+
+    points: Float32  # (N, 3) metres
+    viewpoint: Float64 | None  # (3,) the camera, the mean of several; None: unknown
+    at_border: Bools | None  # (N,) at the border of the camera's image; None: unknown
+
+    def take(self, rows: NDArray[np.int64]) -> "Seen":
+        """Some of the points."""
+        border = None if self.at_border is None else self.at_border[rows]
+        return Seen(self.points[rows], self.viewpoint, border)
+
+    def distance(self) -> Float64:
+        """Metres (N,) from the camera."""
+        if self.viewpoint is None:
+            return np.full(len(self.points), USUAL_DISTANCE)
+        apart = self.points - self.viewpoint
+        return np.sqrt(np.einsum("nd,nd->n", apart, apart))
 
 
-def _vector(array: Float64) -> tuple[float, float, float]:
-    x, y, z = array.tolist()
-    return x, y, z
+class _Plane(NamedTuple):
+    normal: Float64  # (3,) unit, to the side it is seen from
+    offset: float
+    share: float  # of the seen surface
+
+    def heights(self, points: NDArray[np.floating]) -> Float64:
+        heights: Float64 = points @ self.normal - self.offset
+        return heights
 
 
-MIN_SHARE, MIN_POINTS = 0.1, 20  # of the points that the plane must hold
+def thickness(distance: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Metres from a plane within which points seen from `distance` (N,) may belong to it."""
+    return np.asarray(0.004 + 0.006 * np.square(distance))
 
 
-def correct_depth_scale(
-    sent: CheckedCloud,
-    plane: SupportPlane,
-    viewpoints: Float64 | None,
+def find_support(
+    seen: Seen,
+    request: AutoPlane | RansacPlane,
+    up: Float64 | None,
+    max_size: float,
+    rng: np.random.Generator,
     warnings: list[str],
-) -> CheckedCloud:
-    """Scale every view about its camera so that the support plane it sees lies where it should.
+) -> Support | None:
+    """Find the plane that the things stand on.
+
+    Planes are found one after the other, by RANSAC over points with normals, and turned to the
+    camera. The support is not the largest of them but the one with the most things on it; nothing
+    is seen through it nor right under it, and it is near.
 
     Args:
-        sent: N points, in which the plane is seen.
-        plane: Where the support is, and how wrong depths may be (max_depth_error).
-        viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
-        warnings: Gets what was done, or why nothing was.
-
-    Raises:
-        InvalidRequest: There is no viewpoint to scale about.
-    """
-    if viewpoints is None:
-        fix = "Send the camera's position: depths are corrected along its rays."
-        raise InvalidRequest("options.viewpoint", "nothing", fix)
-    several = len(viewpoints) > 1 and sent.view_ids is not None
-    points = sent.points.copy()
-    for number, viewpoint in enumerate(viewpoints):
-        rows = np.flatnonzero(sent.view_ids == number) if several else slice(None)
-        which = f"the depths of view {number}" if several else "the depths"
-        scale = depth_scale(points[rows], viewpoint, plane)
-        if scale is None:
-            warnings.append(
-                f"{which} are taken as they are: no support plane is seen within "
-                f"options.support.max_depth_error ({plane.max_depth_error:g}) of its place."
-            )
-        elif abs(scale - 1.0) > LEAST:
-            warnings.append(f"{which} were multiplied by {scale:.3f}, as the support plane shows.")
-            points[rows] = viewpoint + scale * (points[rows] - viewpoint)
-    return replace(sent, points=points)
-
-
-def depth_scale(
-    points: NDArray[np.floating], viewpoint: Float64, plane: SupportPlane
-) -> float | None:
-    """The factor on all depths of a view that brings its points of the plane into the plane.
-
-    Where several factors fit (the table, or the flat top of an object), the smallest counts:
-    nothing is seen below the table.
-
-    Args:
-        points: (N, 3) metres.
-        viewpoint: (3,) metres.
-        plane: With the greatest depth error that is looked for.
+        seen: N points, metres.
+        request: `auto`, or the largest plane within a tilt of `up`.
+        up: (3,) away from gravity; None: unknown.
+        max_size: Longest side of a thing, metres.
+        rng: Source of the samples.
+        warnings: Gets why there is none, or why it is in doubt.
 
     Returns:
-        The factor; None where the camera is not above the plane, or too high, or sees too little.
+        The plane; None where nothing seen looks like a support.
     """
-    height = float(plane.heights(viewpoint))
-    falls = height - plane.heights(points.astype(np.float64))
-    if not NEAR < height < HIGHEST:
+    up = None if up is None else up / np.linalg.norm(up)
+    planes = _planes(seen, up, rng)
+    if isinstance(request, RansacPlane):
+        level = [p for p in planes if up is None or _tilt(p, up) <= request.max_tilt + 1e-9]
+        best = max(level, key=lambda plane: plane.share, default=None)
+        best = None if best is None or best.share < request.min_share else best
+    else:
+        level = [p for p in planes if up is None or _tilt(p, up) <= MAX_TILT]
+        best = _most_stood_on(seen, level, max_size, rng, warnings)
+    if best is None:
+        warnings.append(_none_found(planes, up))
         return None
-    # A point lies in the plane once it is as far below the camera as the plane is.
-    factors = np.sort(height / falls[falls > 0.5 * height])
-    step, reach = STEP / height, NEAR / height
-    tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error + step / 2, step)
-    held = np.searchsorted(factors, tried + reach) - np.searchsorted(factors, tried - reach)
-    enough = max(MIN_SHARE * len(points), MIN_POINTS)
-    start, width = 0, round(2 * NEAR / STEP) + 1  # tries from a plane's rise to past its peak
-    while start < len(tried):
-        window = held[start : start + width]
-        if window.max() >= enough:
-            scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
-            if scale is not None:
-                return scale
-            start += width - 1
-        start += 1
-    return None
+    least = request.distance if isinstance(request, RansacPlane) else MIN_MARGIN
+    return measured(seen, _as_option(best), least, best.share)
 
 
-def _middle(factors: Float64, scale: float, reach: float) -> float | None:
-    """The median of the factors around one; None where they are too spread for a plane."""
-    for _ in range(SCALE_REFINEMENTS):
-        within = factors[np.abs(factors - scale) <= reach]
-        scale = float(np.median(within))
-    spread = float(np.median(np.abs(within - scale)))
-    return scale if spread <= FLAT * reach else None
+def measured(
+    seen: Seen, plane: SupportPlane, least: float = GIVEN_MARGIN, share: float | None = None
+) -> Support:
+    """A plane, and how well the points agree with it where it is seen.
+
+    Args:
+        seen: N points.
+        plane: Of the cloud's frame.
+        least: Metres over it that belong to it anyway.
+        share: Of the seen surface, where it is known.
+    """
+    rows = np.random.default_rng(0).permutation(len(seen.points))[:VIEW]
+    sample = seen.take(np.sort(rows))
+    points, distance = sample.points.astype(np.float64), sample.distance()
+    normal = np.asarray(plane.normal)
+    origin = points.mean(axis=0)
+    axes = np.stack([*plan_axes(normal, seen.viewpoint, points), origin])
+    height, thick = plane.heights(points), thickness(distance)
+    near = np.abs(height) < thick
+    # Where the cloud was cut off above the plane, only what stands on it is near.
+    if near.sum() < MIN_SEEN or (height[near] < 0).mean() < 0.2:
+        flat, unknown = np.zeros(6), math.nan
+        return Support(plane, unknown, share or 0.0, unknown, USUAL_DISTANCE, least, flat, axes)
+    terms, bow = _squares((points - origin) @ axes[:2].T), np.zeros(6)
+    for _ in range(REFINEMENTS):
+        near = np.abs(height - terms @ bow) < thick
+        bow = np.linalg.lstsq(terms[near], height[near], rcond=None)[0]
+    off, apart = np.abs(height - terms @ bow)[near], distance[near]
+    middle = float(np.median(apart))
+    spread = 1.4826 * float(np.median(off / np.square(apart / middle)))
+    found = share or float(near.mean())
+    return Support(plane, float(np.median(off)), found, spread, middle, least, bow, axes)
+
+
+def _squares(plan: Float64) -> Float64:
+    """1, x, y, x^2, x y, y^2 (N, 6) of points (N, 2)."""
+    x, y = plan.T
+    return np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+
+
+def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_Plane]:
+    """The planes of what is seen, the largest first, each turned to where it is seen from."""
+    if len(seen.points) < NEIGHBORS:
+        return []
+    rows = rng.choice(len(seen.points), min(SAMPLE, len(seen.points)), replace=False)
+    sample = seen.take(rows)
+    points = sample.points.astype(np.float64)
+    thick = thickness(sample.distance())
+    tree = cKDTree(points)
+    normals = _turned(_normals(points, tree), points, seen.viewpoint, up)
+    # Surfaces near the camera have more points: weigh each point by the surface it stands for.
+    weight = 1.0 / tree.query_ball_point(points, CROWD_RADIUS, return_length=True)
+    weight /= weight.sum()
+    left, planes = np.arange(len(points)), []
+    while len(planes) < MAX_PLANES and len(left) >= NEIGHBORS:
+        corner = rng.choice(left, min(JUDGED, len(left)), replace=False)
+        offset = np.einsum("td,td->t", normals[corner], points[corner])
+        held = np.abs(points[left] @ normals[corner].T - offset) < thick[left, None]
+        held &= normals[left] @ normals[corner].T > SAME_WAY
+        share = weight[left] @ held
+        best = int(share.argmax())
+        if share[best] < MIN_SHARE:
+            break
+        plane = _Plane(normals[corner[best]], float(offset[best]), 0.0)
+        for _ in range(REFINEMENTS):
+            near = np.abs(plane.heights(points[left])) < thick[left]
+            mine = left[near & (normals[left] @ plane.normal > ROUGHLY_SAME_WAY)]
+            plane = _fitted(points[mine], weight[mine], plane.normal)
+        planes.append(plane)
+        gone = np.abs(plane.heights(points[left])) < 1.5 * thick[left]
+        left = left[~(gone & (normals[left] @ plane.normal > 0.5))]
+    return sorted(planes, key=lambda plane: -plane.share)
+
+
+def _normals(points: Float64, tree: cKDTree) -> Float64:
+    """Unit normals (N, 3) of either sign."""
+    _, rows = tree.query(points, k=NEIGHBORS)
+    around = points[rows] - points[rows].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    normals: Float64 = vectors[:, :, 0]
+    return normals
+
+
+def _turned(
+    normals: Float64, points: Float64, viewpoint: Float64 | None, up: Float64 | None
+) -> Float64:
+    """Normals on the side of the camera; of `up`, or +z, where there is none."""
+    toward = np.array([0.0, 0.0, 1.0]) if up is None else up
+    side = normals @ toward
+    if viewpoint is not None:
+        side = np.einsum("nd,nd->n", normals, viewpoint - points)
+    return np.where(side[:, None] < 0, -normals, normals)
+
+
+def _fitted(points: Float64, weight: Float64, side: Float64) -> _Plane:
+    """The plane nearest to points (N, 3), its normal on a side."""
+    middle = np.average(points, axis=0, weights=weight)
+    around = points - middle
+    _, vectors = np.linalg.eigh((around * weight[:, None]).T @ around)  # ascending
+    normal: Float64 = vectors[:, 0] if vectors[:, 0] @ side >= 0 else -vectors[:, 0]
+    return _Plane(normal, float(normal @ middle), float(weight.sum()))
+
+
+def _tilt(plane: _Plane, up: Float64) -> float:
+    return math.acos(min(max(float(plane.normal @ up), -1.0), 1.0))
+
+
+def _most_stood_on(
+    seen: Seen,
+    planes: list[_Plane],
+    max_size: float,
+    rng: np.random.Generator,
+    warnings: list[str],
+) -> _Plane | None:
+    """The plane of greatest worth; None where none is a support at all."""
+    rows = rng.choice(len(seen.points), min(VIEW, len(seen.points)), replace=False)
+    sample = seen.take(rows)
+    best, worth, second = None, 0.0, 0.0
+    for plane in planes:
+        this = _worth(sample, plane, max_size, least=worth * ALIKE)
+        if this > worth:
+            best, worth, second = plane, this, worth
+        else:
+            second = max(second, this)
+    if best is not None and second > ALIKE * worth:
+        warnings.append(
+            "two planes look alike as the support: check the one in the answer, or send up, "
+            "support or a workspace."
+        )
+    return best
+
+
+def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
+    """How much a plane is stood on and seen, over its distance; 0 where it is no support."""
+    distance, height = seen.distance(), plane.heights(seen.points)
+    thick = thickness(distance)
+    on = np.abs(height) < thick
+    if seen.viewpoint is not None and plane.heights(seen.viewpoint) < thick[on].mean():
+        return 0.0
+    size, far = int(on.sum()), float(np.median(distance[on]))
+    below = (height < -3 * thick) & (height > -NEAR_BELOW)
+    axes = plan_axes(plane.normal, seen.viewpoint, seen.points)
+    plan = seen.points @ axes.T
+    near_below = _over_hull(plan[on], plan[below])
+    if near_below > MAX_BELOW * (near_below + size):
+        return 0.0
+    if size / far <= least:  # were everything on it a thing, it would not be worth more
+        return 0.0
+    view = PlaneView(plan, height, 2 * thick, on, seen.at_border)
+    things = int((find_things(view, max_size) >= 0).sum())
+    if things == 0 and plane.share < BARE:
+        return 0.0
+    through = _seen_through(seen, height, height < -3 * thick, plan[on], axes, plane)
+    worth = math.sqrt((min(things, size) + NOTHING_ON_IT * size) * size) / far
+    return max(worth * size / (size + near_below) - through / far, 0.0)
+
+
+def _over_hull(on: Float64, others: Float64) -> int:
+    """How many of other points lie over the middle part of a plane's points; plan, metres."""
+    low, high = np.percentile(on, [2, 98], axis=0)
+    return int(((others > low) & (others < high)).all(axis=1).sum())
+
+
+def _seen_through(
+    seen: Seen, height: Float64, below: Bools, on: Float64, axes: Float64, plane: _Plane
+) -> int:
+    """How many points under a plane are seen through its own seen part: it is none, then."""
+    if seen.viewpoint is None or not below.any():
+        return 0
+    above = float(plane.heights(seen.viewpoint))
+    way = above / (above - height[below])
+    crossed = (seen.viewpoint + (seen.points[below] - seen.viewpoint) * way[:, None]) @ axes.T
+    low = on.min(axis=0)
+    cell, other = (np.floor((plan - low) / CELL).astype(np.int64) for plan in (on, crossed))
+    held = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    held[cell[:, 0], cell[:, 1]] = True
+    held = ndimage.binary_erosion(held)
+    other = other[((other >= 0) & (other < held.shape)).all(axis=1)]
+    return int(held[other[:, 0], other[:, 1]].sum())
+
+
+def _as_option(plane: _Plane) -> SupportPlane:
+    x, y, z = plane.normal.tolist()
+    return SupportPlane(normal=(x, y, z), offset=plane.offset)
+
+
+def _none_found(planes: list[_Plane], up: Float64 | None) -> str:
+    said = "no support plane was found"
+    if planes and up is not None:
+        tilt = math.degrees(_tilt(planes[0], up))
+        said += f": the largest plane that is seen is tilted by {tilt:.0f} degrees from up"
+    return f"{said}. Send support, or the true up, if there is one in view."

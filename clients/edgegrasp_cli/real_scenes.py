@@ -1,0 +1,295 @@
+"""Observed scenes with labels, and what grasps are worth that a detector finds in them.
+
+A scene is an .npz file: docs/benchmark.md has its arrays.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:  # Numba is loaded where grasps are judged
+    from edgegrasp_model.gripper import Gripper
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Array = NDArray[Any]
+
+BEST = 10  # grasps of each scene that are judged
+GOOD_SCORE = 0.5
+FIRST_OBJECT = 2  # lower labels: 0 anything else, 1 the support plane
+BELOW = 0.1  # sine of the angle over the level; the detector's own limit, 6 degrees
+NOISE = 0.003  # metres; 98 % of the points of a depth camera's plane lie within it at 0.6 to 0.9 m
+MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
+VIRTUAL_IMAGE = (480, 640)  # rows and columns of the picture of an unorganised cloud
+MAX_PINHOLE_ERROR = 1.0  # pixels; an organised cloud that is further off has no such camera
+
+
+class Camera(NamedTuple):
+    """A pinhole camera, pixels: column = fx * x / z + cx, row = fy * y / z + cy."""
+
+    fx: float  # negative where z points backward
+    fy: float
+    cx: float
+    cy: float
+
+    def pixels(self, points: Array) -> Float64:
+        """Columns and rows (..., 2) of points (..., 3), camera frame."""
+        x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
+
+@dataclass(frozen=True)
+class RealScene:
+    """What a camera saw, and what it is. Camera frame, metres; R rows."""
+
+    name: str
+    request: Mapping[str, Any]  # what a detector gets, as arguments of `GraspClient.detect`
+    points: Float32  # (R, 3) NaN where there is no reading
+    labels: NDArray[np.uint8]  # (R,) 0 anything else, 1 the support plane, 2 and up objects
+    normal: Float64  # (3,) of the support plane, toward the camera
+    offset: float  # normal . x of its points
+    camera: Camera
+    shape: tuple[int, int]  # rows and columns of the camera's image
+    rgb: NDArray[np.uint8] | None  # (H, W, 3)
+
+    @property
+    def objects(self) -> list[int]:
+        """The labels of the objects."""
+        return [int(label) for label in np.unique(self.labels) if label >= FIRST_OBJECT]
+
+    @property
+    def feet(self) -> Float64:
+        """(K, 3) the middle of each object, dropped onto the support plane."""
+        middles = [
+            np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
+        ]
+        height = np.asarray(middles, dtype=np.float64) @ self.normal - self.offset
+        feet: Float64 = middles - height[:, None] * self.normal
+        return feet
+
+
+@dataclass(frozen=True)
+class PlaneFigures:
+    """The plane that was found, beside the labelled one."""
+
+    angle: float  # degrees between the normals
+    offset: float  # metres between the planes at the foot of an object, the greatest
+
+    @property
+    def right(self) -> bool:
+        """Whether grasps may rely on it."""
+        return self.angle <= MAX_ANGLE and self.offset <= MAX_OFFSET
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """What the answer for one scene is worth: counts of its best grasps."""
+
+    grasps: int  # in the answer
+    best: int  # of those judged, BEST at most
+    on_object: int  # approach and contact point on one and the same object
+    from_below: int  # the hand comes up through the support
+    through_points: int  # the open hand at the grasp holds measured points
+    objects: int  # in the scene
+    objects_with_grasp: int  # with a grasp of GOOD_SCORE or more in the answer
+    plane: PlaneFigures | None  # None: none was found
+    milliseconds: float  # from the request to the answer
+
+    def document(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        plane = None if self.plane is None else {**asdict(self.plane), "right": self.plane.right}
+        return {**asdict(self), "plane": plane}
+
+
+def load_scenes(folder: Path) -> list[RealScene]:
+    """The scenes of a folder, by name.
+
+    Raises:
+        ValueError: There are none, or a file is none; names file, field and fix.
+    """
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise ValueError(f"scenes: got {folder}, without .npz files. Give a folder of scenes.")
+    return [load_scene(file) for file in files]
+
+
+def load_scene(file: Path) -> RealScene:
+    """Read one scene.
+
+    Raises:
+        ValueError: It is none; names file, field and fix.
+    """
+    try:
+        with np.load(file) as archive:
+            arrays = dict(archive)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{file.name}: {error}. Give what numpy.savez(file, ...) writes."
+        ) from None
+    checked = _Arrays(file.name, arrays)
+    normal = checked.get("support_normal", "f", "three numbers, of length 1", (3,))
+    if abs(np.linalg.norm(normal) - 1.0) > 1e-3:
+        checked.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
+    offset = float(checked.get("support_offset", "f", "one number, metres", ()))
+    request, points = _cloud(checked)
+    labels = checked.get("labels", "u", "an integer from 0 for each row", points.shape[:-1])
+    labels = np.where(np.isfinite(points).all(axis=-1), labels, 0)
+    if not (labels >= FIRST_OBJECT).any():
+        checked.refuse("labels", "no label above 1", f"{FIRST_OBJECT} and up for the objects")
+    rgb = arrays.get("rgb")
+    if rgb is not None:
+        checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
+    shape = (points.shape[0], points.shape[1]) if points.ndim == 3 else VIRTUAL_IMAGE
+    camera = _camera(arrays.get("intrinsics"), points)
+    if camera is None:
+        camera, rgb, shape = _virtual_camera(points), None, VIRTUAL_IMAGE
+    return RealScene(
+        file.stem,
+        request,
+        points.reshape(-1, 3),
+        labels.ravel().astype(np.uint8),
+        normal.astype(np.float64),
+        offset,
+        camera,
+        shape,
+        rgb,
+    )
+
+
+def judge(
+    scene: RealScene,
+    grasps: Sequence[Any],
+    plane: tuple[Array, float] | None,
+    gripper: "Gripper",
+    milliseconds: float,
+) -> SceneFigures:
+    """What an answer is worth.
+
+    Args:
+        scene: What was asked.
+        grasps: Of the client or of the detector, best first, camera frame.
+        plane: Normal (3,) and offset of the support plane that was found, if one was.
+        gripper: The hand.
+        milliseconds: That the answer took.
+    """
+    best = grasps[:BEST]
+    on_object = _objects_held(scene, grasps)
+    scores = np.array([grasp.score for grasp in grasps])
+    well_held = {label for label in on_object[scores >= GOOD_SCORE] if label >= FIRST_OBJECT}
+    upward = [float(grasp.approach_direction @ scene.normal) for grasp in best]
+    return SceneFigures(
+        grasps=len(grasps),
+        best=len(best),
+        on_object=int((on_object[:BEST] >= FIRST_OBJECT).sum()),
+        from_below=sum(sine > BELOW for sine in upward),
+        through_points=int(_meet_points(scene, best, gripper).sum()),
+        objects=len(scene.objects),
+        objects_with_grasp=len(well_held),
+        plane=None if plane is None else _compare(scene, *plane),
+        milliseconds=milliseconds,
+    )
+
+
+def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> NDArray[np.bool_]:
+    """Which open hands (E,) hold a measured point deeper than NOISE: of all, none cleaned away."""
+    from edgegrasp_model.kernels import any_point_in_boxes
+
+    seen = scene.points[np.isfinite(scene.points).all(axis=1)]
+    hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)
+    boxes = gripper.boxes(gripper.max_opening)
+    boxes[:, 0] += NOISE
+    boxes[:, 1] -= NOISE
+    return any_point_in_boxes(seen, hands, boxes)
+
+
+def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> NDArray[np.int64]:
+    """The label (E,) of the object that both points of a grasp are on; 0: of none."""
+    seen = np.isfinite(scene.points).all(axis=1)
+    ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]
+    # Points of a grasp are means of small voxels: they lie beside a measured point, not on it.
+    _, row = cKDTree(scene.points[seen]).query(np.asarray(ends).reshape(-1, 2, 3))
+    label = scene.labels[seen][row].astype(np.int64)  # (E, 2)
+    same = (label[:, 0] == label[:, 1]) & (label[:, 0] >= FIRST_OBJECT)
+    return np.where(same, label[:, 0], 0)
+
+
+def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
+    cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
+    apart = np.abs(scene.feet @ normal - offset)
+    return PlaneFigures(float(np.degrees(np.arccos(cosine))), float(apart.max()))
+
+
+class _Arrays:
+    """The arrays of a file; what is wrong with one raises ValueError."""
+
+    def __init__(self, file: str, arrays: Mapping[str, Array]) -> None:
+        self.file = file
+        self.arrays = arrays
+
+    def get(
+        self, field: str, kinds: str, wanted: str, shape: tuple[int, ...] | None = None
+    ) -> Array:
+        """An array of one of these dtype kinds and, where one is given, of a shape."""
+        if field not in self.arrays:
+            self.refuse(field, "nothing", wanted)
+        array = self.arrays[field]
+        if array.dtype.kind not in kinds or shape not in (None, array.shape):
+            self.refuse(field, f"shape {array.shape}, dtype {array.dtype}", wanted)
+        return array
+
+    def refuse(self, field: str, value: str, wanted: str) -> NoReturn:
+        raise ValueError(f"{self.file}: {field}: got {value}. Save {wanted}.")
+
+
+def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
+    """What a detector gets; and the points (H, W, 3) or (N, 3), NaN where there is no reading."""
+    from edgegrasp_client.clouds import depth_image_fields
+    from edgegrasp_service.worker.request_cloud import fuse_depth_images
+
+    if "depth" in arrays.arrays:
+        depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
+        values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
+        image: Any = {
+            "depth": depth,
+            "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), values, strict=True)),
+            "T_cloud_camera": np.eye(4),
+        }
+        cloud, _ = fuse_depth_images([depth_image_fields(image, 0)], depth.size)
+        return {"depth_images": [image]}, np.asarray(cloud.points, dtype=np.float32)
+    wanted = "(H, W, 3) or (N, 3) float32 metres, or depth and intrinsics"
+    points = arrays.get("points", "f", wanted)
+    if points.ndim not in (2, 3) or points.shape[-1] != 3:
+        arrays.refuse("points", f"shape {points.shape}", wanted)
+    return {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}, points.astype(np.float32)
+
+
+def _camera(intrinsics: Array | None, points: Float32) -> Camera | None:
+    """The camera of an image; of an organised cloud by least squares; None where there is none."""
+    if intrinsics is not None:
+        return Camera(*intrinsics.tolist())
+    if points.ndim != 3:
+        return None
+    seen = np.isfinite(points).all(axis=2) & (points[..., 2] != 0.0)
+    row, column = np.nonzero(seen)
+    x, y, z = points[seen].T.astype(np.float64)
+    (fx, cx), (fy, cy) = np.polyfit(x / z, column, 1), np.polyfit(y / z, row, 1)
+    camera = Camera(fx, fy, cx, cy)
+    off = np.abs(camera.pixels(points[seen]) - np.stack([column, row], axis=1)).max()
+    return camera if off < MAX_PINHOLE_ERROR else None
+
+
+def _virtual_camera(points: Float32) -> Camera:
+    """A camera at the origin whose picture holds every point."""
+    x, y, z = points.reshape(-1, 3)[np.isfinite(points.reshape(-1, 3)).all(axis=1)].T
+    rows, columns = VIRTUAL_IMAGE
+    across, down = x / z, y / z
+    focal = 0.9 * min(columns / np.ptp(across), rows / np.ptp(down))
+    fx = focal if np.median(z) > 0 else -focal
+    middle = [(values.min() + values.max()) / 2 for values in (across, down)]
+    return Camera(fx, focal, columns / 2 - fx * middle[0], rows / 2 - focal * middle[1])

@@ -1,0 +1,207 @@
+"""What stands on a plane: things, told from walls, rims, furniture and what is cut off."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+CELL = 0.015  # metres; things further apart than this are two
+TOP = 0.5  # metres over the plane from which height no longer tells things apart
+MIN_POINTS = 15  # fewer are no thing
+SUPPORT_CELL = 0.02  # metres
+MIN_PATCH = 5  # cells of a piece of the support plane
+SMALL_PATCH = 0.05  # share of the largest piece below which one is taken for something else's top
+INSIDE = 0.8  # share of a thing that lies over the support
+OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
+CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
+CUT_OFF_POINTS = 3
+STANDS_OUT = 2.0  # margins over the plane that a thing rises at least
+SURE = 0.85  # share of a cluster that lies where the caller says that things are
+MIN_BOX = 0.25  # metres, longest side of the smallest open box that is told from a thing
+
+STRIP = 0.025  # metres inside a side of a rectangle where a wall is looked for
+STEP = 0.02  # metres along a wall
+FILLED = 0.6  # share of a side along which a wall is seen at one height
+LEVEL = 0.02  # metres of height within which a rim is level
+MIN_WIDTH = 0.2  # metres between the walls of an open box
+WALL = 0.02  # metres inside the outline that belong to a wall
+HOLLOW = 0.03  # metres that the inside is seen below the rim
+FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside at its level
+
+
+class PlaneView(NamedTuple):
+    """M points as a plane sees them."""
+
+    plan: Float64  # (M, 2) metres along the plane
+    height: Float64  # (M,) metres over it
+    margin: NDArray[np.floating]  # (M,) metres over it that still belong to it
+    on: Bools  # (M,) belongs to it
+    at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
+
+
+def plan_axes(
+    normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]
+) -> Float64:
+    """Two unit axes (2, 3) along a plane, the first toward the camera, else the furthest point."""
+    middle = points.mean(axis=0, dtype=np.float64)
+    offsets = points[:: max(len(points) // 1000, 1)] - middle
+    if viewpoint is not None:
+        offsets = np.concatenate([[viewpoint - middle], offsets])
+    level = offsets - (offsets @ normal)[:, None] * normal
+    length = np.linalg.norm(level, axis=1)
+    first = 0 if viewpoint is not None and length[0] > 1e-3 else int(length.argmax())
+    x = level[first] / max(length[first], 1e-9)
+    return np.stack([x, np.cross(normal, x)])
+
+
+def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> Int64:
+    """The things that stand on a plane: clusters above it that are no furniture.
+
+    A thing lies over the seen part of the plane, is not longer than `max_size` and is not cut
+    off by the image's border. Of an open box, the inside is one thing or several, however large;
+    its walls are none.
+
+    Args:
+        view: M points.
+        max_size: Longest side of a thing, metres.
+        sure: (M,) where the caller says that things are; what lies there is one.
+
+    Returns:
+        (M,) number of each point's thing, from 0; -1: of none.
+    """
+    number = np.full(len(view.height), -1, dtype=np.int64)
+    rows = np.flatnonzero(view.height > view.margin)
+    found = 0
+    outline = support_outline(view.plan[view.on])
+    for cluster in clusters(view.plan[rows], view.height[rows]):
+        mine = rows[cluster]
+        if np.percentile(view.height[mine] / view.margin[mine], 98) < STANDS_OUT:
+            continue
+        length = _length(view.plan[mine], view.height[mine])
+        if length > MIN_BOX and (inside := box_contents(view.plan[mine], view.height[mine])) is not None:
+            mine = mine[inside]
+            for part in clusters(view.plan[mine], view.height[mine]):
+                number[mine[part]], found = found, found + 1
+        elif (sure is not None and sure[mine].mean() > SURE) or (
+            length <= max_size and _whole(mine, view) and _over(outline, view.plan[mine])
+        ):
+            number[mine], found = found, found + 1
+    return number
+
+
+def clusters(plan: Float64, height: Float64) -> list[Int64]:
+    """Rows of points (M, 2), (M,) that hang together, the largest cluster first."""
+    if len(plan) == 0:
+        return []
+    place = np.column_stack([plan, np.minimum(height, TOP)])
+    cell = np.floor((place - place.min(axis=0)) / CELL).astype(np.int64)
+    shape = cell.max(axis=0) + 1
+    key = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+    held = np.zeros(int(shape.prod()), dtype=bool)
+    held[key] = True
+    labels, _ = ndimage.label(held.reshape(shape), np.ones((3, 3, 3)))
+    label = labels.reshape(-1)[key]
+    count = np.bincount(label)
+    order = np.argsort(label, kind="stable")
+    start = np.cumsum(count) - count
+    large = [int(one) for one in np.argsort(-count, kind="stable") if count[one] >= MIN_POINTS]
+    return [order[start[one] : start[one] + count[one]] for one in large]
+
+
+def support_outline(plan: Float64) -> Float64 | None:
+    """Half planes (H, 3) whose intersection is the outline of a plane's seen pieces."""
+    if len(plan) < MIN_POINTS:
+        return None
+    low = plan.min(axis=0)
+    cell = np.floor((plan - low) / SUPPORT_CELL).astype(np.int64)
+    held = np.zeros(cell.max(axis=0) + 5, dtype=bool)
+    held[cell[:, 0] + 2, cell[:, 1] + 2] = True
+    labels, _ = ndimage.label(ndimage.binary_closing(held, iterations=2), np.ones((3, 3)))
+    size = np.bincount(labels[held], minlength=labels.max() + 1)
+    size[0] = 0
+    good = size >= max(MIN_PATCH, SMALL_PATCH * size.max())
+    middles = (np.argwhere(held & good[labels]) - 1.5) * SUPPORT_CELL + low
+    try:
+        return np.asarray(ConvexHull(middles).equations)
+    except (QhullError, ValueError):  # too few cells, or all in a line
+        return None
+
+
+def box_contents(plan: Float64, height: Float64) -> Bools | None:
+    """Which points (M,) lie inside an open box; None where the points are none.
+
+    An open box has a level rim along at least three sides of the smallest rectangle around it, and
+    is lower inside. The points at its walls and on its floor do not count.
+    """
+    try:
+        place, size = _smallest_rectangle(plan)
+    except (QhullError, ValueError):
+        return None
+    if size.min() < MIN_WIDTH:
+        return None
+    from_side = [place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]]
+    rims = []
+    for side, distance in enumerate(from_side):
+        at = distance < STRIP
+        along = 1 - side // 2
+        rims.append(_rim(place[at, along], height[at], float(size[along])))
+    levels = [rim for rim in rims if rim is not None]
+    inside = np.min(from_side, axis=0) > WALL
+    if len(levels) < 3 or inside.sum() < MIN_POINTS:
+        return None
+    if np.percentile(height[inside], 5) > np.median(levels) - HOLLOW:
+        return None
+    lowest = np.percentile(height[inside], 3)
+    if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
+        inside &= height > lowest + FLOOR
+    return inside
+
+
+def _smallest_rectangle(plan: Float64) -> tuple[Float64, Float64]:
+    """Places (M, 2) in the smallest rectangle around points, from its corner, and its size."""
+    corners = plan[ConvexHull(plan).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
+    turned = np.einsum("kad,cd->kca", axes, corners)
+    size = np.ptp(turned, axis=1)
+    best = int(size.prod(axis=1).argmin())
+    return plan @ axes[best].T - turned[best].min(axis=0), size[best]
+
+
+def _rim(along: Float64, height: Float64, length: float) -> float | None:
+    """The height of a level rim along a side; None where there is none."""
+    steps = max(int(np.ceil(length / STEP)), 1)
+    top = np.full(steps, -np.inf)
+    np.maximum.at(top, np.clip((along / STEP).astype(np.int64), 0, steps - 1), height)
+    seen = np.isfinite(top)
+    if not seen.any():
+        return None
+    level = float(np.median(top[seen]))
+    return level if (np.abs(top - level) < LEVEL).mean() > FILLED else None
+
+
+def _length(plan: Float64, height: Float64) -> float:
+    """The longest side of the box along the principal axes of points, or their height; metres."""
+    around = plan - plan.mean(axis=0)
+    _, vectors = np.linalg.eigh(around.T @ around)
+    return max(float(np.ptp(around @ vectors, axis=0).max()), float(np.ptp(height)))
+
+
+def _whole(rows: Int64, view: PlaneView) -> bool:
+    if view.at_border is None:
+        return True
+    return int(view.at_border[rows].sum()) <= max(CUT_OFF_POINTS, CUT_OFF * len(rows))
+
+
+def _over(outline: Float64 | None, plan: Float64) -> bool:
+    if outline is None:
+        return True
+    inside = (plan @ outline[:, :2].T + outline[:, 2] < OVERHANG).all(axis=1)
+    return bool(inside.mean() >= INSIDE)

@@ -1,0 +1,155 @@
+"""`edgegrasp benchmark-real`: scenes in its format, what grasps are worth in them, refusals."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edgegrasp_cli.real_scenes import judge, load_scene
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.results import Grasp
+
+SHAPE, INTRINSICS = (120, 160), (150.0, 150.0, 79.5, 59.5)
+NORMAL = np.array([0.0, -np.sqrt(0.75), -0.5])  # the camera looks down by 30 degrees
+OFFSET = -0.4
+ALONG = np.array([0.0, 0.5, -np.sqrt(0.75)])  # on the table, toward the camera
+TABLE = OFFSET * NORMAL - 0.35 * ALONG  # where the box stands
+HALF = np.array([0.02, 0.03, 0.06])  # half its size: across, along and up
+
+
+def seen_box() -> dict[str, Any]:
+    """A scene: a depth camera's image of a box on a table."""
+    turn = np.stack([np.cross(ALONG, NORMAL), ALONG, NORMAL])  # camera to box axes
+    fx, fy, cx, cy = INTRINSICS
+    row, column = np.indices(SHAPE)
+    rays = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(SHAPE)], axis=-1)
+    with np.errstate(divide="ignore"):
+        table = OFFSET / (rays @ NORMAL)
+        start, way = -turn @ TABLE - (0, 0, HALF[2]), rays @ turn.T
+        sides = np.stack([(-HALF - start) / way, (HALF - start) / way])
+    enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
+    on_box = (enter < leave) & (enter > 0)
+    depth = np.where(on_box, enter, np.where((table > 0) & (table < 1.2), table, 0.0))
+    return {
+        "depth": np.rint(1000 * depth).astype(np.uint16),
+        "intrinsics": np.array(INTRINSICS, dtype=np.float32),
+        "labels": np.where(on_box, 2, depth > 0).astype(np.uint8),
+        "support_normal": NORMAL.astype(np.float32),
+        "support_offset": np.float32(OFFSET),
+    }
+
+
+def grasp(approach: np.ndarray, tip: np.ndarray, *, end: np.ndarray, score: float = 0.9) -> Grasp:
+    """A Panda's grasp with its fingertips around a place, that says it holds a point."""
+    pose = np.eye(4, dtype=np.float32)
+    closing = np.array([1.0, 0.0, 0.0])
+    pose[:3, :3] = np.stack([np.cross(closing, approach), closing, approach], axis=1)
+    pose[:3, 3] = tip - 0.1122 * approach
+    held = end.astype(np.float32)
+    return Grasp(score, pose, pose, 0.08, held, held, pose[:3, 2], True, 0.0)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    np.savez(tmp_path / "box.npz", **seen_box())
+    return tmp_path / "box.npz"
+
+
+def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
+    top = TABLE + 2 * HALF[2] * NORMAL
+    floor = TABLE + 0.2 * ALONG
+    good = grasp(-NORMAL, top - 0.02 * NORMAL, end=top)
+    grasps = [
+        good,
+        grasp(NORMAL, top, end=top, score=0.4),  # from below, through the table
+        grasp(-NORMAL, floor + 0.02 * NORMAL, end=floor),  # beside the box
+        grasp(-NORMAL, top - 0.08 * NORMAL, end=top),  # the palm is in the box
+    ]
+    figures = judge(load_scene(scene), grasps, None, load_gripper(), 5.0)
+    assert (figures.grasps, figures.best, figures.objects) == (4, 4, 1)
+    assert (figures.on_object, figures.from_below, figures.through_points) == (3, 1, 2)
+    assert figures.objects_with_grasp == 1
+    doubtful = judge(load_scene(scene), grasps[1:3], None, load_gripper(), 5.0)
+    assert doubtful.objects_with_grasp == 0
+    nothing = judge(load_scene(scene), [], None, load_gripper(), 5.0)
+    assert (nothing.best, nothing.on_object, nothing.objects_with_grasp) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("tilt", "shift", "right"),
+    [(0.0, 0.0, True), (4.0, 0.0, True), (6.0, 0.0, False), (0.0, 0.012, False), (180, 0, False)],
+)
+def test_a_plane_is_right_within_5_degrees_and_10_mm(scene, tilt, shift, right) -> None:
+    turn = np.radians(tilt)
+    normal = np.cos(turn) * NORMAL + np.sin(turn) * ALONG
+    plane = normal, float(normal @ (TABLE + shift * NORMAL))
+    found = judge(load_scene(scene), [], plane, load_gripper(), 5.0).plane
+    assert found is not None
+    assert found.angle == pytest.approx(tilt, abs=0.1)
+    assert found.right == right
+
+
+def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path) -> None:
+    """Organised, with y up and z backward as OpenGL has it, and unorganised."""
+    arrays = seen_box()
+    image = load_scene(scene)
+    turned = image.points * np.float32([1, -1, -1])
+    organised = {"points": turned.reshape(*SHAPE, 3), "support_normal": NORMAL * (1, -1, -1)}
+    rest = {name: arrays[name] for name in ("labels", "support_offset")}
+    np.savez(tmp_path / "organised.npz", **rest, **organised)
+    assert load_scene(tmp_path / "organised.npz").camera == pytest.approx(
+        (-INTRINSICS[0], *INTRINSICS[1:]), abs=0.01
+    )
+    seen = np.isfinite(image.points).all(axis=1)
+    flat = {"points": image.points[seen], "labels": arrays["labels"].ravel()[seen]}
+    beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
+    np.savez(tmp_path / "flat.npz", **flat, **beside)
+    virtual = load_scene(tmp_path / "flat.npz")
+    column, row = virtual.camera.pixels(virtual.points).T
+    assert (column.min() >= 0) & (column.max() < virtual.shape[1])
+    assert (row.min() >= 0) & (row.max() < virtual.shape[0])
+
+
+def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
+    output = tmp_path / "results"
+    asked = ("--support", '{"kind":"ransac"}', "--up", ",".join(map(str, NORMAL)))
+    shown = run("benchmark-real", "--scenes", scene.parent, "--output", output, *asked)
+    assert "1 of 1" in shown
+    results = json.loads((output / "results.json").read_text())
+    assert results["scenes"]["box"]["on_object"] == results["scenes"]["box"]["best"] > 0
+    assert results["all"]["on_object"] == results["all"]["planes_right"] == 1
+    assert (output / "box.png").read_bytes().startswith(b"\x89PNG")
+    assert "box" in (output / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("labels", None, "box.npz: labels: got nothing. Save"),
+        ("labels", np.ones(SHAPE, np.uint8), "box.npz: labels: got no label above 1. Save"),
+        ("labels", np.ones(7, np.uint8), "box.npz: labels: got shape (7,), dtype uint8. Save"),
+        ("intrinsics", None, "box.npz: intrinsics: got nothing. Save"),
+        ("support_normal", np.ones(3), "box.npz: support_normal: got length 1.73"),
+        ("rgb", np.zeros((2, 2, 3), np.uint8), "box.npz: rgb: got shape (2, 2, 3)"),
+    ],
+)
+def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, refused) -> None:
+    arrays = seen_box() | {field: value}
+    np.savez(scene, **{name: array for name, array in arrays.items() if array is not None})
+    assert sentence in refused("benchmark-real", "--scenes", scene.parent)
+
+
+def test_what_is_no_scene_is_refused(refused, tmp_path: Path) -> None:
+    assert "Give a folder of scenes" in refused("benchmark-real", "--scenes", tmp_path)
+    (tmp_path / "foreign.npz").write_bytes(b"foreign")
+    assert "foreign.npz: " in refused("benchmark-real", "--scenes", tmp_path)
+
+
+def test_the_scenes_of_real_cameras_can_be_read(shared_dir: Path) -> None:
+    for file in sorted((shared_dir / "real_scenes").glob("*.npz")):
+        scene = load_scene(file)
+        on_plane = scene.points[scene.labels == 1] @ scene.normal - scene.offset
+        assert np.median(np.abs(on_plane)) < 0.005
+        assert scene.objects
