@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.options import (
+    AutoPlane,
     Box,
     Collision,
     DetectOptions,
@@ -27,7 +29,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import build_scene
-from edgegrasp_sim.camera import Observation, ViewRange, crop
+from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
@@ -35,7 +37,7 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
-from edgegrasp_training.views import LabelledView
+from edgegrasp_training.views import LabelledView, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
@@ -61,8 +63,14 @@ VIEWS = {
     SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
     SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
 }
-NEARBY = np.array([[-0.12, -0.12, -0.03], [0.12, 0.12, 0.15]])  # metres around a workspace, kept
+KEPT_DISTANCE = 0.25  # metres from the nearest hand that was tried
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
+TOLD_SHARE = {  # of the views that are not cut off, where support and workspace are told
+    SceneKind.PACKED: 0.0,
+    SceneKind.PILE: 0.0,
+    SceneKind.BIN: 0.7,
+    SceneKind.TABLE: 0.3,
+}
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
 AROUND_MARGIN = 0.006  # metres around a thing that is no object
@@ -240,7 +248,8 @@ def _ask(
 ) -> Query:
     """Look at the scene, and request grasps as a benchmark does, around fewer points.
 
-    In bins, on tables and in some of the other views the cloud holds what is around the workspace.
+    In bins, on tables and in some of the other views the cloud holds all that the camera sees, and
+    the support is told, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
     open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
@@ -248,18 +257,19 @@ def _ask(
     seen = _noise(noise)
     seen["table"] = "around" if around else "known"
     observation = simulation.observe(streams[CAMERA_STREAM], noise, views=VIEWS[kind], **seen)
-    if around:
-        near = crop(observation.cloud, observation.workspace + NEARBY)
-        observation = replace(observation, cloud=near, view_ids=observation.view_ids[: len(near)])
+    support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
+    workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))
+    if around and choice.random() >= TOLD_SHARE[kind]:
+        support, workspace = AutoPlane(), None
     aimed = not open_table and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
     request = DetectOptions(
         num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
-        support=_plane(noise) if around else EXACT_PLANE,
-        workspace=None if around else Workspace(min=tuple(low), max=tuple(high)),
+        support=support,
+        workspace=workspace,
         approach_region=objects,
         contact_region=objects,
         collision=Collision(mode="penalise"),
@@ -335,18 +345,21 @@ def label(
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
+    # What is far from every grasp says nothing about any.
+    far = cKDTree(T_world_hand[:, :3, 3]).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
+    kept = np.flatnonzero(~far)
     return LabelledView(
-        points=scene.points_in_cloud,
-        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
+        points=scene.points_in_cloud[kept],
+        normals=scene.frame.directions_in_cloud(scene.cloud.normals)[kept],
         camera_position=observation.camera_position,
-        approach_index=candidates.approach_index,
-        contact_index=candidates.contact_index,
+        approach_index=np.searchsorted(kept, candidates.approach_index),
+        contact_index=np.searchsorted(kept, candidates.contact_index),
         T_world_hand=T_world_hand,
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
-        support=_plane_as_array(request),
-        at_side=scene.at_side,
-        object_of_point=scene.object_of_point.astype(np.int16),
+        support=support_as_array(scene.found_support),
+        at_side=None if scene.at_side is None else scene.at_side[kept],
+        object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
 
 
@@ -391,11 +404,6 @@ def _chosen(
     left[free] = False
     left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
     return np.flatnonzero(~left)
-
-
-def _plane_as_array(request: DetectOptions) -> NDArray[np.float32]:
-    assert isinstance(request.support, SupportPlane)
-    return np.array([*request.support.normal, request.support.offset], dtype=np.float32)
 
 
 def _empty(observation: Observation) -> LabelledView:

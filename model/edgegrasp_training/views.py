@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
+from edgegrasp_model.scene.support import Support
 
 Float32 = NDArray[np.float32]
 UNTRIED = -1  # label of a candidate that was not tried
@@ -35,7 +36,7 @@ class LabelledView:
     T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
-    support: Float32 | None = None  # (4,) plane's unit normal and offset; None: TABLE
+    support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
     at_side: NDArray[np.bool_] | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
@@ -63,22 +64,29 @@ class LabelledView:
         partial.replace(path)
 
     @property
-    def support_plane(self) -> SupportPlane:
-        """The plane that the objects rest on, as the request gave it."""
+    def support_plane(self) -> SupportPlane | None:
+        """The plane that the objects rest on, as it was given or found."""
         if self.support is None:
             return TABLE
-        x, y, z, offset = self.support.tolist()
-        return SupportPlane(normal=(x, y, z), offset=offset)
+        x, y, z, offset = self.support.astype(np.float64).tolist()
+        return SupportPlane(normal=(x, y, z), offset=offset) if (x, y, z) != (0, 0, 0) else None
 
     def cut_off(self) -> NDArray[np.bool_]:
         """Which points (N,) lie where a side of the workspace cuts things off."""
         if self.at_side is None:
-            return near_workspace_side(self.points, WORKSPACE, UP)
+            return near_workspace_side(self.points, WORKSPACE, UP, self.points)
         return self.at_side
 
     def tried(self) -> NDArray[np.int64]:
         """Rows of the candidates that have a label."""
         return np.flatnonzero(self.success != UNTRIED)
+
+
+def support_as_array(support: Support | None) -> Float32:
+    """A support plane as `LabelledView.support` has it."""
+    if support is None:
+        return np.zeros(4, dtype=np.float32)
+    return np.array([*support.plane.normal, support.plane.offset], dtype=np.float32)
 
 
 def load_view(path: Path) -> LabelledView:

@@ -76,7 +76,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
         UP,
         TABLE,
         view.camera_position,
-        near_workspace_side(view.points, WORKSPACE, UP),
+        near_workspace_side(view.points, WORKSPACE, UP, view.points),
         hands.hand_points,
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)

@@ -134,9 +134,7 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else plane_in_frame(support.plane, frame),
         found_support=support,
-        at_side=near_workspace_side(
-            in_cloud[kept], options.workspace, points.up, sent.points
-        ),
+        at_side=near_workspace_side(in_cloud[kept], options.workspace, points.up, sent.points),
         viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )

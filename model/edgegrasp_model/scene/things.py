@@ -45,9 +45,7 @@ class PlaneView(NamedTuple):
     at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
 
 
-def plan_axes(
-    normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]
-) -> Float64:
+def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]) -> Float64:
     """Two unit axes (2, 3) along a plane, the first toward the camera, else the furthest point."""
     middle = points.mean(axis=0, dtype=np.float64)
     offsets = points[:: max(len(points) // 1000, 1)] - middle
@@ -84,7 +82,10 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
         if np.percentile(view.height[mine] / view.margin[mine], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[mine], view.height[mine])
-        if length > MIN_BOX and (inside := box_contents(view.plan[mine], view.height[mine])) is not None:
+        if (
+            length > MIN_BOX
+            and (inside := box_contents(view.plan[mine], view.height[mine])) is not None
+        ):
             mine = mine[inside]
             for part in clusters(view.plan[mine], view.height[mine]):
                 number[mine[part]], found = found, found + 1
