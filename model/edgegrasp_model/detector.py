@@ -28,7 +28,13 @@ from edgegrasp_model.networks.checkpoint import check_reference_logits, load_che
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.ranking import debug_info, grasps_in_cloud, select
+from edgegrasp_model.ranking import (
+    debug_info,
+    detected_objects,
+    found_support,
+    grasps_in_cloud,
+    select,
+)
 from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
 from edgegrasp_model.scene.cloud import (
     CheckedCloud,
@@ -36,7 +42,13 @@ from edgegrasp_model.scene.cloud import (
     check_edges,
     check_hand_poses,
 )
-from edgegrasp_model.scene.scene import MAX_VOXELS, Scene, build_scene
+from edgegrasp_model.scene.scene import (
+    MAX_VOXELS,
+    Scene,
+    SelectedPoints,
+    build_scene,
+    select_points,
+)
 
 Float32 = NDArray[np.float32]
 
@@ -60,6 +72,7 @@ class Prepared:
     options: DetectOptions
     gripper: Gripper
     crop_radius: float  # metres
+    selected: SelectedPoints | None = None
     scene: Scene | None = None
     sample: Sample | None = None
     width: Float32 | None = None  # (E,) metres
@@ -202,7 +215,18 @@ class GraspDetector:
                 debug = debug_info(scene, sample, score, outcome)
         counts["returned"] = len(grasps)
         seconds, name = prepared.total_seconds(), self.metadata.name
-        return Detection(grasps, counts, seconds, name, prepared.warnings, debug)
+        assert prepared.selected is not None
+        return Detection(
+            grasps,
+            counts,
+            seconds,
+            name,
+            prepared.warnings,
+            debug,
+            found_support(prepared.selected.support),
+            prepared.selected.up.astype(np.float32),
+            [] if scene is None else detected_objects(scene, grasps),
+        )
 
     def score(
         self,
@@ -267,13 +291,10 @@ class GraspDetector:
         """Choose the gripper and build the scene, where enough of the cloud is left."""
         prepared = self._start(sent, options)
         with prepared.timed("cloud"):
+            counts, warnings = prepared.counts, prepared.warnings
+            prepared.selected = select_points(sent, options, counts, warnings)
             prepared.scene = build_scene(
-                sent,
-                options,
-                self.metadata.voxel_size,
-                prepared.counts,
-                prepared.warnings,
-                self.max_voxels,
+                prepared.selected, options, self.metadata.voxel_size, counts, self.max_voxels
             )
         if prepared.scene is None:
             prepared.warn_of_few_points()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.kernels import points_in_hand_boxes
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud
 
 Float32 = NDArray[np.float32]
 
@@ -106,6 +106,7 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
     return HandView(hand, row, position, len(T_cloud_hand), reach)
 
 
+ABOVE = 0.001  # metres over the camera
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
 BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
 
@@ -113,11 +114,12 @@ BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
 def mirror_sides(T_cloud_hand: Float32, viewpoint: Float32 | None) -> Float32:
     """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
 
-    1 for all where the viewpoint is not known.
+    1 for all where the viewpoint is not known. Canonical frame.
     """
     if viewpoint is None:
         return np.ones(len(T_cloud_hand), dtype=np.float32)
-    toward = viewpoint - T_cloud_hand[:, :3, 3]
+    # Straight ahead of a hand that comes from the camera, up decides, not rounding.
+    toward = viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
     along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
     return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
 

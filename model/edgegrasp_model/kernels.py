@@ -17,6 +17,7 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
+STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 BLOCK = 512  # points at a time, so that their positions stay in the first cache
 
 
@@ -77,6 +78,85 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
     if len(points):
         _nearest(_columns(points), bounds, nearest)
     return nearest
+
+
+def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
+    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
+
+    Args:
+        points: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        boxes: (B, 2, 3) of the hand, hand frame.
+        behind: Metres of way behind a box in which points are in its way too.
+
+    Returns:
+        Negative where a hand would have to move back; infinity where nothing is ahead.
+    """
+    turn, shift = _to_hand(T_cloud_hand)
+    way = np.full(len(turn), np.inf, dtype=np.float32)
+    _until_met(_columns(points), turn, shift, boxes.astype(np.float32), np.float32(behind), way)
+    return way
+
+
+def extents_across(
+    points: Float32, rows: Int64, first: Int64, last: Int64, frame: Float32, strip: Float32
+) -> Float32:
+    """How far the surface goes on to both sides of an edge, along a strip across it.
+
+    Args:
+        points: (N, 3) of the cloud.
+        rows: (P,) of points to look at, group after group.
+        first: (M,) places in `rows` where the group of each edge begins.
+        last: (M,) and ends.
+        frame: (M, 4, 3) of each edge the point it is at; across the strip, out of the object
+            along it, and ahead of the hand, unit vectors.
+        strip: (4,) its half width and its length, how far ahead of the edge its points may be, and
+            the gap that ends it, metres.
+
+    Returns:
+        (M, 2) least and greatest distance from the edge into the object.
+    """
+    extent = np.zeros((len(frame), 2), dtype=np.float32)
+    _along_strips(_columns(points), rows, first, last, frame, strip, extent)
+    return extent
+
+
+def level_spread(
+    points: Float32, rows: Int64, toward: Float32, radius: float, drop: float
+) -> tuple[Float32, Float32, Float32]:
+    """How the surface around points lies, seen from some direction.
+
+    Args:
+        points: (N, 3) of the cloud.
+        rows: (M,) of the points to look at.
+        toward: (M, 3) unit, to who looks.
+        radius: Metres around each point in which others count,
+        drop: unless they lie further below it, metres.
+
+    Returns:
+        The direction orthogonal to `toward` in which they spread least, (M, 3) unit; how far (M,)
+        the point lies from their mean along it, not negative; their standard deviation (M,) along
+        it. Metres.
+    """
+    cells = np.floor((points - points.min(axis=0)) / np.float32(radius)).astype(np.int64) + 1
+    sizes = cells.max(axis=0) + 2
+    key = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    order = np.argsort(key, kind="stable")
+    least = np.empty((len(rows), 3), dtype=np.float32)
+    offset, deviation = np.empty((2, len(rows)), dtype=np.float32)
+    _level_spread(
+        np.ascontiguousarray(points[order]),
+        key[order],
+        points[rows],
+        key[rows],
+        sizes,
+        np.ascontiguousarray(toward),
+        np.array([radius, drop], dtype=np.float32),
+        least,
+        offset,
+        deviation,
+    )
+    return least, offset, deviation
 
 
 def _columns(points: Float32) -> Float32:
@@ -248,3 +328,128 @@ def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
                         best[place], mine[place] = best[place - 1], mine[place - 1]
                         place -= 1
                     best[place], mine[place] = here, start + j
+
+
+@compiled("contract")
+def _until_met(
+    columns: Float32,
+    turn: Float32,
+    shift: Float32,
+    boxes: Float32,
+    behind: np.float32,
+    way: Float32,
+) -> None:
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    for e in range(len(turn)):
+        nearest = np.float32(np.inf)
+        for b in range(len(boxes)):
+            low, high = boxes[b, 0], boxes[b, 1]
+            for i in range(len(xs)):
+                x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                above = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+                if above & (z > low[2] - behind):
+                    nearest = min(nearest, z - high[2])
+        way[e] = nearest
+
+
+@compiled("contract")
+def _along_strips(
+    columns: Float32,
+    rows: Int64,
+    first: Int64,
+    last: Int64,
+    frame: Float32,
+    strip: Float32,
+    extent: Float32,
+) -> None:
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    cell = gap / STRIP_CELLS
+    cells = int(np.ceil((length + gap) / cell)) + 1
+    reached = np.empty(cells, np.float32)
+    for m in range(len(frame)):
+        origin, across, out, ahead = frame[m, 0], frame[m, 1], frame[m, 2], frame[m, 3]
+        reached[:] = -np.inf
+        least = np.float32(0.0)
+        for p in range(first[m], last[m]):
+            i = rows[p]
+            x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
+            sideways = x * across[0] + y * across[1] + z * across[2]
+            inward = -(x * out[0] + y * out[1] + z * out[2])
+            below = x * ahead[0] + y * ahead[1] + z * ahead[2]
+            if (abs(sideways) < half) & (below < drop) & (inward > -gap) & (inward < length):
+                least = min(least, inward)
+                place = int((inward + gap) / cell)
+                reached[place] = max(reached[place], inward)
+        furthest = np.float32(0.0)
+        for place in range(int(gap / cell), cells):
+            if reached[place] > furthest:
+                if reached[place] - furthest > gap:
+                    break
+                furthest = reached[place]
+        extent[m, 0], extent[m, 1] = least, furthest
+
+
+@compiled("contract")
+def _first_of(key: Int64, wanted: int) -> int:
+    low, high = 0, len(key)
+    while low < high:
+        middle = (low + high) // 2
+        if key[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@compiled("contract")
+def _level_spread(
+    points: Float32,
+    key: Int64,
+    middle: Float32,
+    middle_key: Int64,
+    sizes: Int64,
+    toward: Float32,
+    reach: Float32,
+    least: Float32,
+    offset: Float32,
+    deviation: Float32,
+) -> None:
+    radius, drop = reach[0], reach[1]
+    for m in range(len(middle)):
+        px, py, pz = middle[m, 0], middle[m, 1], middle[m, 2]
+        ux, uy, uz = toward[m, 0], toward[m, 1], toward[m, 2]
+        # Two level directions: s from the axis that is the furthest from up, t = u x s.
+        if abs(ux) <= abs(uy) and abs(ux) <= abs(uz):
+            length = np.sqrt(uy * uy + uz * uz)
+            sx, sy, sz = np.float32(0.0), -uz / length, uy / length
+        elif abs(uy) <= abs(uz):
+            length = np.sqrt(ux * ux + uz * uz)
+            sx, sy, sz = uz / length, np.float32(0.0), -ux / length
+        else:
+            length = np.sqrt(ux * ux + uy * uy)
+            sx, sy, sz = -uy / length, ux / length, np.float32(0.0)
+        tx, ty, tz = uy * sz - uz * sy, uz * sx - ux * sz, ux * sy - uy * sx
+        a, b, aa, ab, bb, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        for dx in range(-1, 2):
+            for dy in range(-1, 2):
+                start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
+                for j in range(_first_of(key, start), len(key)):
+                    if key[j] > start + 2:
+                        break
+                    x, y, z = points[j, 0] - px, points[j, 1] - py, points[j, 2] - pz
+                    near = x * x + y * y + z * z < radius * radius
+                    if near and x * ux + y * uy + z * uz > -drop:
+                        s, t = x * sx + y * sy + z * sz, x * tx + y * ty + z * tz
+                        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
+                        count += 1
+        a, b = a / count, b / count
+        aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
+        turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
+        s, t = np.cos(turn), np.sin(turn)  # the direction of least variance
+        outward = -(a * s + b * t)
+        if outward < 0.0:
+            s, t, outward = -s, -t, -outward
+        least[m, 0], least[m, 1], least[m, 2] = s * sx + t * tx, s * sy + t * ty, s * sz + t * tz
+        offset[m] = outward
+        deviation[m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))

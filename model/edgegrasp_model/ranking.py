@@ -1,18 +1,23 @@
 """From scored candidates to ranked grasps in the caller's frame."""
 
+import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.collision import clearances
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import DetectOptions, Suppression
-from edgegrasp_model.results import DebugInfo, Grasp, Outcome
+from edgegrasp_model.results import DebugInfo, DetectedObject, FoundSupport, Grasp, Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.support import Support
+from edgegrasp_model.scene.things import smallest_rectangle
 
 Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
@@ -148,6 +153,7 @@ def grasps_in_cloud(
     """Candidates E, all arrays (E,), as grasps in the frame of the cloud."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
+    number = scene.object_of_point[candidates.contact_index]
     return [
         Grasp(
             score=float(np.float32(score[row])),
@@ -159,9 +165,52 @@ def grasps_in_cloud(
             approach_direction=T_cloud_hand[row, :3, 2],
             collision_free=bool(collision_free[row]),
             clearance=float(clearance[row]),
+            object=None if number[row] < 0 else int(number[row]),
         )
         for row in range(len(candidates))
     ]
+
+
+def found_support(support: Support | None) -> FoundSupport | None:
+    """A support as it is told to the caller."""
+    if support is None:
+        return None
+    residual = None if math.isnan(support.residual) else support.residual
+    normal = support.normal.astype(np.float32)
+    return FoundSupport(normal, support.plane.offset, residual, support.share)
+
+
+def detected_objects(scene: Scene, grasps: Sequence[Grasp]) -> list[DetectedObject]:
+    """The scene's objects, and the best score of the grasps on each; the largest first."""
+    number, count = np.unique(scene.object_of_point[scene.object_of_point >= 0], return_counts=True)
+    best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda grasp: grasp.score)}
+    objects = []
+    for row in np.argsort(-count, kind="stable"):
+        which = int(number[row])
+        T_cloud_box, half = _upright_box(scene, scene.object_of_point == which)
+        objects.append(
+            DetectedObject(
+                number=which,
+                points=int(count[row]),
+                center=T_cloud_box[:3, 3],
+                half_extents=half,
+                quaternion=Rotation.from_matrix(T_cloud_box[:3, :3]).as_quat().astype(np.float32),
+                best_score=best.get(which),
+            )
+        )
+    return objects
+
+
+def _upright_box(scene: Scene, held: NDArray[np.bool_]) -> tuple[Float32, Float32]:
+    """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
+    points = scene.cloud.points[held].astype(np.float64)
+    axes, low, size = smallest_rectangle(points[:, :2])
+    T_canonical_box = np.eye(4)
+    T_canonical_box[:2, :2] = axes.T
+    bottom, top = points[:, 2].min(), points[:, 2].max()
+    T_canonical_box[:3, 3] = [*(axes.T @ (low + size / 2)), (bottom + top) / 2]
+    half: Float32 = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
+    return scene.frame.poses_in_cloud(T_canonical_box), half
 
 
 def debug_info(

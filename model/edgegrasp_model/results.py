@@ -48,6 +48,29 @@ class Grasp:
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
     collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
+    object: int | None = None  # number of the object that the contact is on; None: of none
+
+
+@dataclass(frozen=True)
+class FoundSupport:
+    """The plane that things stand on: the points x with normal . x = offset; cloud frame."""
+
+    normal: Float32  # (3,) unit, away from the table
+    offset: float  # metres
+    residual: float | None  # metres, median distance of its points; None: none of it is seen
+    share: float  # of the seen surface that lies in it
+
+
+@dataclass(frozen=True)
+class DetectedObject:
+    """A thing that grasps are for; cloud frame, metres."""
+
+    number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
+    points: int  # voxels of the processed cloud that are seen of it
+    center: Float32  # (3,) of the smallest upright box around them
+    half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
+    quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
+    best_score: float | None  # of the grasps returned; None: there is none on it
 
 
 @dataclass(frozen=True)
@@ -74,6 +97,9 @@ class Detection:
     model: str  # name of the weights used
     warnings: list[str] = field(default_factory=list)
     debug: DebugInfo | None = None  # where it was asked for
+    support: FoundSupport | None = None  # given or found
+    up: Float32 = field(default_factory=lambda: np.array([0, 0, 1], np.float32))  # (3,) unit, used
+    objects: list[DetectedObject] = field(default_factory=list)  # the largest first
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ def hand_batch(
         Cloud(view.points, view.normals),
         candidates,
         gripper,
-        UP,
+        view.up,
         view.support_plane,
         viewpoint,
         view.cut_off(),
@@ -268,7 +268,7 @@ def _turn_of(view: LabelledView) -> NDArray[np.float32]:
     """The rotation (3, 3) of a view's axes to those of the detector's frame."""
     if len(view.points) == 0:
         return np.eye(3, dtype=np.float32)
-    frame = CanonicalFrame.of_scene(view.points, UP, view.camera_position)
+    frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
     return frame.directions(np.eye(3)).T.astype(np.float32)
 
 

@@ -28,7 +28,7 @@ from edgegrasp_model.options import (
     Workspace,
 )
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.scene import build_scene
+from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
@@ -63,7 +63,7 @@ VIEWS = {
     SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
     SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
 }
-KEPT_DISTANCE = 0.25  # metres from the nearest hand that was tried
+KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 TOLD_SHARE = {  # of the views that are not cut off, where support and workspace are told
     SceneKind.PACKED: 0.0,
@@ -331,16 +331,17 @@ def label(
     if len(observation.cloud) == 0:
         return _empty(observation)
     guide = None if options.weights is None else detector(options.weights)
-    sample = score = None
+    selected = sample = score = None
     if guide is None:
-        scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
-        if scene is not None:
+        selected = select_points(check_cloud(observation.cloud), request, {}, [])
+        scene = build_scene(selected, request, VOXEL_SIZE, {})
+        if scene is not None and scene.approach_allowed.any():
             sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
     else:
         prepared = guide.prepare(observation.cloud, request)
-        scene, sample = prepared.scene, prepared.sample
+        selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
         score = None if prepared.batch is None else guide.run(prepared.batch)
-    if scene is None or sample is None:
+    if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return _empty(observation)
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
@@ -357,7 +358,7 @@ def label(
         T_world_hand=T_world_hand,
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
-        support=support_as_array(scene.found_support),
+        support=support_as_array(selected.support),
         at_side=None if scene.at_side is None else scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
     )

@@ -12,8 +12,8 @@ from edgegrasp_model.candidates.edge_grasps import (
     crop_balls,
     edge_grasps,
     retract,
-    top_down_grasps,
 )
+from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud
@@ -95,10 +95,17 @@ class Teacher:
         cloud, support = Cloud(view.points, view.normals), view.support_plane
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
-        level = top_down_grasps(cloud, *pairs, support, self.gripper)
-        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), level])
-        both, clear = retract(both, support, self.gripper)
-        both = both.take(rng.permutation(np.flatnonzero(clear)))
+        every = np.arange(len(crop.ball_rows))
+        wanted = np.ones(len(cloud.points), dtype=bool)
+        across = [
+            outline_grasps(cloud.points, crop, balls, every, seen, support, self.gripper)
+            for seen in outlines(cloud.points, view.camera_position, wanted)
+        ]
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), *across])
+        if support is not None:
+            both, clear = retract(both, support, self.gripper)
+            both = both.take(np.flatnonzero(clear))
+        both = both.take(rng.permutation(len(both)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))
         _, first = np.unique(both.approach_index, return_index=True)
         place = np.arange(len(both)) - np.repeat(first, np.diff([*first, len(both)]))

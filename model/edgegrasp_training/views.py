@@ -71,6 +71,12 @@ class LabelledView:
         x, y, z, offset = self.support.astype(np.float64).tolist()
         return SupportPlane(normal=(x, y, z), offset=offset) if (x, y, z) != (0, 0, 0) else None
 
+    @property
+    def up(self) -> Float32:
+        """Away from gravity, as the detector takes it: (3,)."""
+        plane = self.support_plane
+        return UP if plane is None else np.asarray(plane.normal, dtype=np.float32)
+
     def cut_off(self) -> NDArray[np.bool_]:
         """Which points (N,) lie where a side of the workspace cuts things off."""
         if self.at_side is None:

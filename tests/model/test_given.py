@@ -113,7 +113,7 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         np.testing.assert_allclose(mine.grasp.T_cloud_hand, pose, atol=1e-5)
         np.testing.assert_allclose(mine.grasp.clearance, theirs.clearance, atol=1e-5)
         assert mine.grasp.collision_free
-        near += np.linalg.norm(mine.grasp.contact_point - theirs.contact_point) < 0.012
+        near += np.linalg.norm(mine.grasp.contact_point - theirs.contact_point) < 0.025
         contact = (mine.grasp.contact_point - pose[:3, 3]) @ pose[:3, :3]
         assert abs(contact[0]) < PANDA.pad_half_width
         assert abs(contact[1]) < PANDA.max_opening / 2

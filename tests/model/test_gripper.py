@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.candidates.collision import hits_cloud
-from edgegrasp_model.candidates.edge_grasps import edge_grasps, support_clearance, top_down_grasps
+from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, edge_grasps, support_clearance
+from edgegrasp_model.candidates.outline import MAX_INSERTION
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.gripper import (
     GRIPPER_FOLDER,
@@ -75,17 +76,6 @@ def test_a_swinging_gripper_stays_clear_of_the_support_as_it_closes(gripper: Gri
     clearance = support_clearance(down, floor, gripper)[0]
     lowest = min(0.5 - gripper.boxes(w)[:, 1, 2].max() for w in np.linspace(0, 0.08, 40))
     assert clearance == pytest.approx(lowest, abs=1e-5)
-
-
-@by_name
-def test_a_level_grasp_puts_its_contact_inside_the_fingertips(gripper: Gripper) -> None:
-    floor = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.28)
-    cloud = edge_cloud(0.02, 0.005)
-    grasps = top_down_grasps(cloud, np.array([0]), np.array([1]), floor, gripper)
-    assert len(grasps) == 1
-    pose = grasps.T_cloud_hand[0]
-    contact = (cloud.points[1] - pose[:3, 3]) @ pose[:3, :3]
-    np.testing.assert_allclose(contact, [0, 0.02, gripper.contact_z_at(0.04)], atol=1e-6)
 
 
 @by_name
@@ -213,14 +203,16 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         T_hand_tcp = np.linalg.inv(grasp.T_cloud_hand) @ grasp.T_cloud_tcp
         np.testing.assert_allclose(T_hand_tcp, gripper.T_hand_tcp, atol=1e-5)
         contact = (grasp.contact_point - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, :3]
-        np.testing.assert_allclose(contact[2], gripper.contact_z_at(2 * abs(contact[1])), atol=1e-5)
+        further_in = gripper.contact_z_at(2 * abs(contact[1])) - contact[2]
+        shallowest = gripper.contact_z - gripper.tip_z + TIP_MARGIN
+        assert shallowest - 1e-3 < further_in < MAX_INSERTION + 2e-3
         assert grasp.width <= np.float32(gripper.max_opening)
     told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
     assert told == (gripper.name != "panda")
 
 
 def test_a_wider_gripper_reaches_contacts_beyond_the_ball_of_the_weights() -> None:
-    for name, least, most in (("panda", 0.0, 0.038), ("robotiq-2f-140", 0.045, 0.07)):
+    for name, least, most in (("panda", 0.0, 0.045), ("robotiq-2f-140", 0.045, 0.07)):
         options = DetectOptions(
             viewpoint=VIEW, gripper=name, collision="ignore", suppression=None, top_k=2000
         )

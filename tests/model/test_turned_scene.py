@@ -94,7 +94,7 @@ def test_a_turned_scene_has_the_same_grasps_turned(request_of, seed) -> None:
     assert len(here.grasps) >= 5
     assert there.counts == here.counts
     for a, b in zip(here.grasps, there.grasps, strict=True):
-        np.testing.assert_allclose(b.score, a.score, atol=1e-3)
+        np.testing.assert_allclose(b.score, a.score, atol=4e-3)
         np.testing.assert_allclose(b.clearance, a.clearance, atol=1e-4)
         np.testing.assert_allclose(b.width, a.width, atol=1e-4)
         rotation = turned.turn.as_matrix() @ a.T_cloud_hand[:3, :3]

@@ -11,15 +11,13 @@ from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
     BallCrop,
     Candidates,
-    Headings,
     centred_grasps,
-    closing_headings,
     crop_balls,
     edge_grasps,
     retract,
     sample_approach_points,
-    top_down_grasps,
 )
+from edgegrasp_model.candidates.outline import Outline, outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
@@ -87,7 +85,7 @@ def sample_candidates(
     rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
     limit = OVERSAMPLING * options.num_candidates
-    headings = None if scene.support is None else closing_headings(scene.cloud, scene.support)
+    seen = outlines(scene.cloud.points, scene.viewpoint, scene.contact_allowed)
     attempts: list[Attempt] = []
     while True:
         chosen = sample_approach_points(
@@ -98,7 +96,7 @@ def sample_candidates(
         )
         approach_index = approach_rows[chosen]
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, headings, approach_index, crop, options, gripper, counts, centre)
+        this = _constrained(scene, seen, approach_index, crop, options, gripper, counts, centre)
         attempts.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
         row = passed[random_rows(len(passed), limit, rng_candidates)]
@@ -133,7 +131,7 @@ def sample_candidates(
 
 def _constrained(
     scene: Scene,
-    headings: Headings | None,
+    seen: list[Outline],
     approach_index: Int64,
     crop: BallCrop,
     options: DetectOptions,
@@ -148,17 +146,19 @@ def _constrained(
     add_count(counts, "in_contact_region", len(pair))
     pairs = approach_index[crop.ball_of_point[pair]], crop.ball_rows[pair]
     candidates = edge_grasps(scene.cloud, *pairs, gripper)
-    if scene.support is not None:
-        level = top_down_grasps(scene.cloud, *pairs, scene.support, gripper, headings)
-        candidates = Candidates.concatenate([candidates, level])
     candidates = replace(candidates, pair=pair[candidates.pair])
     if centre:
         centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
         candidates = Candidates.concatenate([candidates, centred])
+    points, margin = scene.cloud.points, options.collision.margin
+    across = [
+        outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
+        for each in seen
+    ]
+    candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))
     outcome = np.full(len(candidates), CODE[Outcome.RETURNED])
     if scene.support is not None:
-        margin = options.collision.margin
         candidates, clear = retract(candidates, scene.support, gripper, margin)
         outcome[~clear] = CODE[Outcome.SUPPORT]
     direction = -candidates.approach

@@ -59,46 +59,89 @@ class Scene:
     contact_allowed: Bools  # (V,) in the contact region
     object_of_point: Int64  # (V,) number of the object that each point is of; -1: of none
     support: SupportPlane | None
-    found_support: Support | None  # the same in the cloud's frame, and how well it is seen
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
 
-def build_scene(
+@dataclass(frozen=True)
+class SelectedPoints:
+    """What is left of a cloud: M points of things and of what is around them."""
+
+    sent: CheckedCloud  # M points
+    number: Int64  # (M,) the object that each is of; -1: an obstacle
+    support: Support | None
+    up: Float64  # (3,) unit, away from gravity, cloud frame
+    viewpoints: Float64 | None  # (W, 3) the cameras
+
+
+def select_points(
     sent: CheckedCloud,
+    options: DetectOptions,
+    counts: dict[str, int],
+    warnings: list[str],
+) -> SelectedPoints:
+    """Correct depths, remove the support, number the objects, drop what no hand can meet.
+
+    Raises:
+        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
+            views do not suit the viewpoints, or there are none to correct depths from.
+    """
+    viewpoints = camera_positions(sent, options)
+    for field in ("approach_region", "contact_region"):
+        if (region := getattr(options, field)) is not None:
+            check_region(region, sent, field)
+    counts["points"] = len(sent.points)
+    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
+        sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
+    sent = near_workspace(sent, options.workspace, REACH)
+    inside = inside_workspace(sent.points, options.workspace)
+    counts["in_workspace"] = int(inside.sum())
+    camera = None if viewpoints is None else viewpoints.mean(axis=0)
+    seen = Seen(sent.points, camera, sent.at_border())
+    support = choose_support(seen, inside, options, warnings)
+    up = _up(options, support)
+    if support is None:
+        counts["above_support"] = int(inside.sum())
+        return SelectedPoints(
+            sent, np.where(inside, _given_numbers(sent), -1), None, up, viewpoints
+        )
+    height, margin = support.heights(sent.points), support.margin(seen.distance())
+    above = np.asarray(height > margin)
+    counts["above_support"] = int((above & inside).sum())
+    number = _numbers(seen, sent, height, margin, inside, support, options, warnings)
+    kept = above & near_things(seen, number, support)
+    return SelectedPoints(sent.take(kept), number[kept], support, up, viewpoints)
+
+
+def build_scene(
+    selected: SelectedPoints,
     options: DetectOptions,
     voxel_size: float,
     counts: dict[str, int],
-    warnings: list[str],
     max_voxels: int = MAX_VOXELS,
 ) -> Scene | None:
-    """Find the support and the things on it, drop what is far from them, voxelise the rest.
+    """Voxelise what is left of a cloud, clean it, estimate its normals, find the regions.
 
     Args:
-        sent: N points.
-        options: workspace, support, objects, viewpoint, up, regions and obstacles.
+        selected: M points.
+        options: workspace, regions and obstacles.
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
-        warnings: Gets what the caller should know.
         max_voxels: Most voxels that the cloud may have where grasps are looked for.
 
     Returns:
         The scene, or None where too few points are left to make a surface.
 
     Raises:
-        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints, or there are none to correct depths from, or the
-            cloud has too many voxels.
+        InvalidRequest: The cloud has too many voxels.
     """
-    viewpoints = camera_positions(sent, options)
-    points = select_points(sent, viewpoints, options, counts, warnings)
-    sent, support = points.sent, points.support
-    if len(sent.points) == 0 or not (points.number >= 0).any():
+    sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
+    if len(sent.points) == 0 or not (selected.number >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
     first_viewpoint = None if viewpoints is None else viewpoints[0]
-    frame = CanonicalFrame.of_scene(sent.points, points.up, first_viewpoint)
+    frame = CanonicalFrame.of_scene(sent.points, selected.up, first_viewpoint)
     canonical = frame.points(sent.points)
     voxels = voxelise(canonical, voxel_size)
     counts["voxels"] = len(voxels.size)
@@ -111,7 +154,7 @@ def build_scene(
         return None
     cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
     in_cloud = frame.points_in_cloud(middles)
-    number = voxels.commonest(points.number + 1, int(points.number.max()) + 2)[kept] - 1
+    number = voxels.commonest(selected.number + 1, int(selected.number.max()) + 2)[kept] - 1
 
     def allowed(region: Region | None) -> Bools:
         if region is None:
@@ -133,8 +176,7 @@ def build_scene(
         contact_allowed=allowed(options.contact_region),
         object_of_point=number,
         support=None if support is None else plane_in_frame(support.plane, frame),
-        found_support=support,
-        at_side=near_workspace_side(in_cloud[kept], options.workspace, points.up, sent.points),
+        at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoint=single_viewpoint(viewpoints, frame),
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )
@@ -150,53 +192,6 @@ def _too_many_voxels(
         f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
         f"Send a workspace around the objects, or a support plane: at most {most} are accepted.",
     )
-
-
-@dataclass(frozen=True)
-class SelectedPoints:
-    """What is left of a cloud: M points of things and of what is around them."""
-
-    sent: CheckedCloud  # M points
-    number: Int64  # (M,) the object that each is of; -1: an obstacle
-    support: Support | None
-    up: Float64  # (3,) unit, away from gravity, cloud frame
-
-
-def select_points(
-    sent: CheckedCloud,
-    viewpoints: Float64 | None,
-    options: DetectOptions,
-    counts: dict[str, int],
-    warnings: list[str],
-) -> SelectedPoints:
-    """Correct depths, remove the support, number the objects, drop what no hand can meet.
-
-    Raises:
-        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or there
-            are no viewpoints (W, 3) to correct depths from.
-    """
-    for field in ("approach_region", "contact_region"):
-        if (region := getattr(options, field)) is not None:
-            check_region(region, sent, field)
-    counts["points"] = len(sent.points)
-    if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
-        sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    sent = near_workspace(sent, options.workspace, REACH)
-    inside = inside_workspace(sent.points, options.workspace)
-    counts["in_workspace"] = int(inside.sum())
-    camera = None if viewpoints is None else viewpoints.mean(axis=0)
-    seen = Seen(sent.points, camera, sent.at_border())
-    support = choose_support(seen, inside, options, warnings)
-    up = _up(options, support)
-    if support is None:
-        counts["above_support"] = int(inside.sum())
-        return SelectedPoints(sent, np.where(inside, _given_numbers(sent), -1), None, up)
-    height, margin = support.heights(sent.points), support.margin(seen.distance())
-    above = np.asarray(height > margin)
-    counts["above_support"] = int((above & inside).sum())
-    number = _numbers(seen, sent, height, margin, inside, support, options, warnings)
-    kept = above & near_things(seen, number, support)
-    return SelectedPoints(sent.take(kept), number[kept], support, up)
 
 
 def choose_support(
@@ -275,7 +270,9 @@ def near_things(seen: Seen, number: Int64, support: Support) -> Bools:
     cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
     held = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     held[tuple(cell[number >= 0].T)] = True
-    near = ndimage.binary_dilation(held, np.ones((3, 3)), iterations=math.ceil(REACH / CELL))
+    near = ndimage.binary_dilation(
+        held, np.ones((3, 3), dtype=bool), iterations=math.ceil(REACH / CELL)
+    )
     return np.asarray(near[tuple(cell.T)])
 
 

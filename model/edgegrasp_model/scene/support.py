@@ -72,7 +72,7 @@ class Support:
         if math.isnan(self.spread):
             return np.full(len(distance), self.least, dtype=np.float32)
         grown = DEVIATIONS * self.spread * np.square(distance / self.distance)
-        return np.clip(grown, self.least, max(MAX_MARGIN, self.least)).astype(np.float32)
+        return np.asarray(np.clip(grown, self.least, max(MAX_MARGIN, self.least)))
 
 
 class Seen(NamedTuple):
@@ -92,7 +92,7 @@ class Seen(NamedTuple):
         if self.viewpoint is None:
             return np.full(len(self.points), USUAL_DISTANCE)
         apart = self.points - self.viewpoint
-        return np.sqrt(np.einsum("nd,nd->n", apart, apart))
+        return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
 
 class _Plane(NamedTuple):
@@ -204,7 +204,8 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
     # Surfaces near the camera have more points: weigh each point by the surface it stands for.
     weight = 1.0 / tree.query_ball_point(points, CROWD_RADIUS, return_length=True)
     weight /= weight.sum()
-    left, planes = np.arange(len(points)), []
+    left = np.arange(len(points))
+    planes: list[_Plane] = []
     while len(planes) < MAX_PLANES and len(left) >= NEIGHBORS:
         corner = rng.choice(left, min(JUDGED, len(left)), replace=False)
         offset = np.einsum("td,td->t", normals[corner], points[corner])

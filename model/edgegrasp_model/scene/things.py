@@ -39,7 +39,7 @@ class PlaneView(NamedTuple):
     """M points as a plane sees them."""
 
     plan: Float64  # (M, 2) metres along the plane
-    height: Float64  # (M,) metres over it
+    height: NDArray[np.floating]  # (M,) metres over it
     margin: NDArray[np.floating]  # (M,) metres over it that still belong to it
     on: Bools  # (M,) belongs to it
     at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
@@ -96,7 +96,7 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
     return number
 
 
-def clusters(plan: Float64, height: Float64) -> list[Int64]:
+def clusters(plan: Float64, height: NDArray[np.floating]) -> list[Int64]:
     """Rows of points (M, 2), (M,) that hang together, the largest cluster first."""
     if len(plan) == 0:
         return []
@@ -134,16 +134,14 @@ def support_outline(plan: Float64) -> Float64 | None:
         return None
 
 
-def box_contents(plan: Float64, height: Float64) -> Bools | None:
+def box_contents(plan: Float64, height: NDArray[np.floating]) -> Bools | None:
     """Which points (M,) lie inside an open box; None where the points are none.
 
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
     is lower inside. The points at its walls and on its floor do not count.
     """
-    try:
-        place, size = _smallest_rectangle(plan)
-    except (QhullError, ValueError):
-        return None
+    axes, low, size = smallest_rectangle(plan)
+    place = plan @ axes.T - low
     if size.min() < MIN_WIDTH:
         return None
     from_side = [place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]]
@@ -153,7 +151,7 @@ def box_contents(plan: Float64, height: Float64) -> Bools | None:
         along = 1 - side // 2
         rims.append(_rim(place[at, along], height[at], float(size[along])))
     levels = [rim for rim in rims if rim is not None]
-    inside = np.min(from_side, axis=0) > WALL
+    inside: Bools = np.min(from_side, axis=0) > WALL
     if len(levels) < 3 or inside.sum() < MIN_POINTS:
         return None
     if np.percentile(height[inside], 5) > np.median(levels) - HOLLOW:
@@ -164,19 +162,24 @@ def box_contents(plan: Float64, height: Float64) -> Bools | None:
     return inside
 
 
-def _smallest_rectangle(plan: Float64) -> tuple[Float64, Float64]:
-    """Places (M, 2) in the smallest rectangle around points, from its corner, and its size."""
-    corners = plan[ConvexHull(plan).vertices]
+def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
+    """The smallest rectangle around points (M, 2): its axes (2, 2), low corner on them, size."""
+    try:
+        corners = plan[ConvexHull(plan).vertices]
+    except (QhullError, ValueError):  # too few points, or all in a line
+        corners = plan
     edges = np.roll(corners, -1, axis=0) - corners
+    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
+    edges = np.concatenate([edges, [[1.0, 0.0]]])
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
     axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
     turned = np.einsum("kad,cd->kca", axes, corners)
     size = np.ptp(turned, axis=1)
     best = int(size.prod(axis=1).argmin())
-    return plan @ axes[best].T - turned[best].min(axis=0), size[best]
+    return axes[best], turned[best].min(axis=0), size[best]
 
 
-def _rim(along: Float64, height: Float64, length: float) -> float | None:
+def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
     """The height of a level rim along a side; None where there is none."""
     steps = max(int(np.ceil(length / STEP)), 1)
     top = np.full(steps, -np.inf)
@@ -188,7 +191,7 @@ def _rim(along: Float64, height: Float64, length: float) -> float | None:
     return level if (np.abs(top - level) < LEVEL).mean() > FILLED else None
 
 
-def _length(plan: Float64, height: Float64) -> float:
+def _length(plan: Float64, height: NDArray[np.floating]) -> float:
     """The longest side of the box along the principal axes of points, or their height; metres."""
     around = plan - plan.mean(axis=0)
     _, vectors = np.linalg.eigh(around.T @ around)

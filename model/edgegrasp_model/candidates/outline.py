@@ -1,0 +1,162 @@
+"""Grasps across an outline: the hand comes along up, or from the camera, and closes across an edge.
+
+Where depth breaks off, the side of an object is not seen, and an edge grasp would need the normal
+there. Here only the run of the outline counts, and what lies between, beside and below the fingers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.candidates.edge_grasps import (
+    EDGE_MARGIN,
+    MIN_EDGE,
+    TIP_MARGIN,
+    BallCrop,
+    Candidates,
+    support_clearance,
+)
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_view import APPROACH_LENGTH
+from edgegrasp_model.kernels import extents_across, free_way, level_spread
+from edgegrasp_model.options import SupportPlane
+from edgegrasp_model.scene.cloud import UP
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+OUTLINE_RADIUS = 0.016  # metres of surface that say where an outline runs
+MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
+THIN = 0.003  # metres of standard deviation across a rim, which is all outline
+DROP = 0.006  # metres below an edge from which a surface is another one
+GAP = 0.007  # metres without a point in which a surface ends
+ONE_VIEW = np.cos(np.radians(15.0))  # directions nearer to each other show the same outline
+CLEARANCE = 0.002  # metres kept free ahead of the hand as it goes in
+MAX_INSERTION = 0.020  # metres further in than an edge grasp; deeper holds no better
+LEVEL = 1e-6  # cosine below which a hand moves along the support
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Where a cloud of N points breaks off for who looks at it from somewhere."""
+
+    toward: Float32  # (N, 3) unit, from each point to who looks
+    heading: Float32  # (N, 3) unit, orthogonal to `toward`: across the edge, out of the object
+    is_edge: Bools  # (N,)
+
+
+def outlines(points: Float32, viewpoint: Float32 | None, wanted: Bools) -> list[Outline]:
+    """The outlines of a cloud from above and, where that is another direction, from the camera.
+
+    Args:
+        points: (N, 3) canonical frame, metres.
+        viewpoint: (3,) the only camera; None where it is unknown, or there are several.
+        wanted: (N,) which points to look at.
+    """
+    seen = [_outline(points, np.broadcast_to(UP, points.shape), wanted)]
+    if viewpoint is not None:
+        toward = viewpoint - points
+        toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+        seen.append(_outline(points, toward, wanted & (toward @ UP < ONE_VIEW)))
+    return seen
+
+
+def _outline(points: Float32, toward: Float32, wanted: Bools) -> Outline:
+    """A point is on the outline where its neighbours, at its height or above, lie to one side."""
+    rows = np.flatnonzero(wanted)
+    heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
+    least, outward, spread = level_spread(points, rows, toward[rows], OUTLINE_RADIUS, DROP)
+    heading[rows] = least
+    is_edge[rows] = (outward > MIN_OUTWARD) | (spread < THIN)
+    return Outline(toward, heading, is_edge)
+
+
+def outline_grasps(
+    points: Float32,
+    crop: BallCrop,
+    approach_index: Int64,
+    pair: Int64,
+    outline: Outline,
+    support: SupportPlane | None,
+    gripper: Gripper,
+    margin: float = 0.0,
+) -> Candidates:
+    """Hands that come from who looks at an outline and close across it.
+
+    The contact point lies on the outline, the hand in the middle between it and the opposite edge
+    of the same surface, and the approach point between the fingers. The hand goes in until
+    something is right ahead of it, by at most MAX_INSERTION more than that of an edge grasp.
+
+    Args:
+        points: (N, 3) the cloud.
+        crop: Balls around the approach points.
+        approach_index: (A,) rows of the approach points.
+        pair: (M,) rows of `crop`: the contact points that are allowed.
+        outline: Of the same cloud.
+        support: Plane that the hand stays above, where it is known.
+        gripper: Its boxes, open to the maximum.
+        margin: Metres kept free around the hand.
+
+    Returns:
+        At most one for each contact point, with the approach point nearest to the hand's axis.
+    """
+    pair = pair[outline.is_edge[crop.ball_rows[pair]]]
+    contact, approach = crop.ball_rows[pair], approach_index[crop.ball_of_point[pair]]
+    y, z = outline.heading[contact], -outline.toward[contact]
+    frame = np.stack([points[contact], np.cross(y, z), y, z], axis=1)  # (M, 4, 3)
+    edge = np.einsum("md,mkd->km", points[contact] - points[approach], frame[:, 1:])
+    between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
+    row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
+    extent = _extents(points, crop, pair[row], frame[row], gripper)
+    width = extent[:, 1] - extent[:, 0]
+    held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * EDGE_MARGIN)
+    held &= edge[1, row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
+    off_axis = np.hypot(edge[0, row], edge[1, row] - extent.mean(axis=1))
+    nearest = np.lexsort((off_axis, contact[row], ~held))[: held.sum()]
+    chosen = nearest[np.unique(contact[row[nearest]], return_index=True)[1]]
+    row, extent, width = row[chosen], extent[chosen], width[chosen]
+    pose = np.zeros((len(row), 4, 4), dtype=np.float32)
+    pose[:, :3, :3] = frame[row, 1:].transpose(0, 2, 1)
+    middle = points[contact[row]] - extent.mean(axis=1, keepdims=True) * y[row]
+    pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z[row]
+    pose[:, 3, 3] = 1.0
+    depth = np.maximum(edge[2, row], 0.0)
+    hands = Candidates(pair[row], approach[row], contact[row], -z[row], depth, pose)
+    return _inserted(points, hands, support, gripper, margin)
+
+
+def _extents(
+    points: Float32, crop: BallCrop, pair: Int64, frame: Float32, gripper: Gripper
+) -> Float32:
+    """How far the surface at contacts (M,) goes on between the pads, outward and inward (M, 2)."""
+    ball = crop.ball_of_point[pair]
+    first, last = (np.searchsorted(crop.ball_of_point, ball, side) for side in ("left", "right"))
+    strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
+    return extents_across(points, crop.ball_rows, first, last, frame, strip)
+
+
+def _inserted(
+    points: Float32,
+    candidates: Candidates,
+    support: SupportPlane | None,
+    gripper: Gripper,
+    margin: float,
+) -> Candidates:
+    """The hands moved along their way until something is right ahead of them.
+
+    Those for which that is before the contact is TIP_MARGIN inside the fingertips are left out.
+    """
+    boxes = gripper.boxes(gripper.max_opening)
+    boxes[:, 0] -= margin
+    boxes[:, 1] += margin
+    way = free_way(points, candidates.T_cloud_hand, boxes, APPROACH_LENGTH) - CLEARANCE
+    if support is not None:
+        fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
+        room = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+        way = np.minimum(way, np.where(fall > LEVEL, room / np.maximum(fall, LEVEL), np.inf))
+    row = np.flatnonzero(way >= gripper.contact_z + TIP_MARGIN - gripper.tip_z)
+    hands = candidates.take(row)
+    hands.T_cloud_hand[:, :3, 3] -= np.minimum(way[row], MAX_INSERTION)[:, None] * hands.approach
+    return hands
