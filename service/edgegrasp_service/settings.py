@@ -44,10 +44,6 @@ class Settings(BaseSettings):
     host: str = Field("127.0.0.1", description="address both transports bind to")
     http_port: Port = Field(8000, description="0: any free port")
     grpc_port: Port = Field(50051, description="0: any free port")
-    backend: Literal["weights", "dummy"] = Field(
-        "weights", description="dummy: made-up grasps, for load tests without weights"
-    )
-    dummy_seconds: Wait = Field(0.0, description="service time of the dummy backend, seconds")
     weights: tuple[Path, ...] = Field(
         (), description="weights files or folders of them, besides those that ship"
     )

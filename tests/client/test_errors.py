@@ -236,8 +236,8 @@ def test_no_server(scheme: str, closed_port: int, make_client, cloud) -> None:
 
 
 @pytest.fixture(scope="module")
-def slow_server(start_server):
-    with start_server("--backend", "dummy", "--dummy-seconds", "0.5") as server:
+def slow_server(start_dummy):
+    with start_dummy(seconds=0.5) as server:
         yield server
 
 

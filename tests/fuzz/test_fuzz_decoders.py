@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
@@ -12,7 +13,6 @@ from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.schemas import GIVEN, PER_POINT
 from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
 from edgegrasp_service.worker.job import Job, Limits
 from edgegrasp_service.worker.request_cloud import File, decode_cloud
 

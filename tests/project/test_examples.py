@@ -37,9 +37,7 @@ def run(*command: object, **environment: str) -> subprocess.CompletedProcess[str
 
 
 def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_path: Path) -> None:
-    done = run(
-        sys.executable, EXAMPLES / "demo.py", "--output", tmp_path, EDGEGRASP_BACKEND="dummy"
-    )
+    done = run(sys.executable, EXAMPLES / "demo.py", "--output", tmp_path)
     assert done.returncode == 0, done.stderr
     grpc_table, rest_table = re.split(r"\n\d+ grasps over ", done.stdout)[1:]
     ranked = re.compile(r"^ +(\d+)  (0\.\d+)  ", re.MULTILINE)

@@ -212,6 +212,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...
     path = str(tmp_path_factory.mktemp("nursery") / "socket")
     command = [sys.executable, "-P", str(Path(__file__).parent / "nursery.py"), path]
     environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
+    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"

@@ -14,12 +14,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.dummy import DummyCatalogue, DummyDetector
+
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
 from edgegrasp_service import errors
 from edgegrasp_service.errors import Overloaded, kind_of
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer as answer  # what a nursery imports
-from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
 from edgegrasp_service.worker.process import main
 
 PATIENCE = 20  # seconds; longer than anything takes
@@ -119,10 +120,10 @@ class Detector(DummyDetector):
 class Catalogue(DummyCatalogue):
     """Every load gives the next digest."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self) -> None:
         stage("load")
         self.digest = str((FOLDER / "begun").read_text().split().count("load"))
-        self._detector = Detector(seconds)
+        self._detector = Detector()
 
     def describe(self) -> Sequence[Mapping[str, Any]]:
         return [{**super().describe()[0], "digest": self.digest}]
@@ -132,7 +133,7 @@ def load(settings: Settings) -> Catalogue:
     failing = FOLDER / "fault-weights"  # stays until it is deleted
     if failing.exists():
         raise EdgeGraspError(failing.read_text())
-    return Catalogue(settings.dummy_seconds)
+    return Catalogue()
 
 
 if __name__ == "__main__":

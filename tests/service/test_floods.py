@@ -302,7 +302,7 @@ async def test_connections_are_bounded(serve) -> None:
 
 OUT_OF_DESCRIPTORS = """
 import resource, sys
-from edgegrasp_cli.main import main
+from benchmarks.dummy import main
 resource.setrlimit(resource.RLIMIT_NOFILE, (96, 96))
 main()
 """
@@ -310,7 +310,7 @@ main()
 
 def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud) -> None:
     """Row 12."""
-    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve", "--backend", "dummy"]
+    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve"]
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen(
             [*command, "--http-port", "0", "--grpc-port", "0", "--workers", "1"],

@@ -101,7 +101,7 @@ async def test_json_lines_name_requests_and_no_secrets(
         assert {"admission", "read", "wait", "prepare", "network"} <= set(line["milliseconds"])
 
 
-def test_requests_outlive_a_log_that_nobody_reads(start_server, cloud: np.ndarray) -> None:
+def test_requests_outlive_a_log_that_nobody_reads(start_dummy, cloud: np.ndarray) -> None:
     """Standard error is a full pipe, which would block who writes to it."""
     read, write = os.pipe()
     os.set_blocking(write, False)
@@ -113,7 +113,7 @@ def test_requests_outlive_a_log_that_nobody_reads(start_server, cloud: np.ndarra
     os.dup2(write, 2)
     try:
         server = contextlib.ExitStack()
-        running = server.enter_context(start_server("--backend", "dummy", "--log-level", "debug"))
+        running = server.enter_context(start_dummy("--log-level", "debug"))
     finally:
         os.dup2(kept, 2)
     with server:

@@ -74,7 +74,7 @@ def test_lists_in_the_environment_are_json(monkeypatch: pytest.MonkeyPatch) -> N
     [
         ({"http_port": -1}, "http_port: got -1. Input should be greater"),
         ({"htp_port": 1}, "htp_port: no such setting"),
-        ({"backend": "none"}, "backend: got 'none'"),
+        ({"log_level": "none"}, "log_level: got 'none'"),
         ({"max_body_bytes": "many"}, "max_body_bytes: got 'many'"),
         ({"tokens": [1]}, "tokens.0: got a secret"),
         ({"tls_key": "key.pem"}, "tls_certificate and tls_key go together"),

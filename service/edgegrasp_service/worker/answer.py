@@ -8,7 +8,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,25 +22,20 @@ from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.dummy import DummyCatalogue
 from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
 from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
 
-Catalogue = Union["ModelCatalogue", DummyCatalogue]  # detectors by the name of their weights
 
-
-def load_catalogue(settings: Settings) -> Catalogue:
+def load_catalogue(settings: Settings) -> "ModelCatalogue":
     """Load the detectors that the settings name and warm them up; takes seconds.
 
     Raises:
         EdgeGraspError: Weights cannot be used, or the device is not there.
     """
-    if settings.backend == "dummy":
-        return DummyCatalogue(settings.dummy_seconds)
-    # Torch takes seconds to import, and the dummy does without.
+    # Torch takes seconds to import, and tests do without.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     device = choose_device(settings.device)
@@ -51,7 +46,7 @@ def load_catalogue(settings: Settings) -> Catalogue:
     return catalogue
 
 
-def describe(catalogue: Catalogue) -> list[dict[str, Any]]:
+def describe(catalogue: "ModelCatalogue") -> list[dict[str, Any]]:
     """The facts of each set of weights, keyed as the fields of edgegrasp.v1.Model."""
     known = grasp_pb2.Model.DESCRIPTOR.fields_by_name
     return [
@@ -63,7 +58,7 @@ def describe(catalogue: Catalogue) -> list[dict[str, Any]]:
 class Answerer:
     """Answers jobs with the detectors of a catalogue; keeps nothing of one for the next."""
 
-    def __init__(self, catalogue: Catalogue, limits: Limits | None = None) -> None:
+    def __init__(self, catalogue: "ModelCatalogue", limits: Limits | None = None) -> None:
         """Wrap a catalogue; `limits` bound every request."""
         self._catalogue = catalogue
         self._limits = limits or Limits()
@@ -95,7 +90,7 @@ class Answerer:
 class _Work:
     """One job on its way to an answer."""
 
-    def __init__(self, job: Job, catalogue: Catalogue, limits: Limits) -> None:
+    def __init__(self, job: Job, catalogue: "ModelCatalogue", limits: Limits) -> None:
         self.facts = Facts()
         self.options: DetectOptions | None = None  # known once they are parsed
         self._job = job

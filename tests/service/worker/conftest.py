@@ -4,11 +4,11 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.errors import Problem
 from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
 from edgegrasp_service.worker.job import Answer, Job
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
 from edgegrasp_service.worker.job import Answer, Job
 
 
