@@ -202,24 +202,14 @@ def run(settings: Settings) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
-    with contextlib.ExitStack() as ends:
-        log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
-        observers: list[Observer] = []
-        if settings.otlp_endpoint:
-            from edgegrasp_service.observability import Tracer, otlp_provider
-
-            provider = otlp_provider(settings.otlp_endpoint)
-            ends.callback(provider.shutdown)
-            observers.append(Tracer(provider).trace_call)
+    with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
-        asyncio.run(_serve_until_signalled(settings, observers, log))
+        asyncio.run(_serve_until_signalled(settings, log))
 
 
-async def _serve_until_signalled(
-    settings: Settings, observers: Sequence[Observer], log: LogQueue
-) -> None:
+async def _serve_until_signalled(settings: Settings, log: LogQueue) -> None:
     stop = asyncio.Event()
-    server = Server(settings, observers)
+    server = Server(settings)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -134,16 +134,8 @@ class Settings(BaseSettings):
     grace_seconds: Wait = Field(
         10.0, description="time for requests in flight when stopping, seconds"
     )
-    otlp_endpoint: str = Field(
-        "",
-        pattern=r"^(https?://[^@\s]+)?$",  # no password: it would be printed
-        description="URL that traces are posted to, e.g. http://127.0.0.1:4318/v1/traces",
-    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="least severe records logged"
-    )
-    log_format: Literal["auto", "json", "text"] = Field(
-        "auto", description="auto: text on a terminal, JSON lines elsewhere"
     )
 
     @model_validator(mode="after")

@@ -1,7 +1,6 @@
 """The examples run as their first lines say."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -25,14 +24,13 @@ def cloud_file(tmp_path: Path) -> Path:
     return path
 
 
-def run(*command: object, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(*command: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(word) for word in command],
         capture_output=True,
         text=True,
         check=False,
         timeout=300,
-        env=os.environ | environment,
     )
 
 

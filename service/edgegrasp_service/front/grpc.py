@@ -417,10 +417,7 @@ async def _next_envelope(context: Any) -> Any:
 async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes:
     """A serialized DetectGraspsStreamResponse."""
     request_id: str = envelope.request_id.decode()
-    call = Call(
-        "grpc", stream.method, request_id, stream.peer, stream.token,
-        traceparent=stream.traceparent, in_stream=True,
-    )  # fmt: skip
+    call = Call("grpc", stream.method, request_id, stream.peer, stream.token, in_stream=True)
     body: bytes = envelope.request
     detection = b""
 

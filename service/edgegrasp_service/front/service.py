@@ -105,7 +105,6 @@ class GraspService:
             The call; of HTTP the transport sets the `code`.
         """
         call = Call(transport, method, headers.get(REQUEST_ID_HEADER, ""), peer)
-        call.traceparent = headers.get("traceparent", "")
         with self.observe(call):
             yield call
 

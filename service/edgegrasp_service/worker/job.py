@@ -24,7 +24,7 @@ class Job:
 
 @dataclass
 class Facts:
-    """What logs, metrics and traces tell of a request, as far as it came."""
+    """What logs and metrics tell of a request, as far as it came."""
 
     model: str = ""  # name of the weights
     points: int = 0  # in the cloud as sent, holes included
