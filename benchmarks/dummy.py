@@ -146,11 +146,11 @@ def _top_down(point: Float32, score: float) -> Grasp:
 
 
 def main() -> None:
-    """The program `edgegrasp` with the dummy; without arguments, what its workers fork from."""
+    """The program `edgegrasp` with the dummy; with settings as JSON, what its workers fork from."""
     from edgegrasp_service.worker import pool, process
 
-    if len(sys.argv) == 1:
-        process.main(lambda settings: DummyCatalogue(SECONDS))
+    if sys.argv[1].startswith("{"):
+        process.main(sys.argv[1], lambda settings: DummyCatalogue(SECONDS))
         return
     pool.NURSERY = (sys.executable, "-P", __file__)
     from edgegrasp_cli.main import main

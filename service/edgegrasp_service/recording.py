@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import limits, pack, receive
+from edgegrasp_service.worker.job import Answer, Job, pack, receive
 
 logger = logging.getLogger(__name__)
 
@@ -74,9 +73,9 @@ def replay(path: Path, settings: Settings) -> Replay:
     from edgegrasp_service.worker.answer import Answerer, load_catalogue
 
     with path.open("rb") as file:
-        job, recorded = receive(file.readinto), receive(file.readinto)
+        job, recorded = receive(file), receive(file)
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
         raise ValueError(f"{path} is no recorded request")
     job = replace(job, remaining=settings.max_request_seconds)
-    answer = Answerer(load_catalogue(settings), limits(settings)).answer(job)
+    answer = Answerer(load_catalogue(settings), settings).answer(job)
     return Replay(job, recorded.body, answer)

@@ -12,8 +12,9 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.schemas import GIVEN, PER_POINT
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.job import Job, Limits
+from edgegrasp_service.worker.job import Job
 from edgegrasp_service.worker.request_cloud import File, decode_cloud
 
 from .conftest import (
@@ -105,7 +106,7 @@ FORM = b"".join(
 
 # Whole requests
 
-ANSWERER = Answerer(DummyCatalogue(), Limits(max_points=MAX_POINTS))
+ANSWERER = Answerer(DummyCatalogue(), Settings(max_points=MAX_POINTS))
 DOCUMENTS = {
     "points": POINTS.tolist(),
     "point_cloud2": POINT_CLOUD2 | {"data": base64_of(POINT_CLOUD2["data"])},

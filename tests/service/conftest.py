@@ -200,7 +200,7 @@ ASK = """
 import os, socket, sys
 with socket.socket(socket.AF_UNIX) as asking:
     asking.connect(sys.argv[1])
-    socket.send_fds(asking, [sys.argv[2].encode()], [0])
+    socket.send_fds(asking, ["\\n".join(sys.argv[2:]).encode()], [0])
     os.close(0)
     asking.recv(1)
 """

@@ -28,7 +28,7 @@ FOLDER = Path()  # what a test writes into it tells what happens
 
 
 def fork_nurseries(path: str) -> None:
-    """Each who asks sends the socket of its pool and a folder, and its nursery ends with it."""
+    """Who asks sends the socket of its pool, a folder and settings; its nursery ends with it."""
     global FOLDER
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listening = socket.socket(socket.AF_UNIX)
@@ -37,16 +37,17 @@ def fork_nurseries(path: str) -> None:
     os.write(1, b"ready\n")
     while True:
         asked, _ = listening.accept()
-        folder, pools, _, _ = socket.recv_fds(asked, 4096, 1)
+        told, pools, _, _ = socket.recv_fds(asked, 2**16, 1)
         if pools and os.fork() == 0:
             listening.close()
             fcntl.fcntl(asked, fcntl.F_SETOWN, os.getpid())
             fcntl.fcntl(asked, fcntl.F_SETFL, os.O_ASYNC)  # SIGIO once who asked is gone: the end
             os.dup2(pools[0], 0)
             os.close(pools[0])
-            FOLDER = Path(folder.decode())
+            folder, settings_json = told.decode().split("\n")
+            FOLDER = Path(folder)
             try:
-                main(load)
+                main(settings_json, load)
             finally:
                 os._exit(0)
         for pool in pools:

@@ -161,7 +161,8 @@ def test_scores_are_the_same_everywhere(
 def test_too_many_voxels_are_named() -> None:
     room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
     np.save(file, room)
-    answerer = Answerer(load_catalogue(Settings(max_voxels=20_000)))
+    few = Settings(max_voxels=20_000)
+    answerer = Answerer(load_catalogue(few), few)
     job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy")
     error = answerer.answer(job).error
     assert error is not None

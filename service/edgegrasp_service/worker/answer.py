@@ -22,7 +22,7 @@ from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
+from edgegrasp_service.worker.job import Answer, Facts, Job
 from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
 
 if TYPE_CHECKING:
@@ -58,10 +58,10 @@ def describe(catalogue: "ModelCatalogue") -> list[dict[str, Any]]:
 class Answerer:
     """Answers jobs with the detectors of a catalogue; keeps nothing of one for the next."""
 
-    def __init__(self, catalogue: "ModelCatalogue", limits: Limits | None = None) -> None:
-        """Wrap a catalogue; `limits` bound every request."""
+    def __init__(self, catalogue: "ModelCatalogue", settings: Settings) -> None:
+        """Wrap a catalogue; the settings bound every request."""
         self._catalogue = catalogue
-        self._limits = limits or Limits()
+        self._settings = settings
 
     def answer(self, job: Job) -> Answer:
         """Decode a job, detect, and encode the answer.
@@ -72,7 +72,7 @@ class Answerer:
         Raises:
             MemoryError: There is not enough; the process is better replaced.
         """
-        work = _Work(job, self._catalogue, self._limits)
+        work = _Work(job, self._catalogue, self._settings)
         try:
             return Answer(work.answer(), work.facts)
         except EdgeGraspError as error:
@@ -90,13 +90,13 @@ class Answerer:
 class _Work:
     """One job on its way to an answer."""
 
-    def __init__(self, job: Job, catalogue: "ModelCatalogue", limits: Limits) -> None:
+    def __init__(self, job: Job, catalogue: "ModelCatalogue", settings: Settings) -> None:
         self.facts = Facts()
         self.options: DetectOptions | None = None  # known once they are parsed
         self._job = job
         self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
-        self._limits = limits
+        self._settings = settings
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
@@ -132,15 +132,15 @@ class _Work:
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
-        limits = self._limits
+        settings = self._settings
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
         for name in ("approach_points", "candidates"):
-            most = getattr(limits, f"max_{name}")
+            most = getattr(settings, f"max_{name}")
             _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
         detector = self._catalogue.get(options.model)
-        given = {} if self._job.method == "DetectGrasps" else _given(fields, limits)
-        cloud, options = decode_cloud(fields, options, limits.max_points)
+        given = {} if self._job.method == "DetectGrasps" else _given(fields, settings)
+        cloud, options = decode_cloud(fields, options, settings.max_points)
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
@@ -161,7 +161,7 @@ class _Work:
             self.facts.seconds[name] = time.monotonic() - start
 
 
-def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]:
+def _given(fields: Mapping[str, Any], settings: Settings) -> dict[str, NDArray[Any]]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
@@ -170,10 +170,10 @@ def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]
         raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
-        given = decode_array(name, given, limits.max_points)
+        given = decode_array(name, given, settings.max_points)
     rows = given.shape[0] if given.ndim else 0
     if rows <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
-        _limit(name, rows, limits.max_candidates)
+        _limit(name, rows, settings.max_candidates)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}

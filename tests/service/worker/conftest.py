@@ -8,6 +8,7 @@ from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.errors import Problem
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import Answerer
 from edgegrasp_service.worker.job import Answer, Job
 
@@ -64,12 +65,12 @@ class GrpcAsker(Asker):
 
 @pytest.fixture(scope="session")
 def rest() -> RestAsker:
-    return RestAsker(Answerer(DummyCatalogue()))
+    return RestAsker(Answerer(DummyCatalogue(), Settings()))
 
 
 @pytest.fixture(scope="session")
 def grpc_() -> GrpcAsker:
-    return GrpcAsker(Answerer(DummyCatalogue()))
+    return GrpcAsker(Answerer(DummyCatalogue(), Settings()))
 
 
 @pytest.fixture(params=["rest", "grpc_"])

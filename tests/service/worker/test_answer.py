@@ -1,15 +1,16 @@
 """The Answerer: the same answer over both transports, facts, deadlines and faults."""
 
+import io
 import json
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 from benchmarks.dummy import DummyCatalogue
 
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.job import Answer, Job
+from edgegrasp_service.worker.job import Answer, Job, pack, receive
 
 
 class FailingCatalogue(DummyCatalogue):
@@ -34,9 +35,14 @@ def job(points: np.ndarray, remaining: float = 30.0, **options: Any) -> Job:
     return Job("DetectGrasps", "http", body, remaining, "application/json")
 
 
+def sent(message: Any) -> Any:
+    """As it is at the other end."""
+    return receive(io.BytesIO(b"".join(pack(message))))
+
+
 def test_facts(points: np.ndarray) -> None:
-    asked = pickle.loads(pickle.dumps(job(points, top_k=3)))
-    answer: Answer = pickle.loads(pickle.dumps(Answerer(DummyCatalogue()).answer(asked)))
+    asked = sent(job(points, top_k=3))
+    answer: Answer = sent(Answerer(DummyCatalogue(), Settings()).answer(asked))
     facts = answer.facts
     assert (facts.model, facts.points, facts.grasps) == ("dummy", 60, 3)
     assert list(facts.seconds) == ["decode", "prepare", "network", "finish", "encode"]
@@ -45,17 +51,17 @@ def test_facts(points: np.ndarray) -> None:
 
 
 def test_the_deadline_is_kept_between_stages(points: np.ndarray) -> None:
-    late = Answerer(DummyCatalogue(0.2)).answer(job(points, remaining=0.1))
+    late = Answerer(DummyCatalogue(0.2), Settings()).answer(job(points, remaining=0.1))
     assert late.error is not None
     assert late.error.kind == "deadline-exceeded"
     assert late.facts.points == 60  # known as far as it came
-    passed = Answerer(DummyCatalogue()).answer(job(points, remaining=-1.0))
+    passed = Answerer(DummyCatalogue(), Settings()).answer(job(points, remaining=-1.0))
     assert passed.error is not None
     assert passed.facts.seconds == {}
 
 
 def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
-    answerer = Answerer(FailingCatalogue(ZeroDivisionError("a secret")))
+    answerer = Answerer(FailingCatalogue(ZeroDivisionError("a secret")), Settings())
     answer = answerer.answer(job(points, seed=7))
     assert answer.error is not None
     assert (answer.error.kind, answer.error.status) == ("detector-failed", 500)
@@ -69,4 +75,4 @@ def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
 )
 def test_a_process_without_memory_says_so(points: np.ndarray, error: Exception) -> None:
     with pytest.raises(MemoryError):
-        Answerer(FailingCatalogue(error)).answer(job(points))
+        Answerer(FailingCatalogue(error), Settings()).answer(job(points))
