@@ -84,20 +84,16 @@ class Tokens:
 
 
 def load_tokens(settings: Settings) -> Tokens:
-    """The tokens of settings and of the files they name.
+    """The tokens of the files that the settings name.
 
     Raises:
         InvalidSettings: A file cannot be read, or what it holds is no token.
     """
-    known: list[Token] = []
-    for prefix in ("", "admin_"):
-        secrets = getattr(settings, f"{prefix}tokens")
-        known += _tokens(f"{prefix}tokens", [secret.get_secret_value() for secret in secrets])
-        known += _from_file(f"{prefix}token_file", getattr(settings, f"{prefix}token_file"))
-    return Tokens(known)
+    tokens = _read_tokens("token_file", settings.token_file)
+    return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
 
 
-def _from_file(setting: str, path: Path | None) -> list[Token]:
+def _read_tokens(setting: str, path: Path | None) -> list[Token]:
     if path is None:
         return []
     try:
@@ -106,15 +102,11 @@ def _from_file(setting: str, path: Path | None) -> list[Token]:
         raise InvalidSettings(
             f"{setting}: got {str(path)!r}. It cannot be read: {error}."
         ) from None
-    tokens = _tokens(setting, [line for line in lines if line and not line.startswith("#")])
-    if not tokens:
-        raise InvalidSettings(f"{setting}: got {str(path)!r}. It holds no token; write one a line.")
-    return tokens
-
-
-def _tokens(setting: str, lines: list[str]) -> list[Token]:
-    tokens = []
-    for number, line in enumerate(lines, 1):
+    tokens: list[Token] = []
+    for line in lines:
+        if not line or line.startswith("#"):
+            continue
+        number = len(tokens) + 1
         name, text = _NAMED.fullmatch(line).groups()  # type: ignore[union-attr]  # anything matches
         if not _TOKEN.fullmatch(text):
             raise InvalidSettings(
@@ -123,6 +115,8 @@ def _tokens(setting: str, lines: list[str]) -> list[Token]:
             )
         is_admin = setting.startswith("admin")
         tokens.append(Token(name or f"{setting} {number}", _digest(text), is_admin))
+    if not tokens:
+        raise InvalidSettings(f"{setting}: got {str(path)!r}. It holds no token; write one a line.")
     return tokens
 
 

@@ -1,28 +1,20 @@
 """Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
+import json
 import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, SecretStr, ValidationError, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    SettingsError,
-    TomlConfigSettingsSource,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
-CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
-# No one may see these, nor give them as flags, which every user of a machine can see.
-SECRETS = ("tokens", "admin_tokens")
+NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
+LISTS = ("weights", "grippers")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
@@ -31,15 +23,10 @@ Wait = Annotated[float, Field(ge=0.0, le=3600.0)]  # seconds
 Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
 
 
-class Settings(BaseSettings):
-    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`.
+class Settings(BaseModel):
+    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
 
-    Made directly, it takes arguments and defaults only; `load_settings` knows every source.
-    """
-
-    model_config = SettingsConfigDict(
-        env_prefix=PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = Field("127.0.0.1", description="address both transports bind to")
     http_port: Port = Field(8000, description="0: any free port")
@@ -121,15 +108,11 @@ class Settings(BaseSettings):
     tls_client_ca: Path | None = Field(
         None, description="PEM file: CAs of clients, which must then show a certificate"
     )
-    tokens: tuple[SecretStr, ...] = Field(
-        (), description="bearer tokens, one of which a request must carry; none: no need"
-    )
-    token_file: Path | None = Field(None, description="file of further tokens, one a line")
-    admin_tokens: tuple[SecretStr, ...] = Field(
-        (), description="tokens that may reload weights too; none: SIGHUP only"
+    token_file: Path | None = Field(
+        None, description="bearer tokens, one a line, which requests must carry; none: no need"
     )
     admin_token_file: Path | None = Field(
-        None, description="file of further admin tokens, one a line"
+        None, description="tokens that may reload weights too, one a line; none: SIGHUP only"
     )
     grace_seconds: Wait = Field(
         10.0, description="time for requests in flight when stopping, seconds"
@@ -146,18 +129,6 @@ class Settings(BaseSettings):
             raise ValueError("tls_client_ca needs tls_certificate and tls_key")
         return self
 
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Arguments only; `load_settings` reads the file and the environment when it is called."""
-        return (init_settings,)
-
 
 def load_settings(config: Path | None = None, **given: object) -> Settings:
     """Settings from defaults, a TOML file, the environment and arguments, the latter winning.
@@ -171,19 +142,16 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
     """
     named = os.environ.get(CONFIG_VARIABLE)
     path = config or (Path(named) if named else None)
-    sources = {"a flag": given}
+    sources = {"a flag": given, "the environment": _read_environment()}
+    if path is not None:
+        sources[str(path)] = _read_file(path)
+    merged: dict[str, Any] = {}
+    for fields in reversed(sources.values()):
+        merged |= fields
     try:
-        sources["the environment"] = _read_environment()
-        if path is not None:
-            sources[str(path)] = _read_file(path)
-        merged: dict[str, Any] = {}
-        for fields in reversed(sources.values()):
-            merged |= fields
         return Settings(**merged)
     except ValidationError as error:
         raise InvalidSettings(_sentence(error, sources)) from None
-    except SettingsError as error:
-        raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
 
 
 def _read_file(path: Path) -> dict[str, Any]:
@@ -191,7 +159,7 @@ def _read_file(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InvalidSettings(f"config: got {str(path)!r}. There is no such file.")
     try:
-        fields = TomlConfigSettingsSource(Settings, path).toml_data
+        fields = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise InvalidSettings(f"config: {path}: {error}.") from None
     return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
@@ -208,18 +176,21 @@ def _located(name: str, value: Any, folder: Path) -> Any:
 
 
 def _read_environment() -> dict[str, Any]:
-    """The settings in EDGEGRASP_* variables, and names that are none."""
-    names = [name.upper() for name, value in os.environ.items() if value]
-    ours = {name.removeprefix(PREFIX).lower(): name for name in names if name.startswith(PREFIX)}
-    for name, variable in ours.items():
-        known = name in Settings.model_fields or variable == CONFIG_VARIABLE
-        if not known and not variable.startswith(CLIENT_PREFIX):
-            raise InvalidSettings(f"{one_line(variable)}: no such setting.")
-    return EnvSettingsSource(Settings)()
+    """The settings in EDGEGRASP_* variables, and names that are none; lists are JSON."""
+    fields: dict[str, Any] = {}
+    for variable, text in os.environ.items():
+        if not text or not variable.startswith(PREFIX) or variable.startswith(NO_SETTINGS):
+            continue
+        name = variable.removeprefix(PREFIX).lower()
+        try:
+            fields[name] = json.loads(text) if name in LISTS else text
+        except ValueError:
+            raise InvalidSettings(f"{variable}: got {text!r}. Write lists as JSON.") from None
+    return fields
 
 
 def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str:
-    """The first thing wrong and where it is set; never the value of a secret."""
+    """The first thing wrong and where it is set."""
     first = error.errors(include_url=False)[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
@@ -228,9 +199,8 @@ def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str
     origin = next(source for source, fields in sources.items() if name in fields)
     if first["type"] == "extra_forbidden":
         return f"{one_line(name)}: no such setting. It comes from {origin}."
-    got = "a secret" if name in SECRETS else repr(first["input"])
     path = ".".join(str(part) for part in first["loc"])
-    return f"{path}: got {got}. {message}. It comes from {origin}."
+    return f"{path}: got {first['input']!r}. {message}. It comes from {origin}."
 
 
 def one_line(text: str) -> str:

@@ -241,6 +241,10 @@ async def begin(
             if call.method in ("DetectGrasps", "ScoreGrasps") or call.in_stream:
                 calls.append(call)
 
+        for name in ("token", "admin_token"):
+            if tokens := given.pop(f"{name}s", None):
+                given[f"{name}_file"] = folder / name
+                (folder / name).write_text("\n".join(tokens))
         server = Server(Settings(**(ours | given)), [note], (*nursery, str(folder)))
         opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
         serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))

@@ -218,12 +218,18 @@ async def test_the_health_check_waits_for_weights(begin) -> None:
         ({"host": "::1"}, []),
         ({"host": "localhost"}, []),
         ({"host": "0.0.0.0"}, ["nothing is encrypted", "asks nobody who"]),
-        ({"host": "robot.example", "tokens": [USER]}, ["nothing is encrypted"]),
+        ({"host": "robot.example", "token_file": "tokens"}, ["nothing is encrypted"]),
     ],
 )
 def test_a_server_that_others_can_reach_warns(
-    given: dict[str, Any], warned: list[str], caplog: pytest.LogCaptureFixture
+    given: dict[str, Any],
+    warned: list[str],
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("tokens").write_text(USER)
     warn(Settings(**given))
     assert len(caplog.messages) == len(warned)
     assert all(said in message for said, message in zip(warned, caplog.messages, strict=True))

@@ -16,7 +16,7 @@ from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
-from edgegrasp_service.settings import SECRETS, Settings
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
 from edgegrasp_service.worker.process import LOST
 
@@ -227,7 +227,7 @@ class _Nursery:
         control, theirs = socket.socketpair()
         with theirs:
             environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-            told = settings.model_dump_json(exclude=set(SECRETS))
+            told = settings.model_dump_json()
             process = subprocess.Popen([*command, told], stdin=theirs.fileno(), env=environment)
         nursery = cls(process, control)
         try:
