@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_service.schemas import GIVEN, PER_POINT
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import Answerer
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import File, decode_cloud
+from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 
 from .conftest import (
     DEPTH_IMAGE,

@@ -19,11 +19,10 @@ from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
-from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
 from edgegrasp_service.worker.job import Answer, Facts, Job
-from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
+from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue

@@ -21,11 +21,13 @@ from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Grasp, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.schemas import FILE_TYPES, DetectRequest, ScoreRequest
+from edgegrasp_service.worker.formats import FILE_FORMATS
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import File
+from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File
 
 JSON, FORM = "application/json", "multipart/form-data"
+FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
+FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
 MAX_PART_HEADER = 8192  # bytes
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
@@ -35,7 +37,7 @@ def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
     Returns:
-        Those of the body's model that were sent, JSON or File, or `cloud`, a File; and `options`.
+        Those that were sent, JSON or File, or `cloud`, a File; and `options`.
 
     Raises:
         InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
@@ -60,14 +62,13 @@ def read_request(job: Job) -> dict[str, Any]:
     if parameters:
         fix = "Send options in the part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
-    known = tuple((ScoreRequest if scores else DetectRequest).model_fields)
+    known = ("points" if media_type == JSON else "cloud", *FIELDS, *(GIVEN if scores else ()))
     if media_type == JSON:
         fields: dict[str, Any] = read_json("body", job.body)
         if not isinstance(fields, dict):
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
-        known = ("cloud", *known[1:])
         fields = _fields_of_form(job, header.get_boundary(), known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
