@@ -106,26 +106,27 @@ def log_call(call: Call) -> None:
         level = logging.WARNING
     if not requests.isEnabledFor(level):
         return
-    milliseconds = {name: round(seconds * 1e3, 1) for name, seconds in call.stages.items()}
+    facts, problem = call.facts, call.problem
     fields = {
+        "request_id": call.request_id,
         "transport": call.transport,
         "method": call.method,
         "code": call.code,
-        "error": "" if call.problem is None else call.problem.kind,
-        "detail": "" if call.problem is None else call.problem.detail,
+        "error": problem and problem.kind,
+        "detail": problem and problem.detail,
         "seconds": round(call.seconds, 6),
         "peer": call.peer,
         "token": call.token,
         "bytes_in": call.bytes_in,
         "bytes_out": call.bytes_out,
-        "model": call.facts.model,
-        "points": call.facts.points,
-        "voxels": call.facts.voxels,
-        "grasps": call.facts.grasps,
-        "milliseconds": milliseconds,
+        "model": facts.model,
+        "points": facts.points,
+        "voxels": facts.voxels,
+        "grasps": facts.grasps,
+        "milliseconds": {name: round(took * 1e3, 1) for name, took in call.stages.items()},
     }
-    known = {name: value for name, value in fields.items() if value not in ("", 0, {})}
-    requests.log(level, "request", extra={"fields": {"request_id": call.request_id} | known})
+    known = {name: value for name, value in fields.items() if value}
+    requests.log(level, "request", extra={"fields": known})
 
 
 class JsonFormatter(logging.Formatter):
@@ -154,16 +155,14 @@ class LogQueue(logging.handlers.QueueHandler):
         dropped: Lines that no one will read: the disk is full, the stream closed or not read.
     """
 
-    def __init__(self, stream: TextIO | None, formatter: logging.Formatter) -> None:
-        super().__init__(queue.Queue(MAX_WAITING))
-        self.setFormatter(formatter)
+    def __init__(self, stream: TextIO | None) -> None:
+        self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING)
+        super().__init__(self._lines)
+        self.setFormatter(JsonFormatter())
         self.dropped = 0
-        self._closed = False
         self._stream = stream
-        writer = logging.Handler()
-        writer.handle = self._write  # type: ignore[method-assign, assignment]
-        self._listener = logging.handlers.QueueListener(self.queue, writer)
-        self._listener.start()
+        self._writer = threading.Thread(target=self._write, daemon=True)
+        self._writer.start()
 
     def prepare(self, record: logging.LogRecord) -> str:
         """The line of a record, while its request is known."""
@@ -178,20 +177,14 @@ class LogQueue(logging.handlers.QueueHandler):
 
     def close(self) -> None:
         """Write what is queued, unless nobody reads it."""
-        if self._closed:
-            return
-        self._closed = True
-        stop = threading.Thread(target=self._stop, daemon=True)
-        stop.start()
-        stop.join(STOP_SECONDS)
+        with contextlib.suppress(queue.Full):
+            self._lines.put(None, timeout=STOP_SECONDS)
+            self._writer.join(STOP_SECONDS)
         super().close()
 
-    def _stop(self) -> None:
-        with contextlib.suppress(queue.Full):
-            self._listener.stop()
-
-    def _write(self, line: str) -> None:
-        self.dropped += not write_line(self._stream, line)
+    def _write(self) -> None:
+        for line in iter(self._lines.get, None):
+            self.dropped += not write_line(self._stream, line)
 
 
 def write_line(stream: TextIO | None, line: str) -> bool:
@@ -217,7 +210,7 @@ def write_line(stream: TextIO | None, line: str) -> bool:
 
 def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
     """Send every record of this process to a stream; close what is returned when it ends."""
-    handler = LogQueue(stream, JsonFormatter())
+    handler = LogQueue(stream)
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     return handler

@@ -74,7 +74,7 @@ class Settings(BaseModel):
         4, le=1024, description="most requests of one stream read ahead"
     )
     max_connections: Count = Field(
-        512, le=65536, description="most HTTP connections open at a time"
+        512, le=65536, description="most connections open at a time, of HTTP and of gRPC each"
     )
     max_request_seconds: float = Field(
         120.0,

@@ -291,6 +291,15 @@ async def test_connections_are_bounded(serve) -> None:
     assert b" 429 " in answer.splitlines()[0]
     for connection in (*held, extra):
         connection.close()
+    opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes.fromhex("000000040000000000")
+    said = []
+    for _ in range(4):
+        held.append(http_socket(f"http://{running.server.grpc_address}"))
+        held[-1].sendall(opening)
+        said.append(await asyncio.to_thread(held[-1].recv, 4096))
+    assert [bool(answer) for answer in said] == [True, True, True, False]
+    for connection in held:
+        connection.close()
     async with httpx.AsyncClient(base_url=url) as http:
         for _ in range(100):  # until the server has seen them go
             with contextlib.suppress(httpx.HTTPError):

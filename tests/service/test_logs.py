@@ -141,7 +141,7 @@ def test_lines_not_written_are_counted(name: str) -> None:
             read, write = os.pipe()
             os.close(read)
             stream = ends.enter_context(os.fdopen(write, "w"))
-        writer = LogQueue(stream, JsonFormatter())
+        writer = LogQueue(stream)
         for _ in range(3):
             writer.handle(logging.makeLogRecord({"msg": "lost"}))
         writer.handle(logging.makeLogRecord({"msg": "%d", "args": ("no number",)}))
@@ -164,7 +164,7 @@ def test_an_unusable_request_id_is_replaced(given_id: str) -> None:
 
 
 def test_a_fault_is_logged_with_its_traceback_and_request() -> None:
-    queue = LogQueue(None, JsonFormatter())
+    queue = LogQueue(None)
     CALL.set(Call("http", "DetectGrasps", "mine"))
     try:
         raise ValueError("why")
