@@ -4,11 +4,10 @@ A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 """
 
 import gc
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from email.message import Message
-from email.parser import HeaderParser
 from functools import partial
 from pathlib import PurePath
 from typing import Any
@@ -16,6 +15,9 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import orjson
+from werkzeug.exceptions import HTTPException
+from werkzeug.formparser import MultiPartParser
+from werkzeug.http import parse_options_header
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
@@ -29,7 +31,6 @@ JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
 FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
-MAX_PART_HEADER = 8192  # bytes
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
@@ -44,8 +45,8 @@ def read_request(job: Job) -> dict[str, Any]:
             there are query parameters beside one that has its own options.
         UnsupportedMediaType: There is no reader for the content type.
     """
-    header = _header(f"Content-Type: {job.content_type}")
-    media_type = job.content_type.partition(";")[0].strip().lower()
+    media_type, named = parse_options_header(job.content_type)
+    media_type = media_type.lower()
     scores = job.method == "ScoreGrasps"
     accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
     if media_type not in accepted:
@@ -69,7 +70,7 @@ def read_request(job: Job) -> dict[str, Any]:
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
-        fields = _fields_of_form(job, header.get_boundary(), known)
+        fields = _fields_of_form(job.body, named.get("boundary", ""), known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
@@ -179,10 +180,10 @@ def _value(name: str, text: str) -> object:
 # Forms
 
 
-def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> dict[str, Any]:
+def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[str, Any]:
     """Files as File, other parts as the JSON that they hold."""
     fields: dict[str, Any] = {}
-    for name, file_format, data in _parts(job.body, boundary, len(known) + 1):
+    for name, file_format, data in _parts(body, boundary, len(known) + 1):
         _refuse_unknown([name], known, "part")
         if name in fields:
             raise InvalidRequest(name, "two parts", "Send one.")
@@ -196,46 +197,25 @@ def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> d
     return fields
 
 
-def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[tuple[str, str | None, bytes]]:
+def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | None, bytes]]:
     """Name, file format (None: no file) and data of the parts of a multipart body.
 
-    What is no such body costs no more than one look at it.
+    The format is what a part's content type names, or else its file name's ending.
     """
-    if not boundary:
-        raise _no_form("no boundary in its Content-Type")
-    delimiter = b"\r\n--" + boundary.encode("utf-8", "replace")
-    pieces = (b"\r\n" + body).split(delimiter, most + 1)
-    for piece in pieces[1:]:
-        if piece.startswith(b"--"):
-            return
-        if len(pieces) > most + 1:
-            raise _no_form(f"more than {most} parts")
-        padding, _, rest = piece.partition(b"\r\n")
-        end = rest.find(b"\r\n\r\n", 0, MAX_PART_HEADER)
-        if padding.strip(b" \t") or end < 0:
-            raise _no_form("a part without a header of its own")
-        header = _header(rest[:end].decode("utf-8", "replace"))
-        name = header.get_param("name", header="Content-Disposition")
-        if not isinstance(name, str):
-            raise _no_form("a part without a name")
-        yield name, _format_of(header), rest[end + 4 :]
-    raise _no_form("no boundary at its end")
-
-
-def _no_form(fault: str) -> InvalidRequest:
-    fix = "Send a file part `cloud` and a JSON part `options`."
-    return InvalidRequest("body", f"a form that cannot be read ({fault})", fix)
-
-
-def _header(text: str) -> Message:
-    whole_characters = text.encode("utf-8", "replace").decode()
-    return HeaderParser().parsestr(whole_characters, headersonly=True)
-
-
-def _format_of(header: Message) -> str | None:
-    """The format a part's content type names, or else its file name's ending; None: no file."""
-    file_name = header.get_filename()
-    if file_name is None:
-        return None
-    suffix = PurePath(file_name.replace("\0", "")).suffix
-    return FILE_TYPES.get(header.get_content_type()) or suffix[1:].lower()
+    parser = MultiPartParser(
+        lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # it is called so
+        max_form_memory_size=None,
+        max_form_parts=most,
+    )
+    try:
+        if not boundary:
+            raise ValueError("no boundary in its Content-Type")
+        form, files = parser.parse(io.BytesIO(body), boundary.encode("utf-8", "replace"), len(body))
+    except (ValueError, HTTPException) as error:
+        fix = "Send a file part `cloud` and a JSON part `options`."
+        raise InvalidRequest("body", f"a form that cannot be read ({error})", fix) from None
+    for name, text in form.items(multi=True):
+        yield str(name), None, text.encode()
+    for name, file in files.items(multi=True):
+        suffix = PurePath((file.filename or "").replace("\0", "")).suffix
+        yield str(name), FILE_TYPES.get(file.mimetype) or suffix[1:].lower(), file.read()
