@@ -34,9 +34,7 @@ class Settings(BaseModel):
     weights: tuple[Path, ...] = Field(
         (), description="weights files or folders of them, besides those that ship"
     )
-    grippers: tuple[Path, ...] = Field(
-        (), description="gripper files (.toml), named by their stem in requests"
-    )
+    grippers: tuple[Path, ...] = Field((), description="gripper files (.toml), named by their stem")
     default_model: str = Field("", description="weights used when a request names none")
     device: str = Field(
         "cpu",
@@ -48,56 +46,33 @@ class Settings(BaseModel):
     )
     max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
     max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
-    max_approach_points: Count = Field(
-        256, le=256, description="most approach points a request may ask for"
-    )
-    max_candidates: Count = Field(
-        16_000, le=16_000, description="most candidates a request may ask for"
-    )
-    workers: int = Field(
-        0, ge=0, le=1024, description="processes that detect, each with one thread; 0: one a core"
-    )
+    max_approach_points: Count = Field(256, le=256, description="most that a request may ask for")
+    max_candidates: Count = Field(16_000, le=16_000, description="most that a request may ask for")
+    workers: int = Field(0, ge=0, le=1024, description="processes that detect; 0: one a core")
     max_worker_bytes: int = Field(
-        3 * 1024 * MIB,
-        ge=64 * MIB,
-        description="memory a worker may take for its request; one that needs more is replaced",
+        3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may take for its request"
     )
     max_queue_length: int = Field(
         32, ge=0, le=65536, description="most requests in the server beside those at work"
     )
-    max_held_bytes: Size = Field(
-        512 * MIB,
-        description="most bytes of bodies held at a time; who comes then waits to be read",
-    )
+    max_held_bytes: Size = Field(512 * MIB, description="most bytes of bodies held at a time")
     max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
-    max_stream_requests: Count = Field(
-        4, le=1024, description="most requests of one stream read ahead"
-    )
+    max_stream_requests: Count = Field(4, le=1024, description="most of one stream read ahead")
     max_connections: Count = Field(
         512, le=65536, description="most connections open at a time, of HTTP and of gRPC each"
     )
     max_request_seconds: float = Field(
-        120.0,
-        gt=0.0,
-        le=86400.0,
-        description="longest a request may take, where the caller sets no shorter deadline",
+        120.0, gt=0.0, le=86400.0, description="longest a request may take, whatever its deadline"
     )
     read_seconds: Timeout = Field(
-        10.0,
-        description="time for a gRPC message, or for an HTTP body at min_bytes_per_second and more",
+        10.0, description="time for a body to arrive, and more at min_bytes_per_second"
     )
     write_seconds: Timeout = Field(
         10.0, description="time for an answer to be taken, and more at min_bytes_per_second"
     )
-    min_bytes_per_second: Count = Field(
-        50_000, description="slowest that bodies and answers may be sent"
-    )
-    record_folder: Path | None = Field(
-        None, description="folder that requests and answers are recorded in; none: not"
-    )
-    record_bytes: Size = Field(
-        1024 * MIB, description="most bytes recorded; the oldest are deleted"
-    )
+    min_bytes_per_second: Count = Field(50_000, description="slowest that bodies and answers go")
+    record_folder: Path | None = Field(None, description="folder to record requests and answers in")
+    record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
     max_header_bytes: int = Field(
         32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
@@ -114,9 +89,7 @@ class Settings(BaseModel):
     admin_token_file: Path | None = Field(
         None, description="tokens that may reload weights too, one a line; none: SIGHUP only"
     )
-    grace_seconds: Wait = Field(
-        10.0, description="time for requests in flight when stopping, seconds"
-    )
+    grace_seconds: Wait = Field(10.0, description="for requests in flight when stopping, seconds")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="least severe records logged"
     )

@@ -109,7 +109,6 @@ DESCRIBED = [
     (Problem("payload-too-large", Code.RESOURCE_EXHAUSTED, 413), PayloadTooLargeError),
     (Problem("unauthenticated", Code.UNAUTHENTICATED, 401), AccessDeniedError),
     (Problem("permission-denied", Code.PERMISSION_DENIED, 403), AccessDeniedError),
-    (Problem("decoder-missing", Code.UNIMPLEMENTED, 501), ServerFailedError),
     (Problem("detector-failed", Code.INTERNAL, 500), ServerFailedError),
     (AWAY, ServerUnavailableError),
     (BUSY, OverloadedError),

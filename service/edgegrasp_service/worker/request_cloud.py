@@ -81,7 +81,6 @@ def decode_cloud(
     Raises:
         InvalidRequest: It cannot be decoded, or the same thing is sent twice.
         PayloadTooLarge: More than `max_points` points.
-        DecoderMissing: The reader of the file's format is not installed.
         UnsupportedMediaType: There is no reader for the file's format.
     """
     source = _source(fields)
@@ -328,37 +327,24 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
 def _record(layout: PointCloud2) -> np.dtype[Any]:
     """The layout of a point, with the fields that are read."""
     order = ">" if layout.is_bigendian else "<"
-    found: dict[str, tuple[str, int]] = {}
-    for row, field in enumerate(layout.fields):
-        here = f"point_cloud2.fields.{row}"
-        kind = order + POINT_TYPES[field.datatype]
-        size = np.dtype(kind).itemsize * max(1, field.count)
-        if field.offset + size > layout.point_step:
-            value = f"{field.name!r} of {size} bytes at {field.offset}"
-            fix = f"Send fields within point_step = {layout.point_step}."
-            raise InvalidRequest(f"{here}.offset", value, fix)
-        if field.name in found:
-            raise InvalidRequest(f"{here}.name", repr(field.name), "Send it once.")
-        if field.name in ("x", "y", "z") and (field.datatype not in (7, 8) or field.count > 1):
-            value = f"{field.datatype} with count {field.count} for {field.name!r}"
-            raise InvalidRequest(
-                f"{here}.datatype", value, "Send one 7 (float32) or 8 (float64), metres."
-            )
-        if field.count <= 1:
-            found[field.name] = (kind, field.offset)
-    missing = [axis for axis in "xyz" if axis not in found]
-    if missing:
-        value = ", ".join(found)[:80] or "no single numbers"
-        raise InvalidRequest("point_cloud2.fields", value, f"Send {', '.join(missing)} too.")
-    names = [name for name in PCL_FIELDS if name in found]
-    return np.dtype(
-        {
-            "names": names,
-            "formats": [found[name][0] for name in names],
-            "offsets": [found[name][1] for name in names],
-            "itemsize": layout.point_step,
-        }
-    )
+    found = [field for field in layout.fields if field.name in PCL_FIELDS and field.count <= 1]
+    kinds = {field.name: field.datatype for field in found}
+    if missing := [axis for axis in "xyz" if kinds.get(axis) not in (7, 8)]:
+        value = ", ".join(f"{field.name} of type {field.datatype}" for field in layout.fields)
+        fix = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
+        raise InvalidRequest("point_cloud2.fields", value[:80], fix)
+    try:
+        return np.dtype(
+            {
+                "names": [field.name for field in found],
+                "formats": [order + POINT_TYPES[field.datatype] for field in found],
+                "offsets": [field.offset for field in found],
+                "itemsize": layout.point_step,
+            }
+        )
+    except ValueError as error:  # a name that is there twice, a field beyond point_step
+        fix = f"Send each field once, within point_step = {layout.point_step}."
+        raise InvalidRequest("point_cloud2.fields", str(error), fix) from None
 
 
 # Depth images
