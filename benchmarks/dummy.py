@@ -133,8 +133,9 @@ class DummyCatalogue:
 
     def describe(self) -> list[dict[str, Any]]:
         """The facts of the dummy."""
-        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
-        return [facts | {"device": "cpu"}]
+        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "device": "cpu"}
+        sizes = {"digest": "", "parameters": 0, "crop_radius": 0.0, "voxel_size": 0.0}
+        return [facts | sizes | {"default": True, "hand_description": False}]
 
 
 def _top_down(point: Float32, score: float) -> Grasp:

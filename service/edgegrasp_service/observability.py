@@ -249,7 +249,7 @@ class Metrics:
         self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
         self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
         self._results = counter("stream_results", "results sent on streams", ("code",))
-        self._workers = counter("workers_replaced", "worker processes that died")
+        self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
         self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
@@ -270,10 +270,6 @@ class Metrics:
     def reloaded(self, succeeded: bool) -> None:
         """Count a reload."""
         self._reloads.labels("succeeded" if succeeded else "failed").inc()
-
-    def worker_replaced(self) -> None:
-        """Count a worker that died."""
-        self._workers.inc()
 
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Show a number that is asked for when metrics are read."""

@@ -62,7 +62,7 @@ class Server:
         self._settings = settings
         self._tls = load_tls(settings)
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, nursery, self.metrics.worker_replaced)
+        self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
         self._recorder: Recorder | None = None
         if settings.record_folder is not None:
             self._recorder = Recorder(settings.record_folder, settings.record_bytes)
@@ -188,7 +188,7 @@ class _LoopErrors:
         self._next = 0.0
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        if not isinstance(context.get("exception"), OSError):
+        if not isinstance(context.get("exception"), OSError | ValueError):
             loop.default_exception_handler(context)
         elif loop.time() >= self._next:
             self._next = loop.time() + REPEAT_SECONDS

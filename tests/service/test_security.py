@@ -21,7 +21,6 @@ from edgegrasp_client import (
     Tls,
 )
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
-from edgegrasp_service.observability import Call
 from edgegrasp_service.probe import is_ready
 from edgegrasp_service.security import load_tls
 from edgegrasp_service.server import warn
@@ -31,7 +30,6 @@ USER = "user-token-0123456789"
 ADMIN = "admin-token-0123456789"
 WRONG = "wrong-token-0123456789"
 HOST = "127.0.0.1"
-ADMINISTRATOR = Call("grpc", "ReloadModels", is_admin=True)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +105,7 @@ async def test_certificates_are_read_anew(
     async with AsyncGraspClient(address, tls=tls("", "")) as before:
         assert await before.models()
         put("other_")
-        await running.server.reloader.reload(ADMINISTRATOR)
+        await running.server.reloader.reload()
         async with AsyncGraspClient(address, tls=tls("other_", "other_")) as after:
             assert len((await after.detect(cloud)).grasps) == 10
         assert len((await before.detect(cloud)).grasps) == 10
@@ -115,7 +113,7 @@ async def test_certificates_are_read_anew(
         assert isinstance(await refused(address, tls=stranger), ServerUnavailableError)
     files["server_key"].write_text("half a k")
     with pytest.raises(ReloadFailed, match="They are no certificate with its key"):
-        await running.server.reloader.reload(ADMINISTRATOR)
+        await running.server.reloader.reload()
     async with AsyncGraspClient(address, tls=tls("other_", "other_")) as still:
         assert await still.models()
 

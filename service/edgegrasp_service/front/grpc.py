@@ -109,8 +109,7 @@ class GrpcServer:
         ]
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=options)
-        router = _Router(service, _Methods(service, reloader, self._health).behaviours())
-        self._server.add_generic_rpc_handlers((router,))
+        self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         place = f"{host}:{settings.grpc_port}"
         try:
@@ -142,17 +141,34 @@ class GrpcServer:
         await self._server.stop(grace_seconds)
 
 
-class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
-    """Every method, named, counted and logged.
+class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
+    """Those of edgegrasp.v1.GraspService, health checks and reflection; named, counted, logged."""
 
-    Args:
-        service: Told of every call.
-        behaviours: The name of the method of each path, and what it does.
-    """
-
-    def __init__(self, service: GraspService, behaviours: dict[str, tuple[str, Behaviour]]) -> None:
+    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
         self._service = service
-        self._behaviours = behaviours
+        self._reloader = reloader
+        self._checks = checks
+        names = (SERVICE.full_name, HEALTH, *REFLECTION)
+        self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
+        self._small_reads = asyncio.Semaphore(SMALL_READS)
+        self._streams = 0
+        ours: dict[str, Behaviour] = {
+            "DetectGrasps": partial(self._answer, "DetectGrasps"),
+            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
+            "DetectGraspsStream": self._stream,
+            "ListModels": self._list_models,
+            "ReloadModels": self._reload_models,
+        }
+        # By path: what a method is called in metrics and the log, and what it does.
+        self._behaviours: dict[str, tuple[str, Behaviour]] = {
+            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
+            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
+            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
+            **{
+                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
+                for name in REFLECTION
+            },
+        }
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
         """The handler of a path, also of one that there is not."""
@@ -190,38 +206,6 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
                 logger.exception("%s failed", method)
                 await _abort(context, report(error))
 
-
-class _Methods:
-    """What the methods do: those of edgegrasp.v1.GraspService, health checks and reflection."""
-
-    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
-        self._service = service
-        self._reloader = reloader
-        self._checks = checks
-        names = (SERVICE.full_name, HEALTH, *REFLECTION)
-        self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._small_reads = asyncio.Semaphore(SMALL_READS)
-        self._streams = 0
-
-    def behaviours(self) -> dict[str, tuple[str, Behaviour]]:
-        """By the methods' paths; and what each is called in metrics and the log."""
-        ours: dict[str, Behaviour] = {
-            "DetectGrasps": partial(self._answer, "DetectGrasps"),
-            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
-            "DetectGraspsStream": self._stream,
-            "ListModels": self._list_models,
-            "ReloadModels": self._reload_models,
-        }
-        return {
-            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
-            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
-            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
-            **{
-                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
-                for name in REFLECTION
-            },
-        }
-
     async def _answer(self, method: Method, context: Any) -> None:
         service = self._service
 
@@ -252,10 +236,12 @@ class _Methods:
             self._streams -= 1
 
     async def _list_models(self, context: Any) -> None:
-        await context.write(grasp_pb2.ListModelsResponse(models=self._service.models()))
+        models = [grasp_pb2.Model(**facts) for facts in self._service.models()]
+        await context.write(grasp_pb2.ListModelsResponse(models=models))
 
     async def _reload_models(self, context: Any) -> None:
-        models = await self._reloader.reload(current_call())
+        loaded = await self._reloader.reload(current_call())
+        models = [grasp_pb2.Model(**facts) for facts in loaded]
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, context: Any) -> None:

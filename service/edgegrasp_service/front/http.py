@@ -15,7 +15,6 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp.v1.grasp_pb2 import Model
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.http_protocol import problem_document
@@ -128,11 +127,11 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
 
     @app.get("/v1/models")
     async def list_models() -> Response:
-        return _models_response(service.models())
+        return JSONResponse({"models": service.models()})
 
     @app.post("/v1/models:reload")
     async def reload() -> Response:
-        return _models_response(await reloader.reload(current_call()))
+        return JSONResponse({"models": await reloader.reload(current_call())})
 
     @app.get("/health/live")
     async def live() -> Response:
@@ -244,12 +243,6 @@ def _timeout(headers: Headers) -> float:
     if not 0.0 < timeout < math.inf:
         raise InvalidRequest(TIMEOUT, brief(text), "Send seconds, such as 2.5, or leave it out.")
     return timeout
-
-
-def _models_response(models: list[Model]) -> JSONResponse:
-    names = [field.name for field in Model.DESCRIPTOR.fields]
-    facts = [{name: getattr(model, name) for name in names} for model in models]
-    return JSONResponse({"models": facts})
 
 
 def _problem_response(call: Call, problem: Problem) -> Response:

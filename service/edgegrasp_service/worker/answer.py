@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
@@ -43,15 +42,6 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
     )
     catalogue.warm_up()
     return catalogue
-
-
-def describe(catalogue: "ModelCatalogue") -> list[dict[str, Any]]:
-    """The facts of each set of weights, keyed as the fields of edgegrasp.v1.Model."""
-    known = grasp_pb2.Model.DESCRIPTOR.fields_by_name
-    return [
-        {name: value for name, value in facts.items() if name in known}
-        for facts in catalogue.describe()
-    ]
 
 
 class Answerer:

@@ -54,7 +54,7 @@ class Ready:
     """What the nursery and its workers say first."""
 
     pid: int
-    models: list[dict[str, Any]]  # as `answer.describe` gives them; of workers
+    models: list[dict[str, Any]]  # what a catalogue tells of its weights; of workers
     failure: str = ""  # why there is none after all
 
 

@@ -54,7 +54,7 @@ class WorkerPool:
         self._nursery_command = nursery
         self._replaced = replaced
         self.models: list[dict[str, Any]] = []
-        self.size = worker_count(settings)
+        self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
         # The last one in is the first one out: its caches are warm.
@@ -206,12 +206,6 @@ class WorkerPool:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-
-
-def worker_count(settings: Settings) -> int:
-    """How many workers there are: as set, or one for each core this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return settings.workers or cores or 1
 
 
 class _Nursery:

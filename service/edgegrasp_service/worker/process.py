@@ -72,7 +72,7 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
 
     def start() -> tuple[Any, list[dict[str, Any]]]:
         loaded = catalogue or load(settings)
-        return answer.Answerer(loaded, settings), answer.describe(loaded)
+        return answer.Answerer(loaded, settings), loaded.describe()
 
     return start
 
