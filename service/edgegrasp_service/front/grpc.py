@@ -183,8 +183,10 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         metadata = context.invocation_metadata() or ()
         headers = {name: value for name, value in metadata if isinstance(value, str)}
         method, behave = self._behaviours.get(path, ("other", _unimplemented))
-        with self._service.call("grpc", method, headers, _address(context.peer())) as call:
-            call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
+        request_id, peer = headers.get(REQUEST_ID_HEADER, ""), _address(context.peer())
+        call = Call("grpc", method, request_id, peer)
+        call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
+        with self._service.observe(call):
             if (remaining := context.time_remaining()) is not None:
                 call.limit(remaining)
             name = ((REQUEST_ID_HEADER, call.request_id),)
@@ -320,13 +322,8 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
 
 def _error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
     """An error as the message of edgegrasp.v1."""
-    return grasp_pb2.ErrorDetail(
-        kind=problem.kind,
-        field=problem.field,
-        value=problem.value,
-        fix=problem.fix,
-        retry_after=problem.retry_after,
-    )
+    names = [field.name for field in grasp_pb2.ErrorDetail.DESCRIPTOR.fields]
+    return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
 
 
 def _details(problem: Problem) -> list[AnyMessage]:

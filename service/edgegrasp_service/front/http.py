@@ -62,7 +62,8 @@ class HttpMiddleware:
         method = METHODS.get(path, "Docs" if path.startswith(f"{ASSETS}/") else "other")
         peer = scope["client"][0] if scope["client"] else ""
         whole = headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
-        with self._service.call("http", method, headers, peer) as call:
+        call = Call("http", method, headers.get(REQUEST_ID_HEADER, ""), peer)
+        with self._service.observe(call):
 
             async def receive_noting() -> Message:
                 nonlocal whole

@@ -166,15 +166,7 @@ class _GentleTransport:
 
 def problem_document(problem: Problem) -> bytes:
     """An error as a problem document (RFC 9457)."""
-    return orjson.dumps(
-        {
-            "type": f"urn:edgegrasp:error:{problem.kind}",
-            "title": problem.kind.replace("-", " ").capitalize(),
-            "status": problem.status,
-            "detail": problem.detail,
-            "field": problem.field,
-            "value": problem.value,
-            "fix": problem.fix,
-            "retry_after": problem.retry_after,
-        }
-    )
+    title = problem.kind.replace("-", " ").capitalize()
+    document = {"type": f"urn:edgegrasp:error:{problem.kind}", "title": title} | vars(problem)
+    del document["kind"], document["code"]
+    return orjson.dumps(document)

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -22,10 +22,10 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front.admission import Admission
-from edgegrasp_service.observability import CALL, REQUEST_ID_HEADER, Call
+from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job, Transport
+from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -89,27 +89,8 @@ class GraspService:
             raise NotReady("Weights are still loading. Try again in some seconds.")
 
     @contextmanager
-    def call(
-        self, transport: Transport, method: str, headers: Mapping[str, str], peer: str
-    ) -> Iterator[Call]:
-        """Name one call, and tell the observers when it has ended.
-
-        Args:
-            transport: The way it came.
-            method: For metrics and the log.
-            headers: By their lower-case names.
-            peer: Its address.
-
-        Yields:
-            The call; of HTTP the transport sets the `code`.
-        """
-        call = Call(transport, method, headers.get(REQUEST_ID_HEADER, ""), peer)
-        with self.observe(call):
-            yield call
-
-    @contextmanager
     def observe(self, call: Call) -> Iterator[None]:
-        """As `call`, for one that has a name, such as a request of a stream."""
+        """Work on a call, and tell the observers when it has ended; HTTP sets its `code`."""
         CALL.set(call)
         self.in_flight += 1
         try:
