@@ -121,7 +121,7 @@ def log_call(call: Call) -> None:
         "bytes_out": call.bytes_out,
         "model": facts.model,
         "points": facts.points,
-        "voxels": facts.voxels,
+        "voxels": facts.counts.get("voxels"),
         "grasps": facts.grasps,
         "milliseconds": {name: round(took * 1e3, 1) for name, took in call.stages.items()},
     }

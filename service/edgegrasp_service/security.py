@@ -161,22 +161,18 @@ class ServerTls:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.set_alpn_protocols(["http/1.1"])
-        wrong = f"tls_certificate: got {str(certificate)!r} with tls_key {str(key)!r}. "
-        wrong += "They are no certificate with its key, in PEM"
         try:
             pair, authorities = (key.read_bytes(), certificate.read_bytes()), None
             context.load_cert_chain(certificate, key, password=_refuse_encrypted_key)
             if ca is not None:
-                wrong = f"tls_client_ca: got {str(ca)!r}. It holds no certificate in PEM"
                 authorities = ca.read_bytes()
                 context.load_verify_locations(ca)
                 context.verify_mode = ssl.CERT_REQUIRED
-        except (ssl.SSLError, ValueError) as error:
-            raise InvalidSettings(f"{wrong}: {error}.") from None
-        except OSError as error:
-            names = {certificate: "tls_certificate", key: "tls_key", ca: "tls_client_ca"}
-            path = Path(error.filename)
-            raise InvalidSettings(f"{names[path]}: got {str(path)!r}. {error.strerror}.") from None
+        except (OSError, ValueError) as error:  # an SSLError too
+            files = f"tls_certificate {certificate}, tls_key {key}"
+            files += f" and tls_client_ca {ca}" if ca else ""
+            wrong = f"{files}: they cannot be read as a certificate with its key, in PEM: {error}."
+            raise InvalidSettings(wrong) from None
         return context, grpc.ssl_server_certificate_configuration([pair], authorities)
 
 

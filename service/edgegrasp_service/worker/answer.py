@@ -44,36 +44,28 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
     return catalogue
 
 
-class Answerer:
-    """Answers jobs with the detectors of a catalogue; keeps nothing of one for the next."""
+def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
+    """Decode a job, detect, and encode the answer; nothing of it is kept for the next.
 
-    def __init__(self, catalogue: "ModelCatalogue", settings: Settings) -> None:
-        """Wrap a catalogue; the settings bound every request."""
-        self._catalogue = catalogue
-        self._settings = settings
+    Returns:
+        The answer; or, for a request that cannot be answered, an empty one with its Problem.
 
-    def answer(self, job: Job) -> Answer:
-        """Decode a job, detect, and encode the answer.
-
-        Returns:
-            The answer; or, for a request that cannot be answered, an empty one with its Problem.
-
-        Raises:
-            MemoryError: There is not enough; the process is better replaced.
-        """
-        work = _Work(job, self._catalogue, self._settings)
-        try:
-            return Answer(work.answer(), work.facts)
-        except EdgeGraspError as error:
-            problem = report(error)
-        except Exception as error:
-            if _out_of_memory(error):
-                raise MemoryError(str(error)) from None
-            problem = report(error)
-            work.facts.traceback = traceback.format_exc()
-            if work.options is not None:  # rows in it may be millions
-                work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
-        return Answer(b"", work.facts, problem)
+    Raises:
+        MemoryError: There is not enough; the process is better replaced.
+    """
+    work = _Work(job, catalogue, settings)
+    try:
+        return Answer(work.answer(), work.facts)
+    except EdgeGraspError as error:
+        problem = report(error)
+    except Exception as error:
+        if _out_of_memory(error):
+            raise MemoryError(str(error)) from None
+        problem = report(error)
+        work.facts.traceback = traceback.format_exc()
+        if work.options is not None:  # rows in it may be millions
+            work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
+    return Answer(b"", work.facts, problem)
 
 
 class _Work:
@@ -92,7 +84,7 @@ class _Work:
         """The body of the answer; raises any error that there may be."""
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
         self.facts.model = result.model
-        self._count(result.counts)
+        self.facts.counts = dict(result.counts)
         with self._stage("encode"):
             body: bytes = self._encoding.write(result)
         return body
@@ -102,7 +94,7 @@ class _Work:
             detector, cloud, options, _ = self._decode()
         with self._stage("prepare"):
             prepared = detector.prepare(cloud, options)
-            self._count(prepared.counts)
+            self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
             logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
         prepared.seconds["network"] = self.facts.seconds["network"]
@@ -133,10 +125,6 @@ class _Work:
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
-
-    def _count(self, counts: Mapping[str, int]) -> None:
-        self.facts.counts = dict(counts)
-        self.facts.voxels = counts.get("voxels", 0)
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:

@@ -3,7 +3,6 @@
 A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 """
 
-import gc
 import io
 import json
 from collections import Counter
@@ -119,15 +118,10 @@ def read_json(field: str, text: bytes) -> Any:
     if lists > len(text) // 7 + MAX_SHORT_LISTS:
         value = f"{lists} lists and objects in {len(text)} bytes"
         raise InvalidRequest(field, value, "Send lists that hold numbers.")
-    collecting = gc.isenabled()
-    gc.disable()  # it would look through millions of lists again and again, and find nothing
     try:
         return json.loads(text, object_pairs_hook=partial(_object, field))
     except (ValueError, RecursionError) as error:
         raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
-    finally:
-        if collecting:
-            gc.enable()
 
 
 def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -32,7 +32,6 @@ class Facts:
 
     model: str = ""  # name of the weights
     points: int = 0  # in the cloud as sent, holes included
-    voxels: int = 0  # of the processed cloud
     grasps: int = 0  # returned, or evaluated where the caller gave them
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
     counts: dict[str, int] = field(default_factory=dict)  # what passed each stage

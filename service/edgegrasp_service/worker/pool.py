@@ -20,8 +20,8 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
 from edgegrasp_service.worker.process import LOST
 
-# -P: nothing is imported from the folder the server was started in.
 MAIN = "import sys; from edgegrasp_service.worker.process import main; main(sys.argv[1])"
+# -P: nothing is imported from the folder the server was started in.
 NURSERY = (sys.executable, "-P", "-c", MAIN)
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -60,7 +60,6 @@ class WorkerPool:
         # The last one in is the first one out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._closed = False
 
     @property
     def pids(self) -> list[int]:
@@ -137,7 +136,6 @@ class WorkerPool:
 
     def close(self) -> None:
         """End every worker, whatever it does."""
-        self._closed = True
         for task in self._tasks:
             task.cancel()
         for worker in list(self._workers):

@@ -14,6 +14,7 @@ import signal
 import socket
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
     _send(pool, Ready(os.getpid(), []))
     gc.collect()
     gc.freeze()  # collecting would write to pages that are shared
+    gc.disable()  # it would look through millions of lists of points again and again
     while True:
         _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
         if not descriptors:
@@ -61,7 +63,7 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
 
 
 def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
-    """Import and load; returns what gives each worker its answerer and facts of its models.
+    """Import and load; returns what gives each worker its `answer` and facts of its models.
 
     A GPU's context cannot be forked: with one, every worker loads the weights for itself.
     """
@@ -72,7 +74,7 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
 
     def start() -> tuple[Any, list[dict[str, Any]]]:
         loaded = catalogue or load(settings)
-        return answer.Answerer(loaded, settings), loaded.describe()
+        return partial(answer.answer, catalogue=loaded, settings=settings), loaded.describe()
 
     return start
 
@@ -80,7 +82,7 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
 def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> None:
     """Answer jobs, one after the other, until the pool closes the socket."""
     try:
-        answerer, models = start()
+        work, models = start()
     except EdgeGraspError as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
@@ -90,7 +92,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
     while (job := receive(jobs)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
-            answer: Answer = answerer.answer(job)
+            answer: Answer = work(job)
         except BaseException:  # out of memory
             facts = Facts(traceback=traceback.format_exc())
             _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
@@ -98,6 +100,7 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         _send(pool, answer)
         del job, answer  # or the next request would add to them
+        gc.collect()
 
 
 def _limit_memory(most: int) -> None:
