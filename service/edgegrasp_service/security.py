@@ -189,11 +189,6 @@ class _RenewableContext(ssl.SSLContext):
         return self.current.wrap_bio(*arguments, **named)
 
 
-def load_tls(settings: Settings) -> ServerTls | None:
-    """Of the settings; None where they name no certificate. Raises as ServerTls."""
-    return None if settings.tls_certificate is None else ServerTls(settings)
-
-
 def _refuse_encrypted_key() -> str:
     """Called for an encrypted key, in the place of a question on the terminal."""
     raise ValueError("the key is encrypted, and nobody is there to ask")

@@ -20,7 +20,7 @@ from edgegrasp_service.front.http_protocol import HttpProtocol
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder
-from edgegrasp_service.security import load_tls, load_tokens
+from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
@@ -60,7 +60,7 @@ class Server:
         nursery: Sequence[str] = NURSERY,
     ) -> None:
         self._settings = settings
-        self._tls = load_tls(settings)
+        self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
         self._recorder: Recorder | None = None
@@ -88,7 +88,6 @@ class Server:
         watch("queue_depth", waiting, lambda: max(0, admission.tickets - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(pool.pids))
-        watch("workers_resident_bytes", "memory of workers", lambda: pool.resident_bytes)
 
     async def serve(
         self,
@@ -145,7 +144,7 @@ class Server:
     async def _drain(self, grpc_server: GrpcServer) -> None:
         """Refuse new requests, and wait until those accepted are answered, or grace is over."""
         self.service.stopping.set()
-        await grpc_server.stop_serving()
+        await grpc_server.set_serving(False)
         notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
         await asyncio.sleep(notice)
         await self.service.drain(self._settings.grace_seconds - notice)

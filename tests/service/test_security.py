@@ -22,7 +22,7 @@ from edgegrasp_client import (
 )
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready
-from edgegrasp_service.security import load_tls
+from edgegrasp_service.security import ServerTls
 from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
 
@@ -134,7 +134,7 @@ def test_bad_certificates_are_named(
     files = {**pem, "text": tmp_path / "text"}
     given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
     with pytest.raises(InvalidSettings) as caught:
-        load_tls(Settings(**given))
+        ServerTls(Settings(**given))
     assert sentence in str(caught.value)
 
 
@@ -195,8 +195,7 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
     assert await asyncio.to_thread(is_ready, Settings(**given, http_port=port))
-    loaded = load_tls(Settings(**given))
-    assert loaded is not None
+    loaded = ServerTls(Settings(**given))
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
 

@@ -132,10 +132,6 @@ class GrpcServer:
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
 
-    async def stop_serving(self) -> None:
-        """Tell health checks that the server is stopping."""
-        await self._health.enter_graceful_shutdown()
-
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
         await self._server.stop(grace_seconds)

@@ -168,7 +168,7 @@ def cloud_of_records(rows: Records) -> CloudInput:
     """
     colors = _stacked(rows, "red", "green", "blue")
     for name in ("rgb", "rgba"):
-        if colors is None and name in _names(rows) and rows.dtype[name].itemsize == 4:
+        if colors is None and name in (rows.dtype.names or ()) and rows.dtype[name].itemsize == 4:
             # 0x00RRGGBB, kept in a float32 or uint32
             packed = np.ascontiguousarray(rows[name]).view(np.uint32)
             colors = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1)
@@ -179,13 +179,9 @@ def cloud_of_records(rows: Records) -> CloudInput:
 
 def _stacked(rows: Records, *names: str) -> Array | None:
     """Fields of the rows side by side; None where one of them is missing."""
-    if not {*names} <= {*_names(rows)}:
+    if not {*names} <= {*(rows.dtype.names or ())}:
         return None
     return np.stack([rows[name] for name in names], axis=-1)
-
-
-def _names(rows: Records) -> tuple[str, ...]:
-    return rows.dtype.names or ()
 
 
 def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]:

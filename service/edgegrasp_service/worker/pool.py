@@ -4,14 +4,12 @@ import asyncio
 import contextlib
 import logging
 import os
-import resource
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
@@ -70,15 +68,6 @@ class WorkerPool:
     def busy(self) -> int:
         """Workers that have a job."""
         return sum(worker.answer is not None for worker in self._workers)
-
-    @property
-    def resident_bytes(self) -> int:
-        """Memory of the workers; what they share is counted for each."""
-        pages = 0
-        for pid in self.pids:
-            with contextlib.suppress(OSError):  # it died just now, or there is no /proc
-                pages += int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-        return pages * resource.getpagesize()
 
     async def start(self) -> None:
         """Load, and start the workers; those of a start before end when they have answered.
