@@ -68,6 +68,9 @@ class RequestTimeout(_FieldError):  # noqa: N818
 class DeadlineExceeded(ServiceError):  # noqa: N818
     """The caller's deadline passed before there was an answer."""
 
+    def __init__(self, message: str = "The deadline passed before there was an answer.") -> None:
+        super().__init__(message)
+
 
 class Cancelled(ServiceError):  # noqa: N818
     """The caller is gone; nobody reads this."""

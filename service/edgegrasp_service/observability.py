@@ -93,6 +93,17 @@ MAX_WAITING = 4096  # records; more than that, and new ones are dropped
 STOP_SECONDS = 1.0
 PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
 
+LOGGED = [
+    "request_id",
+    "transport",
+    "method",
+    "code",
+    "peer",
+    "token",
+    "bytes_in",
+    "bytes_out",
+]  # of a Call
+
 requests = logging.getLogger("edgegrasp_service.requests")
 
 
@@ -107,18 +118,10 @@ def log_call(call: Call) -> None:
     if not requests.isEnabledFor(level):
         return
     facts, problem = call.facts, call.problem
-    fields = {
-        "request_id": call.request_id,
-        "transport": call.transport,
-        "method": call.method,
-        "code": call.code,
+    fields = {name: getattr(call, name) for name in LOGGED} | {
         "error": problem and problem.kind,
         "detail": problem and problem.detail,
         "seconds": round(call.seconds, 6),
-        "peer": call.peer,
-        "token": call.token,
-        "bytes_in": call.bytes_in,
-        "bytes_out": call.bytes_out,
         "model": facts.model,
         "points": facts.points,
         "voxels": facts.counts.get("voxels"),

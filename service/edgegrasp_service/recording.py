@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job, pack, receive
@@ -50,20 +49,15 @@ class Recorder:
             logger.warning("%s is not recorded: %s", job.request_id, error)
 
 
-class Replay(NamedTuple):
-    """A recorded request, answered again."""
-
-    job: Job
-    recorded: bytes  # the answer's body then; empty for an error
-    answer: Answer  # now
-
-
-def replay(path: Path, settings: Settings) -> Replay:
+def replay(path: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
     """Answer a recorded request again, in this process.
 
     Args:
         path: The file.
         settings: Weights and limits.
+
+    Returns:
+        The request, the answer that is recorded, and the answer now.
 
     Raises:
         OSError: The file cannot be read.
@@ -77,5 +71,4 @@ def replay(path: Path, settings: Settings) -> Replay:
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
         raise ValueError(f"{path} is no recorded request")
     job = replace(job, remaining=settings.max_request_seconds)
-    again = worker.answer(job, worker.load_catalogue(settings), settings)
-    return Replay(job, recorded.body, again)
+    return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)

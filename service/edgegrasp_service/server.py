@@ -187,11 +187,13 @@ class _LoopErrors:
         self._next = 0.0
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        if not isinstance(context.get("exception"), OSError | ValueError):
+        error = context.get("exception")
+        # A socket that is closed before it accepts again has no descriptor: a ValueError.
+        if not isinstance(error, OSError) and "Invalid file descriptor" not in str(error):
             loop.default_exception_handler(context)
         elif loop.time() >= self._next:
             self._next = loop.time() + REPEAT_SECONDS
-            logger.error("%s (%s)", context["message"], context["exception"])
+            logger.error("%s (%s)", context["message"], error)
 
 
 def run(settings: Settings) -> None:

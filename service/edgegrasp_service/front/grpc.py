@@ -15,8 +15,9 @@ from functools import partial
 from typing import Any, NoReturn
 
 import grpc
+from google.protobuf import any as any_message
+from google.protobuf import duration
 from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.duration_pb2 import Duration
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
@@ -326,16 +327,12 @@ def _details(problem: Problem) -> list[AnyMessage]:
     reason = problem.kind.upper().replace("-", "_")
     details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
     if problem.retry_after is not None:
-        delay = Duration()
-        delay.FromMilliseconds(int(problem.retry_after * 1000))
+        delay = duration.from_milliseconds(int(problem.retry_after * 1000))
         details.append(RetryInfo(retry_delay=delay))
     if problem.field:
         violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
         details.append(BadRequest(field_violations=[violation]))
-    packed = [AnyMessage() for _ in details]
-    for envelope, detail in zip(packed, details, strict=True):
-        envelope.Pack(detail)
-    return packed
+    return [any_message.pack(detail) for detail in details]
 
 
 # Streams: requests of one at work side by side, answered in their order

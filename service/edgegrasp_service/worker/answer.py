@@ -131,7 +131,7 @@ class _Work:
         """Time a stage; raises DeadlineExceeded instead of beginning it too late."""
         start = time.monotonic()
         if start > self._deadline:
-            raise DeadlineExceeded("The deadline passed before there was an answer.")
+            raise DeadlineExceeded()
         try:
             yield
         finally:

@@ -184,6 +184,14 @@ def _stacked(rows: Records, *names: str) -> Array | None:
     return np.stack([rows[name] for name in names], axis=-1)
 
 
+def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]], re.Match[bytes]]:
+    """The words of the lines before the last one, and where that is."""
+    end = last.search(data[:MAX_HEADER])
+    if end is None:
+        raise ValueError("no header")
+    return [line.split() for line in data[: end.start()].decode("latin-1").splitlines()], end
+
+
 def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]:
     """The layout of a point, of name, type and count of each field; "": one that is not read."""
     layout = [
@@ -243,10 +251,7 @@ PLY_HEADER_END = re.compile(rb"^end_header[ \t\r]*\n", re.MULTILINE)
 
 def _read_ply(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the vertices, and nx, ny, nz and red, green, blue where there are any."""
-    end = PLY_HEADER_END.search(data[:MAX_HEADER])
-    if end is None or not data.startswith(b"ply"):
-        raise ValueError("no header")
-    lines = [line.split() for line in data[: end.start()].decode("latin-1").splitlines()]
+    lines, end = _read_header(data, PLY_HEADER_END)
     encoding = next((line[1] for line in lines if line[:1] == ["format"]), "")
     elements = [row for row, line in enumerate(lines) if line[:1] == ["element"]]
     if not elements or encoding not in PLY_ORDERS or lines[elements[0]][1] != "vertex":
@@ -271,11 +276,8 @@ PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r
 
 def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb where there are any."""
-    end = PCD_HEADER_END.search(data[:MAX_HEADER])
-    if end is None:
-        raise ValueError("no header")
-    lines = data[: end.start()].decode("latin-1").splitlines()
-    header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    lines, end = _read_header(data, PCD_HEADER_END)
+    header = {words[0]: words[1:] for words in lines if words}
     if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
         raise ValueError(f"no line {', '.join(missing)}")
     names = header["FIELDS"]

@@ -115,8 +115,8 @@ def _source(fields: Mapping[str, Any]) -> str:
     """Which of SOURCES a request has."""
     sources = [name for name in SOURCES if fields.get(name) is not None]
     if not sources:
-        fix = "Send a list of [x, y, z] in metres, point_cloud2, depth_images or a file."
-        raise InvalidRequest("points", "nothing", fix)
+        fix = "Send points in metres, point_cloud2, depth_images or a file."
+        raise InvalidRequest("cloud", "nothing", fix)
     if len(sources) > 1:
         raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
     return sources[0]

@@ -333,7 +333,7 @@ CLOUD = part("cloud", npy(POINTS), '; filename="a.npy"')
         (form(part("cloud", npy(POINTS), '; filename="a.las"')), "format"),
         (form(part("cluod", npy(POINTS), '; filename="a.npy"')), "cluod"),
         (form(part("cloud", npy(POINTS))), "cloud"),
-        (form(part("options", b"{}", '; filename="o.json"')), "points"),
+        (form(part("options", b"{}", '; filename="o.json"')), "cloud"),
         (form(CLOUD, CLOUD), "cloud"),
         (form(CLOUD, part("options", b"{")), "options"),
         (form(CLOUD, part("options", b"[]")), "options"),
