@@ -19,8 +19,8 @@ def generate_data(
     ] = None,
     scenes: Annotated[int, Option(min=1, help="Scenes.")] = 100,
     scene: Annotated[
-        Literal["packed", "pile"] | None,
-        Option(help="Kind of the scenes; else half packed, half piles."),
+        Literal["packed", "pile", "bin", "table"] | None,
+        Option(help="Kind of the scenes; else a mixture of them all."),
     ] = None,
     views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
     grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,

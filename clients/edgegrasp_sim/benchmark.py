@@ -15,7 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from edgegrasp_sim import engine, hand, objects, scene, trial
+from edgegrasp_sim import engine, hand, objects, scene, surroundings, trial
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
@@ -30,7 +30,8 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
 CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module, for the manifest
     (engine, ("time_step", "solver_iterations", "gravity")),
-    (scene, ("table_friction", "packed_attempts", "pile_drop_height", "rest_speed")),
+    (surroundings, ("table_friction",)),
+    (scene, ("packed_attempts", "pile_drop_height", "rest_speed")),
     (objects, ("object_mass", "object_friction")),
     (hand, ("max_opening", "hand_mass", "finger_friction", "finger_spinning_friction")),
     (hand, ("finger_force", "gear_force", "tool_force", "close_seconds", "collision_depth")),

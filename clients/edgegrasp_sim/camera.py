@@ -1,4 +1,4 @@
-"""The depth camera: viewpoints, noise, the way from depth to points, and what planners are shown.
+"""The depth camera: viewpoints, the way from depth to points, and what planners are shown.
 
 The surfaces of a depth image may be resampled. Its pixels lie farther apart on a surface seen at a
 slant; a volume of signed distances, from which the reference system takes its clouds, has one point
@@ -10,11 +10,9 @@ from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import zoom
 
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.poses import Matrix
-from edgegrasp_sim.scene import SIZE, TABLE_HEIGHT
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -22,13 +20,9 @@ Float64 = NDArray[np.float64]
 
 TRUNCATION = 4  # voxels; a point farther from a surface has no signed distance
 _NEAR = 0.98  # of the truncation, within which a distance counts as one to a surface
-TableView = Literal["known", "ransac", "seen"]
-# Lowest and highest corner of where grasps are looked for; the table itself is cut off.
-WORKSPACE = np.array([[0.02, 0.02, TABLE_HEIGHT + 0.005], [SIZE - 0.02, SIZE - 0.02, SIZE]])
-_WITH_TABLE = np.array([[0.02, 0.02, TABLE_HEIGHT - 0.01], WORKSPACE[1]])
+TableView = Literal["known", "ransac", "seen", "around", "auto"]
+_ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
 _AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
-WORKSPACE_BOX = {"known": WORKSPACE, "ransac": _WITH_TABLE, "seen": WORKSPACE}
-CLOUD_BOX = {"known": WORKSPACE, "ransac": _WITH_TABLE, "seen": _WITH_TABLE + _AROUND}
 Float = TypeVar("Float", bound=np.floating)
 
 
@@ -38,13 +32,15 @@ class Observation:
 
     Attributes:
         cloud: (N, 3) float32, world frame, metres; order of the pixels, one image after another.
-        workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for.
-        table_height: metres; not to be used where `table` is `ransac`.
+        workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for; not
+            to be used where `table` is `auto`.
+        table_height: metres; not to be used where `table` is `ransac` or `auto`.
         camera_positions: (V, 3) float32, every camera, world frame, metres.
         view_ids: (N,) int32, which camera saw each point.
         table: whether the cloud is cut off above the table (`known`) or holds it too: to be found
             (`ransac`), or to correct the depth scale by (`seen`; then the cloud is not cut off at
-            the sides of the workspace either).
+            the sides of the workspace either), or with all that is around it (`around`). `auto`:
+            the same, and nothing is to be used but the cloud and the cameras.
         failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
     """
 
@@ -97,26 +93,28 @@ class ViewRange:
         return poses
 
 
-# The views of the reference evaluation, and the wider ones to draw training views from.
+# The views of the reference evaluation.
 EVALUATION_VIEWS = ViewRange((0.6, 0.75), (np.pi / 4, np.pi / 3), (0.0, np.pi))
-TRAINING_VIEWS = ViewRange((0.45, 0.75), (np.pi / 6, np.pi * 5 / 12), (0.0, 2 * np.pi))
 
 
 def look_at(eye: Matrix, target: Matrix) -> Matrix:
     """Pose of a camera at `eye` that looks at `target` with world z up in the image.
 
-    Camera axes: x to the right of the image, y down, z along the line of sight.
+    Camera axes: x to the right of the image, y down, z along the line of sight. Where that is
+    vertical, the image's x is the world's.
 
     Returns:
         `T_world_camera`, (4, 4).
 
     Raises:
-        ValueError: the line of sight is vertical, or eye and target coincide.
+        ValueError: eye and target coincide.
     """
     sight = np.asarray(target, dtype=np.float64) - eye
+    if np.linalg.norm(sight) < 1e-9:
+        raise ValueError(f"cannot look from {eye} at {target}: choose two different points")
     right = np.cross(sight, (0.0, 0.0, 1.0))
     if np.linalg.norm(right) < 1e-9:
-        raise ValueError(f"cannot look from {eye} at {target}: choose a slanted line of sight")
+        right = np.array([1.0, 0.0, 0.0])
     z = sight / np.linalg.norm(sight)
     x = right / np.linalg.norm(right)
     T = np.eye(4)
@@ -137,36 +135,12 @@ def points_of(
     return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-@dataclass(frozen=True, slots=True)
-class DepthNoise:
-    """Noise of depth images: a random factor on each, and smooth Gaussian noise on some.
-
-    Attributes:
-        gamma_shape: shape of the gamma distribution of the factor; 0: no factor.
-        gamma_scale: its scale.
-        correlated_std: standard deviation of the smooth noise, metres.
-        correlated_pixels: pixels between its independent values, interpolated in between.
-        correlated_share: share of the images that have it.
-    """
-
-    gamma_shape: float
-    gamma_scale: float
-    correlated_std: float
-    correlated_pixels: int
-    correlated_share: float
-
-    def apply(self, depth: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-        """A noisy copy of a depth image: (height, width) metres."""
-        noisy: NDArray[np.float64] = depth
-        if self.gamma_shape > 0:
-            noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)
-        if self.correlated_std > 0 and rng.random() < self.correlated_share:
-            height, width = depth.shape
-            step = self.correlated_pixels
-            coarse = rng.normal(0.0, self.correlated_std, (height // step, width // step))
-            factors = (height / coarse.shape[0], width / coarse.shape[1])
-            noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
-        return noisy
+def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
+    """What is kept of a cloud: (2, 3) lowest and highest corner, or None: all of it."""
+    if table in ("around", "auto"):
+        return None
+    box = workspace if table == "known" else workspace - _ALOFT
+    return np.asarray(box + _AROUND if table == "seen" else box)
 
 
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:

@@ -133,14 +133,24 @@ class World:
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         return Body(self.client, uid)
 
-    def add_box(self, size: Sequence[float], centre: Sequence[float], *, friction: float) -> "Body":
-        """Add an axis-aligned box that never moves; `size` is its full extent in metres."""
+    def add_box(
+        self,
+        size: Sequence[float],
+        centre: Sequence[float],
+        *,
+        friction: float,
+        yaw: float = 0.0,
+    ) -> "Body":
+        """Add a box that never moves, turned about z; `size` is its full extent in metres."""
         shape = pybullet.createCollisionShape(
             pybullet.GEOM_BOX,
             halfExtents=[0.5 * extent for extent in size],
             physicsClientId=self.client,
         )
-        uid = pybullet.createMultiBody(0.0, shape, -1, centre, physicsClientId=self.client)
+        quaternion_xyzw = [0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))]
+        uid = pybullet.createMultiBody(
+            0.0, shape, -1, centre, quaternion_xyzw, physicsClientId=self.client
+        )
         body = Body(self.client, uid)
         body.set_dynamics(friction=friction)
         return body

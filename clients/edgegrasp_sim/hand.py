@@ -1,6 +1,6 @@
 """A floating Panda hand, and a grasp with it: approach, close, retreat, and the outcome."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -106,6 +106,7 @@ def run_grasp(
     gripper: "Gripper",
     T_world_hand: Matrix,
     objects: Mapping[int, SceneObject],
+    obstacles: Set[int] = frozenset(),
     *,
     start_contact_fails: bool,
     to_the_end: bool,
@@ -117,6 +118,7 @@ def run_grasp(
         gripper: the hand to use.
         T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
         objects: what may be held, by the id of its body.
+        obstacles: ids of the bodies that a hand must not cut into: that fails the grasp at once.
         start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
         to_the_end: simulate every step, so that whatever the hand pushes aside ends up right;
             otherwise stop once the outcome is clear.
@@ -130,9 +132,18 @@ def run_grasp(
         outcome, cause = GraspOutcome.PREGRASP, FailureCause.START_COLLISION
         return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
 
+    def blocked(cause: FailureCause) -> GraspResult:
+        outcome = GraspOutcome.AFTER
+        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
+
+    if _cut_into(gripper) & obstacles:
+        return blocked(FailureCause.START_COLLISION)
     collided = False
     for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
-        collided = collided or any(c.distance < -COLLISION_DEPTH for c in gripper.body.contacts())
+        cut = _cut_into(gripper)
+        if cut & obstacles:
+            return blocked(FailureCause.APPROACH_COLLISION)
+        collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
     missed = gripper.opening <= MIN_OPENING
     caught = _touched(gripper, objects)
@@ -317,6 +328,12 @@ def _holds_when_shaken(
         for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
             gripper.move_to(T_world_lifted @ translation(*(way * along)), step_length=SHAKE_STEP)
     return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
+
+
+def _cut_into(gripper: Gripper) -> set[int]:
+    """Ids of the bodies that the hand overlaps."""
+    contacts = gripper.body.contacts()
+    return {each.other_uid for each in contacts if each.distance < -COLLISION_DEPTH}
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

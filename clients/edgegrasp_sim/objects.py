@@ -39,10 +39,21 @@ logger = logging.getLogger(__name__)
 
 
 class SceneKind(StrEnum):
-    """How a scene is made: objects stood upright one by one, or dropped on a heap."""
+    """How a scene is made.
+
+    Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, or put on a
+    table among larger things.
+    """
 
     PACKED = "packed"
     PILE = "pile"
+    BIN = "bin"
+    TABLE = "table"
+
+    @property
+    def objects(self) -> "SceneKind":
+        """The kind whose objects it is made of where it has none of its own."""
+        return {SceneKind.BIN: SceneKind.PILE, SceneKind.TABLE: SceneKind.PACKED}.get(self, self)
 
     @classmethod
     def _missing_(cls, value: object) -> Never:
@@ -113,8 +124,9 @@ class ObjectSet:
     def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name.
 
-        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), or in `root` itself
-        where there is no such folder. Where there are none, they are the meshes there, `.obj` or
+        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins and tables
+        those of piles and packed scenes where they have no such folder, or in `root` itself where
+        there is none at all. Where there are none, they are the meshes there, `.obj` or
         `.stl`: see `prepare_mesh`.
 
         Raises:
@@ -122,9 +134,10 @@ class ObjectSet:
             ValueError: two meshes have one name, or one cannot be used.
             RuntimeError: there are meshes, and what prepares them is not installed.
         """
-        folder, name = root / scene / split, f"{scene}/{split}"
-        if not folder.is_dir():
-            folder, name = root, root.name
+        folder, name = root, root.name
+        for kind in (scene.objects, scene):
+            if (root / kind / split).is_dir():
+                folder, name = root / kind / split, f"{kind}/{split}"
         urdfs = sorted(folder.glob("*.urdf"))
         if urdfs:
             return cls(name, tuple(ObjectModel(path.stem, path) for path in urdfs))
@@ -145,17 +158,21 @@ class ObjectSet:
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that ship with the engine, scaled to the hand."""
-        known = list(_BUILTIN)
+        known = [
+            (ObjectModel(name, ASSETS / file, scale), stands)
+            for name, file, scale, stands in _BUILTIN
+        ]
         for blobs, stands in ((_STANDING_BLOBS, True), (_OTHER_BLOBS, False)):
-            for number, scale in blobs.items():
-                file = f"random_urdfs/{number:03d}/{number:03d}.urdf"
-                known.append((f"blob_{number:03d}", file, scale, stands))
-        models = tuple(
-            ObjectModel(name, ASSETS / file, scale)
-            for name, file, scale, stands in known
-            if stands or scene is SceneKind.PILE
-        )
+            known += [(blob(number, scale), stands) for number, scale in blobs.items()]
+        lying = scene.objects is SceneKind.PILE
+        models = tuple(model for model, stands in known if stands or lying)
         return cls(f"builtin/{scene}", models)
+
+
+def blob(number: int, scale: float) -> ObjectModel:
+    """An object of random shape that ships with the engine, by its number below 1000."""
+    name = f"{number:03d}"
+    return ObjectModel(f"blob_{name}", ASSETS / "random_urdfs" / name / f"{name}.urdf", scale)
 
 
 def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:

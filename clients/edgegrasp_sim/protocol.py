@@ -10,12 +10,14 @@ from typing import Any, get_args
 
 import numpy as np
 
-from edgegrasp_sim import scene
-from edgegrasp_sim.camera import DepthNoise, TableView, ViewRange
+from edgegrasp_sim.camera import TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
+from edgegrasp_sim.surroundings import SIZE, TABLE_HEIGHT
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
+RANDOM_SENSOR = "random"
 SELECTIONS = ("best", "highest", "elsewhere")
 Range = tuple[float, float]
 
@@ -25,11 +27,11 @@ class SceneRules:
     """What stands on the table.
 
     Attributes:
-        workspace_size: edge of the cube, metres.
+        workspace_size: edge of the cube of packed and pile scenes, metres.
         table_height: metres.
         num_objects: how many objects to try to place, in turn from round to round.
-        packed_scale: range of the factor on the objects' size in packed scenes.
-        pile_scale: the same for piles.
+        packed_scale: range of the factor on the objects' size in packed scenes and on tables.
+        pile_scale: the same for piles and bins.
     """
 
     workspace_size: float
@@ -40,15 +42,15 @@ class SceneRules:
 
     def __post_init__(self) -> None:
         # The simulated workspace has a fixed size; a protocol only records it.
-        if (self.workspace_size, self.table_height) != (scene.SIZE, scene.TABLE_HEIGHT):
+        if (self.workspace_size, self.table_height) != (SIZE, TABLE_HEIGHT):
             raise ValueError(
                 f"workspace_size is {self.workspace_size} and table_height {self.table_height}; "
-                f"the simulator has {scene.SIZE} and {scene.TABLE_HEIGHT}"
+                f"the simulator has {SIZE} and {TABLE_HEIGHT}"
             )
 
     def scale(self, kind: SceneKind) -> Range:
         """The range of scales of a kind of scene."""
-        return self.packed_scale if kind.value == "packed" else self.pile_scale
+        return self.packed_scale if kind.objects is SceneKind.PACKED else self.pile_scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +104,21 @@ class NoiseRules(DepthNoise):
 
     Attributes:
         point_std: standard deviation of each coordinate of each point, metres.
+        sensor: kind of camera whose faults the images have besides, one of `SENSORS`; `random`:
+            another before every grasp; empty: none.
     """
 
     point_std: float
+    sensor: str = ""
+
+    def __post_init__(self) -> None:
+        if self.sensor not in ("", RANDOM_SENSOR, *SENSORS):
+            known = ", ".join((RANDOM_SENSOR, *SENSORS))
+            raise ValueError(f"sensor is {self.sensor!r}; choose one of {known}, or none")
+
+    def depth_sensor(self, rng: np.random.Generator) -> DepthSensor | None:
+        """The camera of the next view, if it is one with faults."""
+        return random_sensor(rng) if self.sensor == RANDOM_SENSOR else SENSORS.get(self.sensor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +128,9 @@ class PlanningRules:
     Attributes:
         table: `known`: the cloud is cut off above it and its plane is told; `ransac`: it is in
             the cloud and has to be found; `seen`: it is in the cloud and its plane is told, so
-            that the depth scale can be corrected.
+            that the depth scale can be corrected; `around`: all that the camera sees is in the
+            cloud, and the plane and where to grasp are told; `auto`: the same, and only the
+            camera's position is told.
         voxel_size: metres; network weights carry their own.
         num_approach_points: approach points sampled.
         num_candidates: candidates scored at most.
@@ -174,6 +190,8 @@ class Protocol:
         table = asdict(self)
         if self.camera.surface_voxel == 0:  # so that earlier results can be resumed
             del table["camera"]["surface_voxel"]
+        if not self.noise.sensor:
+            del table["noise"]["sensor"]
         return table
 
 

@@ -1,4 +1,4 @@
-"""Making packed and pile scenes, and bringing them to rest."""
+"""Making packed and pile scenes, full bins and crowded tables, and bringing them to rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
-
-SIZE = 0.30  # metres, edge of the workspace cube
-TABLE_HEIGHT = 0.05  # metres
-TABLE_EXTENT = (1.2, 1.2, 0.2)  # metres; objects would sink through a thin one
-TABLE_FRICTION = 0.5
+from edgegrasp_sim.surroundings import (
+    MIDDLE,
+    OPEN_TABLE,
+    SIZE,
+    TABLE_HEIGHT,
+    TABLE_REACH,
+    Box,
+    Surroundings,
+)
 
 PACKED_ATTEMPTS = 12
 PACKED_RANGE = (0.08, 0.22)  # metres, for x and y
@@ -24,6 +28,13 @@ PILE_DROP_HEIGHT = 0.2  # metres above the table
 PILE_BOX_CORNER = 0.02  # metres, x and y
 PILE_BOX_EXTENT = (0.26, 0.26, 0.13)  # metres
 PILE_BOX_WALL = 0.0039  # metres
+
+BIN_DROP_HEIGHT = 0.08  # metres above the walls
+BIN_DROP_MARGIN = 0.05  # metres from the walls
+BIN_DROP_SECONDS = 0.5
+
+TABLE_ATTEMPTS = 4  # for each object
+LYING_SHARE = 0.4  # of the objects on a table, which are dropped in any pose
 
 REST_SPEED = 0.01
 REST_CHECK_STEPS = 60
@@ -38,12 +49,6 @@ class SceneObject:
     model: ObjectModel
     scale: float
     body: Body
-
-
-def add_table(world: World) -> Body:
-    """Add the table, its top at `TABLE_HEIGHT`."""
-    centre = (SIZE / 2, SIZE / 2, TABLE_HEIGHT - TABLE_EXTENT[2] / 2)
-    return world.add_box(TABLE_EXTENT, centre, friction=TABLE_FRICTION)
 
 
 def load_object(
@@ -79,24 +84,61 @@ def make_packed(
     for _ in range(PACKED_ATTEMPTS):
         if len(placed) >= num_objects:
             break
-        state = world.save_state()
         model = objects.sample(rng)
         x, y = rng.uniform(*PACKED_RANGE, size=2)
-        half_turn = rng.uniform(0.0, 2.0 * np.pi) / 2
-        quaternion = [0.0, 0.0, float(np.sin(half_turn)), float(np.cos(half_turn))]
+        quaternion = _upright(rng)
         scale = float(rng.uniform(*scales))
-        new = load_object(world, model, (x, y, 1.0), quaternion, scale)
-        x, y, z = new.body.position
-        lowest = new.body.bounds[0, 2]
-        new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + PACKED_CLEARANCE), quaternion)
-        world.step()
-        if new.body.contacts():
-            new.body.remove()
-            world.restore_state(state)
-        else:
-            placed = settle(world, [*placed, new])
-        world.remove_state(state)
+        placed = _place(world, OPEN_TABLE, placed, model, (x, y), quaternion, scale)
     return placed
+
+
+def make_table(
+    world: World,
+    surroundings: Surroundings,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float] = PACKED_SCALE,
+) -> list[SceneObject]:
+    """Put objects on a table beside larger things: most upright, some lying as they fall.
+
+    Up to `TABLE_ATTEMPTS` objects are drawn for each, so that there may be fewer than asked for.
+    """
+    placed: list[SceneObject] = []
+    for _ in range(TABLE_ATTEMPTS * num_objects):
+        if len(placed) >= num_objects:
+            break
+        model = objects.sample(rng)
+        x, y = MIDDLE + rng.uniform(-TABLE_REACH, TABLE_REACH, size=2)
+        lying = rng.random() < LYING_SHARE
+        quaternion = Rotation.random(rng=rng).as_quat().tolist() if lying else _upright(rng)
+        scale = float(rng.uniform(*scales))
+        placed = _place(world, surroundings, placed, model, (x, y), quaternion, scale)
+    return placed
+
+
+def make_bin(
+    world: World,
+    surroundings: Surroundings,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float] = PILE_SCALE,
+) -> list[SceneObject]:
+    """Drop objects into a bin one after another; those that do not fit in it are taken away."""
+    low, high = np.asarray(surroundings.bounds)
+    walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
+    dropped: list[SceneObject] = []
+    for _ in range(num_objects):
+        model = objects.sample(rng)
+        quaternion = Rotation.random(rng=rng).as_quat().tolist()
+        x, y = rng.uniform(low[:2] + BIN_DROP_MARGIN, high[:2] - BIN_DROP_MARGIN)
+        scale = float(rng.uniform(*scales))
+        dropped.append(
+            load_object(world, model, (x, y, walls + BIN_DROP_HEIGHT), quaternion, scale)
+        )
+        wait_for_rest(world, dropped, BIN_DROP_SECONDS)
+    return settle(world, dropped, surroundings)
 
 
 def make_pile(
@@ -107,7 +149,7 @@ def make_pile(
     scales: tuple[float, float] = PILE_SCALE,
 ) -> list[SceneObject]:
     """Drop objects into an open box one after another, then take the box away."""
-    walls = _add_box_walls(world)
+    walls = [box.add_to(world) for box in _pile_box()]
     dropped: list[SceneObject] = []
     for _ in range(num_objects):
         model = objects.sample(rng)
@@ -119,7 +161,7 @@ def make_pile(
         wait_for_rest(world, dropped, DROP_SECONDS)
     for wall in walls:
         wall.remove()
-    return settle(world, dropped)
+    return settle(world, dropped, OPEN_TABLE)
 
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
@@ -132,8 +174,10 @@ def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) 
             return
 
 
-def settle(world: World, objects: Sequence[SceneObject]) -> list[SceneObject]:
-    """Wait for rest and remove what left the workspace, until nothing more leaves.
+def settle(
+    world: World, objects: Sequence[SceneObject], surroundings: Surroundings
+) -> list[SceneObject]:
+    """Wait for rest and remove what is no longer where objects are, until nothing more leaves.
 
     Returns:
         The objects that remain.
@@ -141,7 +185,7 @@ def settle(world: World, objects: Sequence[SceneObject]) -> list[SceneObject]:
     remaining = list(objects)
     while True:
         wait_for_rest(world, remaining, REST_SECONDS)
-        outside = [item for item in remaining if _is_outside(item.body)]
+        outside = [item for item in remaining if not surroundings.contain(item.body)]
         if not outside:
             return remaining
         for item in outside:
@@ -149,21 +193,47 @@ def settle(world: World, objects: Sequence[SceneObject]) -> list[SceneObject]:
         remaining = [item for item in remaining if item not in outside]
 
 
-def _is_outside(body: Body) -> bool:
-    position = body.position
-    return bool((position < 0.0).any() or (position[:2] > SIZE).any())
+def _upright(rng: np.random.Generator) -> list[float]:
+    """A random turn about z, as a quaternion xyzw."""
+    half_turn = rng.uniform(0.0, 2.0 * np.pi) / 2
+    return [0.0, 0.0, float(np.sin(half_turn)), float(np.cos(half_turn))]
 
 
-def _add_box_walls(world: World) -> list[Body]:
+def _place(
+    world: World,
+    surroundings: Surroundings,
+    placed: list[SceneObject],
+    model: ObjectModel,
+    place: tuple[float, float],
+    quaternion_xyzw: Sequence[float],
+    scale: float,
+) -> list[SceneObject]:
+    """Put an object down where it touches nothing, or nowhere; returns all that are there."""
+    state = world.save_state()
+    new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)
+    x, y, z = new.body.position
+    lowest = new.body.bounds[0, 2]
+    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + PACKED_CLEARANCE), quaternion_xyzw)
+    world.step()
+    if new.body.contacts():
+        new.body.remove()
+        world.restore_state(state)
+    else:
+        placed = settle(world, [*placed, new], surroundings)
+    world.remove_state(state)
+    return placed
+
+
+def _pile_box() -> list[Box]:
+    """The walls that a pile is dropped into."""
     length, width, height = PILE_BOX_EXTENT
     low = PILE_BOX_CORNER
     half = PILE_BOX_WALL / 2
     z = TABLE_HEIGHT + height / 2
     middle = low + length / 2
-    plan = (
-        ((PILE_BOX_WALL, width, height), (low + half, middle, z)),
-        ((PILE_BOX_WALL, width, height), (low + length - half, middle, z)),
-        ((length, PILE_BOX_WALL, height), (middle, low + half, z)),
-        ((length, PILE_BOX_WALL, height), (middle, low + width - half, z)),
-    )
-    return [world.add_box(extent, centre, friction=0.5) for extent, centre in plan]
+    return [
+        Box((PILE_BOX_WALL, width, height), (low + half, middle, z)),
+        Box((PILE_BOX_WALL, width, height), (low + length - half, middle, z)),
+        Box((length, PILE_BOX_WALL, height), (middle, low + half, z)),
+        Box((length, PILE_BOX_WALL, height), (middle, low + width - half, z)),
+    ]

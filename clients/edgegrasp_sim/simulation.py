@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_sim.camera import (
-    CLOUD_BOX,
     EVALUATION_VIEWS,
-    WORKSPACE_BOX,
-    DepthNoise,
     Observation,
     TableView,
     ViewRange,
     crop,
     points_of,
     resample_surfaces,
+    seen_box,
 )
 from edgegrasp_sim.engine import Intrinsics, World
 from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
@@ -27,13 +25,21 @@ from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
-    TABLE_HEIGHT,
     SceneObject,
-    add_table,
     load_object,
+    make_bin,
     make_packed,
     make_pile,
+    make_table,
     settle,
+)
+from edgegrasp_sim.sensor import DepthNoise, DepthSensor
+from edgegrasp_sim.surroundings import (
+    OPEN_TABLE,
+    TABLE_HEIGHT,
+    Surroundings,
+    random_bin,
+    random_table,
 )
 
 NOISE_STD = 0.001  # metres
@@ -65,6 +71,7 @@ class Seeing(TypedDict, total=False):
         noise_std: standard deviation of the noise in each coordinate of each point, metres; by
             default `NOISE_STD`.
         depth_noise: noise of the images.
+        sensor: what else the camera gets wrong.
         table: what the cloud holds of the table, see `Observation`; by default `known`.
         surface_voxel: metres between the points of a surface, at whatever slant it is seen; 0, the
             default: one point for each pixel.
@@ -72,12 +79,13 @@ class Seeing(TypedDict, total=False):
 
     noise_std: float
     depth_noise: DepthNoise
+    sensor: DepthSensor | None
     table: TableView
     surface_voxel: float
 
 
 class ClutterSimulation:
-    """A table with objects, a depth camera and a floating hand.
+    """Objects in their surroundings, a depth camera and a floating hand.
 
     Equal calls after equal seeds give equal results, whatever was simulated before.
 
@@ -101,8 +109,10 @@ class ClutterSimulation:
             else {kind: ObjectSet.builtin(kind) for kind in SceneKind}
         )
         self.start_contact_fails = start_contact_fails
+        self.surroundings = OPEN_TABLE
         self.world = World()
         self._objects: list[SceneObject] = []
+        self._obstacles: frozenset[int] = frozenset()
         self._gripper: Gripper | None = None
         self._rest_state: int | None = None
         self._copy: ClutterSimulation | None = None
@@ -131,6 +141,11 @@ class ClutterSimulation:
         return [item.model for item in self._objects]
 
     @property
+    def object_bounds(self) -> Matrix:
+        """The box around each object that is left: (K, 2, 3) metres, world frame."""
+        return np.array([item.body.bounds for item in self._objects]).reshape(-1, 2, 3)
+
+    @property
     def placements(self) -> list[ObjectPlacement]:
         """Where the objects are; `reset_from_poses` takes them back."""
         return [
@@ -154,7 +169,7 @@ class ClutterSimulation:
         """Make a new scene at rest.
 
         Args:
-            scene: `packed` or `pile`.
+            scene: `packed`, `pile`, `bin` or `table`.
             rng: the scene's own stream.
             num_objects: how many to try to place.
             scales: range of the factor on the objects' size; by default the scene's own.
@@ -171,22 +186,37 @@ class ClutterSimulation:
         objects = self.object_sets.get(kind)
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
-        self._clear()
-        make, own_scales = (
-            (make_packed, PACKED_SCALE) if kind is SceneKind.PACKED else (make_pile, PILE_SCALE)
-        )
-        self._objects = make(self.world, objects, rng, num_objects, scales or own_scales)
+        match kind:
+            case SceneKind.PACKED:
+                self._clear(OPEN_TABLE)
+                made = make_packed(self.world, objects, rng, num_objects, scales or PACKED_SCALE)
+            case SceneKind.PILE:
+                self._clear(OPEN_TABLE)
+                made = make_pile(self.world, objects, rng, num_objects, scales or PILE_SCALE)
+            case SceneKind.BIN:
+                around = self._clear(random_bin(rng))
+                given = scales or PILE_SCALE
+                made = make_bin(self.world, around, objects, rng, num_objects, given)
+            case SceneKind.TABLE:
+                around = self._clear(random_table(rng))
+                given = scales or PACKED_SCALE
+                made = make_table(self.world, around, objects, rng, num_objects, given)
+        self._objects = made
         self._gripper = Gripper(self.world)
         return self.num_objects
 
-    def reset_from_poses(self, placements: Sequence[ObjectPlacement]) -> None:
+    def reset_from_poses(
+        self,
+        placements: Sequence[ObjectPlacement],
+        surroundings: Surroundings = OPEN_TABLE,
+    ) -> None:
         """Put objects exactly at the given poses, at rest, without simulating.
 
         Raises:
             FileNotFoundError: an object's file is missing.
             ValueError: the engine cannot read it.
         """
-        self._clear()
+        self._clear(surroundings)
         for placement in placements:
             model = ObjectModel(placement.urdf.stem, placement.urdf)
             item = load_object(
@@ -230,24 +260,29 @@ class ClutterSimulation:
             **seen: see `Seeing`.
         """
         table, voxel = seen.get("table", "known"), seen.get("surface_voxel", 0.0)
-        depth_noise = seen.get("depth_noise")
-        box = CLOUD_BOX[table]
+        depth_noise, sensor = seen.get("depth_noise"), seen.get("sensor")
+        workspace = np.asarray(self.surroundings.workspace)
+        box = seen_box(workspace, table)
         clouds = []
         for T_world_camera in T_world_cameras:
             depth = self.world.render_depth(T_world_camera, CAMERA)
             if depth_noise is not None:
                 depth = depth_noise.apply(depth, rng_noise)
-            points = crop(points_of(depth, T_world_camera, CAMERA), box, _CROP_MARGIN)
+            if sensor is not None:
+                depth = sensor.apply(depth, CAMERA, rng_noise)
+            points = points_of(depth, T_world_camera, CAMERA)
+            points = points if box is None else crop(points, box, _CROP_MARGIN)
             if voxel > 0 and len(points) > 0:
                 around = np.stack((points.min(axis=0), points.max(axis=0)))
                 points = resample_surfaces(depth, T_world_camera, CAMERA, around, voxel)
             std = seen.get("noise_std", NOISE_STD)
             points = points + rng_noise.normal(0.0, std, size=points.shape)
-            clouds.append(crop(points, box, 0.0).astype(np.float32))
+            points = points if box is None else crop(points, box)
+            clouds.append(points.astype(np.float32))
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
-            workspace=WORKSPACE_BOX[table].astype(np.float32),
+            workspace=np.asarray(box if table == "ransac" else workspace, np.float32),
             table_height=TABLE_HEIGHT,
             camera_positions=positions,
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
@@ -297,7 +332,7 @@ class ClutterSimulation:
             self._copy = ClutterSimulation(self.object_sets)
         placements = self.placements
         if self._copied != placements:
-            self._copy.reset_from_poses(placements)
+            self._copy.reset_from_poses(placements, self.surroundings)
             self._copied = placements
         self._copy.start_contact_fails = self.start_contact_fails
         return self._copy.try_grasp(T_world_hand, to_the_end=True)
@@ -319,7 +354,7 @@ class ClutterSimulation:
         if result.held is not None:
             result.held.body.remove()
             self._objects.remove(result.held)
-        self._objects = settle(self.world, self._objects)
+        self._objects = settle(self.world, self._objects, self.surroundings)
         return result
 
     @property
@@ -337,6 +372,7 @@ class ClutterSimulation:
             self._hand,
             T,
             {item.body.uid: item for item in self._objects},
+            self._obstacles,
             start_contact_fails=self.start_contact_fails,
             to_the_end=to_the_end,
             shake=shake,
@@ -356,12 +392,14 @@ class ClutterSimulation:
         self.world.detect_collisions()
         self.world.restore_state(state)
 
-    def _clear(self) -> None:
+    def _clear(self, surroundings: Surroundings) -> Surroundings:
         self.world.reset()
         self._objects = []
         self._gripper = None
         self._rest_state = None
-        add_table(self.world)
+        self.surroundings = surroundings
+        self._obstacles = surroundings.add_to(self.world)
+        return surroundings
 
     def _forget_rest_state(self) -> None:
         if self._rest_state is not None:

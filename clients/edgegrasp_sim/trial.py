@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.camera import Observation, crop
 from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
@@ -167,7 +167,7 @@ class RoundDriver:
 
     Args:
         simulation: is reset first.
-        scene: `packed` or `pile`.
+        scene: `packed`, `pile`, `bin` or `table`.
         protocol: objects, camera, noise and what ends the round.
         seed: not negative.
         index: number of the round, not negative.
@@ -219,13 +219,15 @@ class RoundDriver:
             num_views=rules.camera.views,
             noise_std=rules.noise.point_std,
             depth_noise=rules.noise,
+            sensor=rules.noise.depth_sensor(self._noise),
             table=rules.planning.table,
             surface_voxel=rules.camera.surface_voxel,
         )
         failed = [each.T_world_hand for each in self._round.attempts if not each.success]
         self._seen = replace(seen, failed=np.array(failed).reshape(-1, 4, 4))
         self.view += 1
-        above = self._seen.cloud[:, 2] > self._seen.table_height + 0.005
+        inside = crop(self._seen.cloud, self._seen.workspace)
+        above = inside[:, 2] > self._seen.table_height + 0.005
         if np.count_nonzero(above) < MIN_POINTS:
             self.end = RoundEnd.NOTHING_SEEN
         return self._seen

@@ -172,7 +172,7 @@ class GraspDetector:
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
         """First stage: everything before the network."""
-        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points), options)
+        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points or 1), options)
         scene, gripper = prepared.scene, prepared.gripper
         if scene is None:
             return prepared

@@ -457,8 +457,12 @@ class DetectOptions(Strict):
         default=None,
         description="name of a gripper, or a gripper; null: the one the weights were trained for",
     )
-    num_approach_points: Integer = Field(
-        default=32, ge=1, le=MAX_APPROACH_POINTS, description="approach points sampled"
+    num_approach_points: Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric] | None = (
+        Field(
+            default=None,
+            description="approach points sampled, spread over the objects; null: as many as their "
+            "surface needs",
+        )
     )
     num_candidates: Integer = Field(
         default=2000, ge=1, le=MAX_CANDIDATES, description="candidates scored at most"

@@ -23,6 +23,7 @@ Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
 
 COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
+GOOD_SCORE = 0.5  # from which an object has a grasp to offer
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 OUTCOMES = list(Outcome)
 
@@ -36,6 +37,8 @@ def select(
     counts: dict[str, int],
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
+
+    The best good grasp of each object is among them before a second one of any.
 
     Args:
         scene: The scene.
@@ -59,12 +62,29 @@ def select(
     outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
+    place = np.empty(len(score), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    order = objects_first(order, score, scene.object_of_point[sample.candidates.contact_index])
     if options.suppression is not None:
         order, dropped = non_max_suppression(T_cloud_tcp, order, options.suppression, options.top_k)
     order = order[: options.top_k]
+    order = order[np.argsort(place[order])]
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome
+
+
+def objects_first(order: Int64, score: NDArray[np.floating], number: Int64) -> Int64:
+    """The rows `order`, the first good one of each object brought to the front.
+
+    Args:
+        order: (M,) rows, best first.
+        score: (E,) probabilities.
+        number: (E,) the object that each is on.
+    """
+    _, first = np.unique(number[order], return_index=True)
+    first = np.sort(first[score[order[first]] >= GOOD_SCORE])
+    return np.concatenate([order[first], np.delete(order, first)])
 
 
 def ranked(

@@ -17,16 +17,11 @@ from edgegrasp_model.hand_description import without_support
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
-from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
-from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.recipes import LENGTH_UNIT
-from edgegrasp_training.views import UNTRIED, LabelledView
+from edgegrasp_training.views import UNTRIED, UP, LabelledView
 
 Rotations = Literal["any", "upright", "none"]
-UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
-WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))  # of the simulated scenes
-SUPPORT = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)  # their table
 SPARE_POINTS = 2  # times a hand's points are kept, for each step to pick from
 TRIED_WEIGHT = 4.0  # of a simulated label in the loss, beside a teacher's score of weight 1
 SHAKEN_SHARE = 0.2  # of a held grasp's label that depends on whether it survives shaking
@@ -114,7 +109,7 @@ def tried_grasps(
     seen = None
     if config.architecture == "hand":
         viewpoint = view.camera_position if viewpoint_known else None
-        batch = hand_batch(cloud, candidates, gripper, viewpoint, SPARE_POINTS * config.hand_points)
+        batch = hand_batch(view, candidates, gripper, viewpoint, SPARE_POINTS * config.hand_points)
         description, points = batch.description.numpy(), batch.points.numpy()
         seen = HandInputs(
             description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
@@ -123,7 +118,7 @@ def tried_grasps(
 
 
 def hand_batch(
-    cloud: Cloud,
+    view: LabelledView,
     candidates: Candidates,
     gripper: Gripper,
     viewpoint: NDArray[np.float32] | None,
@@ -132,15 +127,21 @@ def hand_batch(
     """The hand network's inputs for candidates in a simulated scene.
 
     Args:
-        cloud: What is seen of the scene.
+        view: What is seen of the scene.
         candidates: E hands to try.
         gripper: To try them with.
         viewpoint: (3,) camera position, metres; None: not known.
         max_points: Points of each hand at most.
     """
-    at_side = near_workspace_side(cloud.points, WORKSPACE, UP)
     return HandBatch.from_cloud(
-        cloud, candidates, gripper, UP, SUPPORT, viewpoint, at_side, max_points
+        Cloud(view.points, view.normals),
+        candidates,
+        gripper,
+        view.up,
+        view.support_plane,
+        viewpoint,
+        view.cut_off(),
+        max_points,
     )
 
 
@@ -267,7 +268,7 @@ def _turn_of(view: LabelledView) -> NDArray[np.float32]:
     """The rotation (3, 3) of a view's axes to those of the detector's frame."""
     if len(view.points) == 0:
         return np.eye(3, dtype=np.float32)
-    frame = CanonicalFrame.of_scene(view.points, UP, view.camera_position)
+    frame = CanonicalFrame.of_scene(view.points, view.up, view.camera_position)
     return frame.directions(np.eye(3)).T.astype(np.float32)
 
 

@@ -12,31 +12,79 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.options import Collision, DetectOptions, SupportPlane, Workspace
+from edgegrasp_model.options import (
+    AutoPlane,
+    Box,
+    Collision,
+    DetectOptions,
+    OrientedBox,
+    Region,
+    SupportPlane,
+    Workspace,
+)
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.scene import build_scene
-from edgegrasp_sim.camera import TRAINING_VIEWS, Observation
+from edgegrasp_model.scene.scene import build_scene, select_points
+from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
-from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
+from edgegrasp_sim.sensor import random_sensor
+from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
+from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
-from edgegrasp_training.views import LabelledView
+from edgegrasp_training.views import LabelledView, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
-MEAN_FURTHER_OBJECTS = 4  # a scene holds one object and Poisson(this) more
+BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
+# Four in ten scenes are those of the benchmark of the paper.
+_P, _H, _B, _T = SceneKind
+MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
+FURTHER_OBJECTS = {  # a scene holds one object and Poisson(this) more
+    SceneKind.PACKED: 4,
+    SceneKind.PILE: 4,
+    SceneKind.BIN: 7,
+    SceneKind.TABLE: 5,
+}
+_ABOVE, _STEEP, _ANY_SIDE = (
+    (0.0, np.radians(40)),
+    (np.radians(20), np.radians(75)),
+    (0.0, 2 * np.pi),
+)
+_LOW_TARGET = (MIDDLE, MIDDLE, 0.1)  # metres
+VIEWS = {
+    SceneKind.PACKED: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
+    SceneKind.PILE: ViewRange((0.45, 0.75), (0.0, np.radians(75)), _ANY_SIDE),
+    SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
+    SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
+}
+KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried
+AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
+TOLD_SHARE = {  # of the views that are not cut off, where support and workspace are told
+    SceneKind.PACKED: 0.0,
+    SceneKind.PILE: 0.0,
+    SceneKind.BIN: 0.7,
+    SceneKind.TABLE: 0.3,
+}
+AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
+AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
+AROUND_MARGIN = 0.006  # metres around a thing that is no object
+PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
 VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
 WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
 HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding network finds hard
 HARD_TRIES = 3  # scenes looked through for a hard one
-OTHER_NOISE = 0.3  # share of the views with another noise than the benchmark's
-MAX_NOISE = 0.003  # metres
+HARD_LOOKS = 6  # into each of them
+SENSOR_SHARE = 0.4  # of the views, with the faults of a depth camera
+OTHER_NOISE = 0.3  # of the views, with another noise than the benchmark's
+MAX_NOISE = 0.004  # metres
+EXACT_PLANE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=TABLE_HEIGHT)
 
 BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
 UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
@@ -55,11 +103,11 @@ class GenerationOptions:
     grasps_per_view: int = 100
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
-    kind: SceneKind | None = None  # of all scenes; None: packed where the index is even, else piles
+    kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
-        return self.kind or (SceneKind.PACKED if index % 2 == 0 else SceneKind.PILE)
+        return self.kind or MIXTURE[index % len(MIXTURE)]
 
 
 class Query(NamedTuple):
@@ -124,8 +172,9 @@ def generate_scene(
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
     kind = options.kind_of(index)
     # Some scenes are made of the other kind's objects.
-    other = SceneKind.PILE if kind is SceneKind.PACKED else SceneKind.PACKED
-    source = other if streams[SCENE_STREAM].random() < OTHER_OBJECTS else kind
+    source = kind.objects
+    if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
+        source = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
     tried = held = 0
     with TemporaryDirectory() as shapes:
         drawn = None
@@ -138,7 +187,7 @@ def generate_scene(
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             for number in range(options.views_per_scene):
-                query = hard if hard and number == 0 else _ask(simulation, streams)
+                query = hard if hard and number == 0 else _ask(simulation, kind, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 view = replace(view, objects=names, object_digests=digests)
@@ -156,14 +205,14 @@ def _make_scene(
 ) -> Query | None:
     """Make a scene; with weights mostly one that they find hard, and return the hard view."""
     rng = streams[SCENE_STREAM]
-    low, high = PACKED_SCALE if kind is SceneKind.PACKED else PILE_SCALE
+    low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
     scales = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
     for _ in range(1 if guide is None else HARD_TRIES):
-        simulation.reset(kind, rng, 1 + int(rng.poisson(MEAN_FURTHER_OBJECTS)), scales)
-        hard = None if guide is None else _hard_view(simulation, guide, streams)
+        simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), scales)
+        hard = None if guide is None else _hard_view(simulation, kind, guide, streams)
         if hard is not None:
             return hard
     return None
@@ -171,6 +220,7 @@ def _make_scene(
 
 def _hard_view(
     simulation: ClutterSimulation,
+    kind: SceneKind,
     guide: GraspDetector,
     streams: list[np.random.Generator],
 ) -> Query | None:
@@ -178,8 +228,8 @@ def _hard_view(
 
     Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
-    for _ in range(simulation.num_objects):
-        query = _ask(simulation, streams)
+    for _ in range(min(simulation.num_objects, HARD_LOOKS)):
+        query = _ask(simulation, kind, streams)
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
@@ -193,23 +243,71 @@ def _hard_view(
     return None
 
 
-def _ask(simulation: ClutterSimulation, streams: list[np.random.Generator]) -> Query:
-    """Look at the scene, and request grasps as a benchmark does, around fewer points."""
-    noise = streams[NOISE_STREAM]
-    std = noise.uniform(0.0, MAX_NOISE) if noise.random() < OTHER_NOISE else NOISE_STD
-    observation = simulation.observe(
-        streams[CAMERA_STREAM], noise, views=TRAINING_VIEWS, noise_std=std
-    )
+def _ask(
+    simulation: ClutterSimulation, kind: SceneKind, streams: list[np.random.Generator]
+) -> Query:
+    """Look at the scene, and request grasps as a benchmark does, around fewer points.
+
+    In bins, on tables and in some of the other views the cloud holds all that the camera sees, and
+    the support is told, not quite where it is, or has to be found.
+    """
+    noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
+    open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
+    around = not open_table or noise.random() < AROUND_SHARE
+    seen = _noise(noise)
+    seen["table"] = "around" if around else "known"
+    observation = simulation.observe(streams[CAMERA_STREAM], noise, views=VIEWS[kind], **seen)
+    support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
+    workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))
+    if around and choice.random() >= TOLD_SHARE[kind]:
+        support, workspace = AutoPlane(), None
+    aimed = not open_table and choice.random() < AIMED_SHARE
+    objects = _objects_of(simulation) if aimed else None
     request = DetectOptions(
-        num_approach_points=APPROACH_POINTS,
-        seed=int(streams[CHOICE_STREAM].integers(2**32)),
+        num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
+        seed=int(choice.integers(2**32)),
         viewpoint=tuple(observation.camera_position.tolist()),
-        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=observation.table_height),
-        workspace=Workspace(min=tuple(low), max=tuple(high)),
+        support=support,
+        workspace=workspace,
+        approach_region=objects,
+        contact_region=objects,
         collision=Collision(mode="penalise"),
     )
     return Query(observation, request)
+
+
+def _noise(rng: np.random.Generator) -> Seeing:
+    """The benchmark's noise, more or less of it, or a camera's faults."""
+    draw = rng.random()
+    if draw < SENSOR_SHARE:
+        return {"noise_std": 0.0, "sensor": random_sensor(rng)}
+    if draw < SENSOR_SHARE + OTHER_NOISE:
+        return {"noise_std": rng.uniform(0.0, MAX_NOISE)}
+    return {"noise_std": NOISE_STD}
+
+
+def _plane(rng: np.random.Generator) -> SupportPlane:
+    """The table as it is measured or found: not quite where it is."""
+    tilted = np.array([*rng.normal(0.0, PLANE_TILT, size=2), 1.0])
+    x, y, z = (tilted / np.linalg.norm(tilted)).tolist()
+    height = TABLE_HEIGHT + rng.normal(0.0, PLANE_ERROR)
+    return SupportPlane(normal=(x, y, z), offset=float((x + y) * MIDDLE + z * height))
+
+
+def _objects_of(simulation: ClutterSimulation) -> Region:
+    """Where the objects are, without the things around them."""
+    boxes = simulation.object_bounds + AIM_MARGIN
+    around = []
+    for box in simulation.surroundings.boxes:
+        if box.obstacle:
+            x, y, z = (size / 2 + AROUND_MARGIN for size in box.size)
+            turn = 0.0, 0.0, float(np.sin(box.yaw / 2)), float(np.cos(box.yaw / 2))
+            around.append(OrientedBox(center=box.centre, half_extents=(x, y, z), quaternion=turn))
+    return Region(
+        include=tuple(Box(min=tuple(low), max=tuple(high)) for low, high in boxes.tolist()),
+        exclude=tuple(around),
+    )
 
 
 def label(
@@ -233,29 +331,36 @@ def label(
     if len(observation.cloud) == 0:
         return _empty(observation)
     guide = None if options.weights is None else detector(options.weights)
-    sample = score = None
+    selected = sample = score = None
     if guide is None:
-        scene = build_scene(check_cloud(observation.cloud), request, VOXEL_SIZE, {}, [])
-        if scene is not None:
+        selected = select_points(check_cloud(observation.cloud), request, {}, [])
+        scene = build_scene(selected, request, VOXEL_SIZE, {})
+        if scene is not None and scene.approach_allowed.any():
             sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
     else:
         prepared = guide.prepare(observation.cloud, request)
-        scene, sample = prepared.scene, prepared.sample
+        selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
         score = None if prepared.batch is None else guide.run(prepared.batch)
-    if scene is None or sample is None:
+    if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return _empty(observation)
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
+    # What is far from every grasp says nothing about any.
+    far = cKDTree(T_world_hand[:, :3, 3]).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
+    kept = np.flatnonzero(~far)
     return LabelledView(
-        points=scene.points_in_cloud,
-        normals=scene.frame.directions_in_cloud(scene.cloud.normals),
+        points=scene.points_in_cloud[kept],
+        normals=scene.frame.directions_in_cloud(scene.cloud.normals)[kept],
         camera_position=observation.camera_position,
-        approach_index=candidates.approach_index,
-        contact_index=candidates.contact_index,
+        approach_index=np.searchsorted(kept, candidates.approach_index),
+        contact_index=np.searchsorted(kept, candidates.contact_index),
         T_world_hand=T_world_hand,
         success=np.asarray([result.success for result in results], dtype=np.int8),
         firm=np.asarray([bool(result.held_after_shaking) for result in results], dtype=np.int8),
+        support=support_as_array(selected.support),
+        at_side=None if scene.at_side is None else scene.at_side[kept],
+        object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
 
 
@@ -298,7 +403,7 @@ def _chosen(
     hit = rng.permutation(np.flatnonzero(left & ~sample.collision_free))
     free = free[: max(round(FREE_SHARE * count), count - len(hit))]
     left[free] = False
-    left[hit[: count - len(free)]] = False
+    left[hit[: round((1.0 - FREE_SHARE) * count)]] = False
     return np.flatnonzero(~left)
 
 

@@ -8,14 +8,18 @@ but nothing can enter.
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, write_object
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
-MADE_SHARE = 0.6  # of a scene's objects that are computed
+MADE_SHARE = 0.5  # of a scene's objects that are computed
+BLOB_SHARE = 0.15  # of them that come with the engine
+TRAINING_BLOBS = (100, 1000)  # their numbers; the built-in object sets have lower ones
+BLOB_SCALE = (0.6, 1.1)
 SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
 NUM_VARIED = 16  # objects that a scene is drawn from
 HOLLOW_SHARE = 0.25  # of the computed objects; the others are drawn at random
@@ -46,8 +50,13 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
     """
     drawn: dict[str, ObjectModel] = {}
     for _ in range(NUM_VARIED):
-        made = rng.random() < MADE_SHARE
-        model = any_made_object(folder / "made", rng) if made else objects.sample(rng)
+        draw = rng.random()
+        if draw < MADE_SHARE:
+            model = any_made_object(folder / "made", rng)
+        elif draw < MADE_SHARE + BLOB_SHARE:
+            model = any_blob(rng)
+        else:
+            model = objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
         if rng.random() < SYMMETRIC_SHARE:
             factors[1] = factors[0]
@@ -69,7 +78,7 @@ def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: P
     tree = ElementTree.parse(model.urdf)
     for shape in (*tree.iter("visual"), *tree.iter("collision")):
         mesh = shape.find("geometry/mesh")
-        if mesh is None or shape.find("origin") is not None:
+        if mesh is None or _is_shifted(shape):
             raise ValueError(f"{model.urdf}: has shapes that cannot be stretched; use plain meshes")
         own = np.array([float(each) for each in mesh.get("scale", "1 1 1").split()])
         mesh.set("scale", " ".join(f"{each:.5f}" for each in own * factors))
@@ -83,10 +92,21 @@ def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: P
     return replace(model, urdf=path, origin=model)
 
 
+def _is_shifted(shape: Element) -> bool:
+    origin = shape.find("origin")
+    values = [] if origin is None else [*origin.attrib.values()]
+    return any(float(each) for value in values for each in value.split())
+
+
 def any_made_object(folder: Path, rng: np.random.Generator) -> ObjectModel:
     """Draw a computed object and write it into a folder."""
     names = HOLLOW_NAMES if rng.random() < HOLLOW_SHARE else DRAWN_NAMES
     return made_object(names[int(rng.integers(len(names)))], folder)
+
+
+def any_blob(rng: np.random.Generator) -> ObjectModel:
+    """Draw one of the objects of random shape that come with the engine."""
+    return blob(int(rng.integers(*TRAINING_BLOBS)), float(rng.uniform(*BLOB_SCALE)))
 
 
 def made_object(name: str, folder: Path) -> ObjectModel:

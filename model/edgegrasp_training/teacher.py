@@ -17,7 +17,7 @@ from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_training.examples import SUPPORT, SoftLabels, hand_batch
+from edgegrasp_training.examples import SoftLabels, hand_batch
 from edgegrasp_training.views import LabelledView, load_view
 
 OWN_BALLS = 16  # balls of a view around approach points of its tried grasps
@@ -72,14 +72,12 @@ class Teacher:
         others = np.setdiff1d(np.arange(len(view.points)), own)
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
-        cloud = Cloud(view.points, view.normals)
-        camera = view.camera_position
-        candidates = self._candidates(cloud, balls, camera, rng) if len(balls) else None
+        candidates = self._candidates(view, balls, rng) if len(balls) else None
         if candidates is None or len(candidates) == 0:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
             return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
-        hands = hand_batch(cloud, candidates, self.gripper, camera, max_points)
+        hands = hand_batch(view, candidates, self.gripper, view.camera_position, max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
         return SoftLabels(
@@ -91,23 +89,23 @@ class Teacher:
         )
 
     def _candidates(
-        self,
-        cloud: Cloud,
-        balls: NDArray[np.int64],
-        camera: NDArray[np.float32],
-        rng: np.random.Generator,
+        self, view: LabelledView, balls: NDArray[np.int64], rng: np.random.Generator
     ) -> Candidates:
         """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
+        cloud, support = Cloud(view.points, view.normals), view.support_plane
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
         every = np.arange(len(crop.ball_rows))
+        wanted = np.ones(len(cloud.points), dtype=bool)
         across = [
-            outline_grasps(cloud.points, crop, balls, every, seen, SUPPORT, self.gripper)
-            for seen in outlines(cloud.points, camera, np.ones(len(cloud.points), dtype=bool))
+            outline_grasps(cloud.points, crop, balls, every, seen, support, self.gripper)
+            for seen in outlines(cloud.points, view.camera_position, wanted)
         ]
         both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), *across])
-        both, clear = retract(both, SUPPORT, self.gripper)
-        both = both.take(rng.permutation(np.flatnonzero(clear)))
+        if support is not None:
+            both, clear = retract(both, support, self.gripper)
+            both = both.take(np.flatnonzero(clear))
+        both = both.take(rng.permutation(len(both)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))
         _, first = np.unique(both.approach_index, return_index=True)
         place = np.arange(len(both)) - np.repeat(first, np.diff([*first, len(both)]))

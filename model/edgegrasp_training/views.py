@@ -10,9 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_model.options import SupportPlane, Workspace
+from edgegrasp_model.scene.scene import near_workspace_side
+from edgegrasp_model.scene.support import Support
+
 Float32 = NDArray[np.float32]
 UNTRIED = -1  # label of a candidate that was not tried
 CARD_FILE = "card.md"
+OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
+# Of views that say nothing of them: the table of the simulated scenes, and where they are cut off.
+TABLE = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.05)
+WORKSPACE = Workspace(min=(0.02, 0.02, 0.055), max=(0.28, 0.28, 0.3))
+UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,9 @@ class LabelledView:
     T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
+    support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
+    at_side: NDArray[np.bool_] | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
+    object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
 
@@ -40,10 +52,9 @@ class LabelledView:
             "contact_index": self.contact_index.astype(np.uint16),
             "success": self.success,
         }
-        if self.T_world_hand is not None:
-            arrays["T_world_hand"] = self.T_world_hand
-        if self.firm is not None:
-            arrays["firm"] = self.firm
+        for name in OPTIONAL:
+            if (array := getattr(self, name)) is not None:
+                arrays[name] = array
         if self.objects:
             arrays["objects"] = np.array(self.objects)
             arrays["object_digests"] = np.array(self.object_digests)
@@ -52,9 +63,36 @@ class LabelledView:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         partial.replace(path)
 
+    @property
+    def support_plane(self) -> SupportPlane | None:
+        """The plane that the objects rest on, as it was given or found."""
+        if self.support is None:
+            return TABLE
+        x, y, z, offset = self.support.astype(np.float64).tolist()
+        return SupportPlane(normal=(x, y, z), offset=offset) if (x, y, z) != (0, 0, 0) else None
+
+    @property
+    def up(self) -> Float32:
+        """Away from gravity, as the detector takes it: (3,)."""
+        plane = self.support_plane
+        return UP if plane is None else np.asarray(plane.normal, dtype=np.float32)
+
+    def cut_off(self) -> NDArray[np.bool_]:
+        """Which points (N,) lie where a side of the workspace cuts things off."""
+        if self.at_side is None:
+            return near_workspace_side(self.points, WORKSPACE, UP, self.points)
+        return self.at_side
+
     def tried(self) -> NDArray[np.int64]:
         """Rows of the candidates that have a label."""
         return np.flatnonzero(self.success != UNTRIED)
+
+
+def support_as_array(support: Support | None) -> Float32:
+    """A support plane as `LabelledView.support` has it."""
+    if support is None:
+        return np.zeros(4, dtype=np.float32)
+    return np.array([*support.plane.normal, support.plane.offset], dtype=np.float32)
 
 
 def load_view(path: Path) -> LabelledView:
@@ -66,9 +104,8 @@ def load_view(path: Path) -> LabelledView:
             camera_position=arrays["camera_position"].astype(np.float32),
             approach_index=arrays["approach_index"].astype(np.int64),
             contact_index=arrays["contact_index"].astype(np.int64),
-            T_world_hand=arrays.get("T_world_hand"),
             success=arrays["success"].astype(np.int8),
-            firm=arrays.get("firm"),
+            **{name: arrays.get(name) for name in OPTIONAL},
             objects=tuple(map(str, arrays.get("objects", ()))),
             object_digests=tuple(map(str, arrays.get("object_digests", ()))),
         )

@@ -71,14 +71,15 @@ def scene() -> Scene:
     everywhere = np.ones(len(POINTS), dtype=bool)
     frame = CanonicalFrame(np.eye(4))
     return Scene(
-        frame,
-        Cloud(POINTS, POINTS),
-        POINTS,
-        np.arange(len(POINTS)),
-        everywhere,
-        everywhere,
-        SupportPlane(normal=(0.0, 0.0, 1.0), offset=FLOOR),
-        SolidBoxes.from_shapes([WALL], frame),
+        frame=frame,
+        cloud=Cloud(POINTS, POINTS),
+        points_in_cloud=POINTS,
+        point_of_row=np.arange(len(POINTS)),
+        approach_allowed=everywhere,
+        contact_allowed=everywhere,
+        object_of_point=np.zeros(len(POINTS), dtype=np.int64),
+        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=FLOOR),
+        obstacles=SolidBoxes.from_shapes([WALL], frame),
     )
 
 

@@ -11,7 +11,7 @@ from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
-from edgegrasp_model.scene.scene import Scene, build_scene
+from edgegrasp_model.scene.scene import Scene, build_scene, select_points
 
 from .scenes import SEED
 
@@ -27,8 +27,9 @@ def sheet(z: float, count: int = 3000, seed: int = 0) -> np.ndarray:
 def build(cloud: object, **options: object) -> tuple[Scene, dict[str, int], list[str]]:
     counts: dict[str, int] = {}
     warnings: list[str] = []
-    asked = DetectOptions.model_validate(options)
-    scene = build_scene(check_cloud(cloud), asked, VOXEL, counts, warnings)
+    asked = DetectOptions.model_validate({"support": None} | options)
+    selected = select_points(check_cloud(cloud), asked, counts, warnings)
+    scene = build_scene(selected, asked, VOXEL, counts)
     assert scene is not None
     return scene, counts, warnings
 

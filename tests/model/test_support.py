@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import RansacPlane, SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
-from edgegrasp_model.scene.scene import build_scene
-from edgegrasp_model.scene.support import correct_depth_scale, depth_scale, find_support_plane
+from edgegrasp_model.scene.depth_scale import correct_depth_scale, depth_scale
+from edgegrasp_model.scene.scene import build_scene, select_points
+from edgegrasp_model.scene.support import Seen, find_support
 
 from .scenes import SEED
 
@@ -27,6 +28,16 @@ def scene(rng: np.random.Generator, table: int = 2000, things: int = 1000) -> np
     return points + rng.normal(0, 0.001, points.shape)
 
 
+def largest(
+    points: np.ndarray, request: RansacPlane, up: object, seed: int = 1
+) -> SupportPlane | None:
+    """The plane that is found without knowing the camera."""
+    seen = Seen(points, None, None)
+    rng = np.random.default_rng(seed)
+    found = find_support(seen, request, np.asarray(up, float), 0.4, rng, [])
+    return None if found is None else found.plane
+
+
 @given(seed=st.integers(0, SEED), share=st.floats(0.3, 0.9))
 def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -35,7 +46,7 @@ def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     points = scene(rng, table, 3000 - table)
     points = (turn.apply(points) + shift).astype(np.float32)
     up = turn.apply([0.1, 0.0, 1.0])  # need not be exact
-    plane = find_support_plane(points, RansacPlane(), up, np.random.default_rng(seed))
+    plane = largest(points, RansacPlane(), up, seed)
     assert plane is not None
     normal = turn.apply([0, 0, 1])
     assert np.dot(plane.normal, normal) > np.cos(0.01)
@@ -52,22 +63,21 @@ def test_a_plane_that_is_too_steep_or_too_small_is_none(request_: RansacPlane) -
     wall = rng.uniform(-0.3, 0.3, (2000, 3)) * (1, 0, 1)  # plane y = 0
     cloud = rng.uniform(-0.3, 0.3, (1000, 3))
     points = np.concatenate([wall, cloud]).astype(np.float32)
-    assert find_support_plane(points, request_, (0, 0, 1), rng) is None
+    assert largest(points, request_, (0, 0, 1)) is None
 
 
 def test_a_steep_plane_is_found_where_it_may_be_steep() -> None:
     rng = np.random.default_rng(1)
     wall = (rng.uniform(-0.3, 0.3, (2000, 3)) * (1, 0, 1)).astype(np.float32)
-    plane = find_support_plane(wall, RansacPlane(max_tilt=1.6), (0, 0.1, 1), rng)
+    plane = largest(wall, RansacPlane(max_tilt=1.6), (0, 0.1, 1))
     assert plane is not None
     np.testing.assert_allclose(plane.normal, (0, 1, 0), atol=1e-4)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 10])
 def test_a_handful_of_points_or_one_point_many_times_is_no_plane(count: int) -> None:
-    rng = np.random.default_rng(0)
     same = np.zeros((count, 3), np.float32)
-    assert find_support_plane(same, RansacPlane(), (0, 0, 1), rng) is None
+    assert largest(same, RansacPlane(), (0, 0, 1)) is None
 
 
 def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
@@ -133,7 +143,8 @@ def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]
     options = parse_options(
         {"support": PLANE | support, "viewpoint": CAMERA.tolist(), "workspace": workspace}
     )
-    found = build_scene(check_cloud(points.astype(np.float32)), options, 0.004, {}, warnings)
+    selected = select_points(check_cloud(points.astype(np.float32)), options, {}, warnings)
+    found = build_scene(selected, options, 0.004, {})
     assert found is not None
     return found.points_in_cloud, warnings
 
@@ -160,5 +171,5 @@ def test_a_table_that_was_cut_away_is_missed() -> None:
 def test_depths_need_a_camera() -> None:
     cloud = check_cloud(scene(np.random.default_rng(7)).astype(np.float32))
     with pytest.raises(InvalidRequest) as caught:
-        build_scene(cloud, parse_options({"support": PLANE}), 0.004, {}, [])
+        select_points(cloud, parse_options({"support": PLANE}), {}, [])
     assert caught.value.field == "options.viewpoint"

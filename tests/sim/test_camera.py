@@ -5,8 +5,6 @@ import pytest
 
 from edgegrasp_sim.camera import (
     EVALUATION_VIEWS,
-    TRAINING_VIEWS,
-    WORKSPACE,
     ViewRange,
     look_at,
     points_of,
@@ -16,6 +14,7 @@ from edgegrasp_sim.engine import Intrinsics, World
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
+from edgegrasp_sim.surroundings import WORKSPACE
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])
@@ -53,7 +52,10 @@ def test_depth_is_measured_along_the_line_of_sight(world: World) -> None:
     assert depth[120, 320] > depth[240, 320] > depth[360, 320]
 
 
-@pytest.mark.parametrize("views", [EVALUATION_VIEWS, TRAINING_VIEWS])
+FROM_ABOVE = ViewRange((0.5, 1.1), (0.0, 0.7), (0.0, 2 * np.pi))
+
+
+@pytest.mark.parametrize("views", [EVALUATION_VIEWS, FROM_ABOVE])
 def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -66,8 +68,13 @@ def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> N
         assert T_world_camera[:3, 2] == pytest.approx(sight / radius)
         assert np.linalg.det(T_world_camera[:3, :3]) == pytest.approx(1.0)
         assert T_world_camera[2, 1] < 0  # the image's y points down in the world
-    with pytest.raises(ValueError, match="slanted line of sight"):
-        look_at(np.array([0.0, 0.0, 1.0]), np.zeros(3))
+    with pytest.raises(ValueError, match="two different points"):
+        look_at(np.zeros(3), np.zeros(3))
+
+
+def test_a_camera_may_look_straight_down() -> None:
+    T_world_camera = look_at(np.array([0.1, 0.2, 1.0]), np.array([0.1, 0.2, 0.0]))
+    np.testing.assert_allclose(T_world_camera[:3, :3], np.diag([1.0, -1.0, -1.0]))
 
 
 def test_resampled_surfaces_are_as_dense_at_a_slant_as_face_to_face(world: World) -> None:

@@ -19,7 +19,8 @@ from edgegrasp_sim.objects import (
     prepare_mesh,
     write_family,
 )
-from edgegrasp_sim.scene import add_table, load_object
+from edgegrasp_sim.scene import load_object
+from edgegrasp_sim.surroundings import OPEN_TABLE
 
 MARGIN = 0.006  # metres that the engine's boxes are wider than what is in them
 
@@ -101,7 +102,7 @@ def test_meshes_of_any_unit_are_scaled_to_the_hand(world: World, meshes: Path, c
 
 def test_a_ring_has_a_hole_and_every_object_s_mass(world: World, meshes: Path, cache: Path) -> None:
     urdf = prepare_mesh(meshes / "ring.obj")
-    add_table(world)
+    OPEN_TABLE.add_to(world)
     ring = load_object(world, ObjectModel("ring", urdf), (0.15, 0.15, 0.07), (0, 0, 0, 1), 1.0)
     above = np.array([[x, 0.15, 0.3] for x in (0.15, 0.15 + 0.055)])
     below = above - np.array([0.0, 0.0, 0.245])

@@ -3,13 +3,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim.camera import WORKSPACE, look_at
+from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import ASSETS, World
 from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
 from edgegrasp_sim.poses import require_pose, translation
-from edgegrasp_sim.scene import TABLE_HEIGHT, add_table, load_object
+from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
+from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, WORKSPACE
 from edgegrasp_sim.validate import measure_agreement
 
 CUBE = ASSETS / "cube_small.urdf"  # 0.05 m
@@ -62,7 +63,7 @@ def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
 
 
 def test_an_object_pressed_into_the_table_comes_out_on_top(world: World) -> None:
-    add_table(world)
+    OPEN_TABLE.add_to(world)
     cube = load_object(world, ObjectModel("cube", CUBE), (0.15, 0.15, 0.035), UPRIGHT, 1.0)
     world.step(400)
     assert cube.body.position[2] == pytest.approx(TABLE_HEIGHT + 0.025, abs=0.002)
@@ -175,7 +176,7 @@ def test_observation_holds_the_objects_and_not_the_table(simulation: ClutterSimu
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
     seen = simulation.observe_from([FRONT], np.random.default_rng(0), noise_std=0.0)
     assert seen.cloud.dtype == np.float32
-    assert (seen.cloud >= WORKSPACE[0].astype(np.float32)).all()
+    assert (seen.cloud >= np.float32(WORKSPACE[0])).all()
     assert seen.cloud.max(axis=0) == pytest.approx((0.175, 0.175, 0.1), abs=2e-3)
     assert seen.cloud[:, 1].min() == pytest.approx(0.125, abs=2e-3)
     assert seen.camera_position == pytest.approx((0.6, 0.15, 0.6))

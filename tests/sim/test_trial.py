@@ -25,7 +25,7 @@ from edgegrasp_sim.trial import (
 )
 
 MakeProtocol = Callable[[int], Protocol]
-PACKED, PILE = SceneKind
+PACKED, PILE, *_ = SceneKind
 IN_THE_AIR = np.diag([1.0, -1.0, -1.0, 1.0])
 IN_THE_AIR[:3, 3] = (0.15, 0.15, 0.5)
 

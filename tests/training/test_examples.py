@@ -9,9 +9,6 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_training.examples import (
-    SUPPORT,
-    UP,
-    WORKSPACE,
     TriedGrasps,
     pack_balls,
     pack_hands,
@@ -20,7 +17,7 @@ from edgegrasp_training.examples import (
     turned,
 )
 from edgegrasp_training.recipes import LENGTH_UNIT
-from edgegrasp_training.views import LabelledView
+from edgegrasp_training.views import TABLE, UP, WORKSPACE, LabelledView
 
 Networks = dict[str, NetworkConfig]
 
@@ -77,9 +74,9 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
         grasps.candidates.take(rows),
         load_gripper(),
         UP,
-        SUPPORT,
+        TABLE,
         view.camera_position,
-        near_workspace_side(view.points, WORKSPACE, UP),
+        near_workspace_side(view.points, WORKSPACE, UP, view.points),
         hands.hand_points,
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)

@@ -11,7 +11,6 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.examples import (
-    SUPPORT,
     TRIED_WEIGHT,
     hand_batch,
     pack_balls,
@@ -19,7 +18,7 @@ from edgegrasp_training.examples import (
 )
 from edgegrasp_training.teacher import GRASPS_PER_BALL, Teacher
 from edgegrasp_training.training import Trainer
-from edgegrasp_training.views import LabelledView
+from edgegrasp_training.views import TABLE, LabelledView
 
 MakeView = Callable[[int], LabelledView]
 MakeTrainer = Callable[..., Trainer]
@@ -53,17 +52,11 @@ def test_a_teacher_scores_candidates_above_the_table(made_up_view, networks, vie
 
     # Hands of the view's own labels get the scores of the network itself.
     tried = tried_grasps(view, networks["hands"], gripper).candidates
-    hands = hand_batch(
-        tried_grasps(view, networks["hands"], gripper).cloud,
-        tried,
-        gripper,
-        view.camera_position,
-        networks["hands"].hand_points,
-    )
+    hands = hand_batch(view, tried, gripper, view.camera_position, networks["hands"].hand_points)
     with torch.inference_mode():
         own = torch.sigmoid(teacher.network(hands) / teacher.metadata.temperature).numpy()
     pairs = list(zip(labels.approach_index.tolist(), labels.contact_index.tolist(), strict=True))
-    above = support_clearance(tried.T_cloud_hand, SUPPORT, gripper) > 0
+    above = support_clearance(tried.T_cloud_hand, TABLE, gripper) > 0
     compared = [
         (own[row], chance[pairs.index(pair)])
         for row, pair in enumerate(

@@ -206,10 +206,10 @@ def request_options(
         "num_approach_points": rules.num_approach_points,
         "num_candidates": rules.num_candidates,
         "viewpoint": positions[0] if len(positions) == 1 else positions,
-        "support": support,
-        "workspace": {"min": low, "max": high},
         "top_k": 1 if rules.selection == "best" else CHOICE,
     }
+    if observation.table != "auto":  # there the detector finds out for itself
+        options |= {"support": support, "workspace": {"min": low, "max": high}}
     return options | dict(extra)
 
 

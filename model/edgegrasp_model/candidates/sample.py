@@ -29,6 +29,9 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
+POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
+APPROACH_POINTS_EACH = 8, 64  # of an object
+MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 128  # of a scene
 OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
@@ -88,13 +91,7 @@ def sample_candidates(
     seen = outlines(scene.cloud.points, scene.viewpoint, scene.contact_allowed)
     attempts: list[Attempt] = []
     while True:
-        chosen = sample_approach_points(
-            scene.cloud.points[approach_rows],
-            options.num_approach_points,
-            options.sampling,
-            rng_approach,
-        )
-        approach_index = approach_rows[chosen]
+        approach_index = approach_points(scene, approach_rows, options, rng_approach)
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
         this = _constrained(scene, seen, approach_index, crop, options, gripper, counts, centre)
         attempts.append(this)
@@ -111,7 +108,7 @@ def sample_candidates(
         add_count(counts, "collision_free", int(free.sum()))
         found = len(row) > 0 if ignored else free.any()
         # A further attempt would draw the same approach points and candidates.
-        exhausted = len(approach_rows) <= len(chosen) and len(passed) <= limit
+        exhausted = len(approach_rows) <= len(approach_index) and len(passed) <= limit
         if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
             break
     scored = rows_to_score(free, options, rng_candidates)
@@ -127,6 +124,41 @@ def sample_candidates(
         attempts,
         row[scored],
     )
+
+
+def approach_points(
+    scene: Scene, rows: Int64, options: DetectOptions, rng: np.random.Generator
+) -> Int64:
+    """Approach points spread over the objects: small ones get some, large ones more.
+
+    Args:
+        scene: Its cloud, and the object of each point.
+        rows: (R,) points that may be chosen.
+        options: How many, and how they are sampled.
+        rng: Source of the random choice.
+
+    Returns:
+        Rows of the cloud.
+    """
+    number = scene.object_of_point[rows]
+    objects, size = np.unique(number, return_counts=True)
+    if options.num_approach_points is None:
+        wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
+        wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
+        wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
+        wanted = np.maximum(wanted, 1)
+    else:  # the largest objects first where there are fewer approach points than objects
+        share = np.sqrt(size) / np.sqrt(size).sum() * options.num_approach_points
+        wanted = np.floor(share).astype(np.int64)
+        rest = options.num_approach_points - wanted.sum()
+        wanted[np.argsort(wanted - share, kind="stable")[:rest]] += 1
+    chosen = []
+    for which, count in zip(objects, wanted, strict=True):
+        mine = rows[number == which]
+        points = scene.cloud.points[mine]
+        if count > 0:
+            chosen.append(mine[sample_approach_points(points, count, options.sampling, rng)])
+    return np.concatenate(chosen)
 
 
 def _constrained(

@@ -1,0 +1,227 @@
+"""What depth cameras get wrong: structured light, stereo, time of flight, and plain noise.
+
+A rendered depth image goes in, one as such a camera would give it comes out, NaN where it has no
+reading. The models follow measurements of such cameras: noise that grows with the square of the
+depth (Khoshelham and Elberink 2012; Nguyen, Izadi and Lovell 2012), quantised disparities and the
+shadow of the projector (Handa et al. 2014), windows that smooth over small steps, and the pixels
+of a time-of-flight camera that fly between an edge and what is behind it (Sarbolandi et al. 2015).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter, zoom
+
+from edgegrasp_sim.engine import Intrinsics
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+EDGE = 0.015  # metres between neighbouring pixels from which on they show different things
+SAME_SURFACE = 0.004  # metres by which a pixel may lie behind what hides it
+WARP_PIXELS = 96  # between the independent values of the warp
+PATCH_PIXELS = 12  # between those of what is missing
+
+
+@dataclass(frozen=True, slots=True)
+class DepthNoise:
+    """Noise of depth images: a random factor on each, and smooth Gaussian noise on some.
+
+    Attributes:
+        gamma_shape: shape of the gamma distribution of the factor; 0: no factor.
+        gamma_scale: its scale.
+        correlated_std: standard deviation of the smooth noise, metres.
+        correlated_pixels: pixels between its independent values, interpolated in between.
+        correlated_share: share of the images that have it.
+    """
+
+    gamma_shape: float
+    gamma_scale: float
+    correlated_std: float
+    correlated_pixels: int
+    correlated_share: float
+
+    def apply(self, depth: Float64, rng: np.random.Generator) -> Float64:
+        """A noisy copy of a depth image: (height, width) metres."""
+        noisy: Float64 = depth
+        if self.gamma_shape > 0:
+            noisy = noisy * rng.gamma(self.gamma_shape, self.gamma_scale)
+        if self.correlated_std > 0 and rng.random() < self.correlated_share:
+            height, width = depth.shape
+            step = self.correlated_pixels
+            coarse = rng.normal(0.0, self.correlated_std, (height // step, width // step))
+            factors = (height / coarse.shape[0], width / coarse.shape[1])
+            noisy = noisy + zoom(coarse, factors, order=1, mode="nearest", grid_mode=True)
+        return noisy
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSensor:
+    """A depth camera: what `apply` does to an image, in this order.
+
+    Attributes:
+        baseline: metres from the camera to the projector or second camera along the image's x;
+            what it does not see is missing. 0: none.
+        window: pixels across the window in which depths are found; steps smaller than `EDGE` are
+            smoothed over. 1: each pixel by itself.
+        fattening: share of the pixels beside an edge, behind it, that get the depth of its front.
+        flying: share of the pixels at an edge that lie somewhere between its front and its back.
+        noise_floor: standard deviation of the noise at depth 0, metres.
+        noise_growth: what is added to that for each square metre of depth, 1 / metre.
+        noise_pixels: pixels between independent values of the noise.
+        warp: standard deviation of a smooth error over the whole image, metres: a camera
+            calibrated badly, or an uneven table.
+        disparity_step: pixels to which disparities are rounded; 0: not rounded.
+        grazing: degrees between a line of sight and the surface's normal at which half of the
+            readings are missing.
+        missing: share of the image that is missing in patches.
+    """
+
+    baseline: float
+    window: int
+    fattening: float
+    flying: float
+    noise_floor: float
+    noise_growth: float
+    noise_pixels: int
+    warp: float
+    disparity_step: float
+    grazing: float
+    missing: float
+
+    def apply(self, depth: Float64, camera: Intrinsics, rng: np.random.Generator) -> Float64:
+        """The image that this camera gives: (height, width) metres, NaN without a reading."""
+        true = depth.astype(np.float32)
+        seen = self._at_edges(true, rng)
+        lost = _shadow(true, self.baseline * camera.focal_length)
+        lost |= self._grazing(true, camera, rng)
+        if self.missing > 0:
+            patches = _smooth(true.shape, PATCH_PIXELS, rng)
+            lost |= patches > np.quantile(patches[::8, ::8], 1.0 - self.missing)
+        std = self.noise_floor + self.noise_growth * true * true
+        seen = seen + std * _smooth(true.shape, self.noise_pixels, rng)
+        if self.warp > 0:
+            seen += np.float32(self.warp) * _smooth(true.shape, WARP_PIXELS, rng)
+        if self.disparity_step > 0:
+            step = abs(self.baseline) * camera.focal_length / self.disparity_step
+            seen = step / np.maximum(np.rint(step / seen), 1.0)
+        seen[lost | (true >= 0.999 * camera.far)] = np.nan
+        return seen.astype(np.float64)
+
+    def _at_edges(self, depth: Float32, rng: np.random.Generator) -> Float32:
+        """Depths smoothed over small steps, fattened or flying at large ones."""
+        across = max(self.window, 3)
+        front = minimum_filter(depth, across, mode="nearest")
+        back = maximum_filter(depth, across, mode="nearest")
+        at_edge = back - front > EDGE * across / 3
+        smoothed = uniform_filter(depth, self.window, mode="nearest") if self.window > 1 else depth
+        seen = np.where(at_edge, depth, smoothed)
+        rows, columns = np.nonzero(at_edge)
+        draw = rng.random(len(rows), dtype=np.float32)
+        near, far = front[rows, columns], back[rows, columns]
+        here = depth[rows, columns]
+        mixed = near + rng.random(len(rows), dtype=np.float32) * (far - near)
+        here = np.where(draw < self.flying, mixed, here)
+        # Whole stretches of an edge are fattened, not single pixels.
+        fat = _smooth(depth.shape, 2 * across, rng)[rows, columns]
+        share = 0.5 + np.clip(fat, -1.5, 1.5) / 3  # nearly uniform between 0 and 1
+        seen[rows, columns] = np.where(share < self.fattening, near, here)
+        return seen
+
+    def _grazing(self, depth: Float32, camera: Intrinsics, rng: np.random.Generator) -> Bools:
+        """Pixels that show a surface at too small an angle."""
+        slope = np.zeros_like(depth)
+        for axis in (0, 1):
+            step = np.abs(np.diff(depth, axis=axis))
+            # The smaller step to either side: an edge is no slanted surface.
+            lower = np.minimum(np.delete(step, 0, axis), np.delete(step, -1, axis))
+            inner = slope[1:-1] if axis == 0 else slope[:, 1:-1]
+            inner += lower * lower
+        tangent = np.sqrt(slope) * camera.focal_length / depth
+        angle = np.degrees(np.arctan(tangent))
+        limit = self.grazing + 4.0 * rng.standard_normal(depth.shape, dtype=np.float32)
+        return np.asarray(angle > limit)
+
+
+# A first-generation Kinect, an active stereo camera, a time-of-flight camera; at arm's length.
+STRUCTURED_LIGHT = DepthSensor(
+    baseline=0.075, window=5, fattening=0.15, flying=0.0, noise_floor=0.0002, noise_growth=0.0014,
+    noise_pixels=2, warp=0.001, disparity_step=0.125, grazing=78.0, missing=0.01,
+)  # fmt: skip
+STEREO = DepthSensor(
+    baseline=0.05, window=7, fattening=0.35, flying=0.05, noise_floor=0.0003, noise_growth=0.0022,
+    noise_pixels=4, warp=0.001, disparity_step=0.0625, grazing=80.0, missing=0.02,
+)  # fmt: skip
+TIME_OF_FLIGHT = DepthSensor(
+    baseline=0.0, window=1, fattening=0.0, flying=0.5, noise_floor=0.0010, noise_growth=0.0010,
+    noise_pixels=1, warp=0.002, disparity_step=0.0, grazing=82.0, missing=0.005,
+)  # fmt: skip
+SENSORS = {
+    "structured-light": STRUCTURED_LIGHT,
+    "stereo": STEREO,
+    "time-of-flight": TIME_OF_FLIGHT,
+}
+
+
+def random_sensor(rng: np.random.Generator) -> DepthSensor:
+    """A camera of one of the three kinds, better or worse than its model."""
+    typical = list(SENSORS.values())[int(rng.integers(len(SENSORS)))]
+    side = float(rng.choice([-1.0, 1.0]))  # of the projector
+    worse = float(np.exp(rng.uniform(np.log(0.4), np.log(1.6))))
+    window = typical.window + 2 * int(rng.integers(-1, 2)) if typical.window > 1 else 1
+    return replace(
+        typical,
+        baseline=side * typical.baseline * rng.uniform(0.5, 1.5),
+        window=window,
+        fattening=typical.fattening * rng.uniform(0.0, 2.0),
+        flying=typical.flying * rng.uniform(0.0, 1.5),
+        noise_floor=typical.noise_floor * worse,
+        noise_growth=typical.noise_growth * worse,
+        noise_pixels=int(rng.integers(1, 7)) if typical.noise_pixels > 1 else 1,
+        warp=rng.uniform(0.0, 0.002),
+        disparity_step=typical.disparity_step * rng.uniform(0.5, 1.5),
+        grazing=typical.grazing + rng.uniform(-8.0, 4.0),
+        missing=typical.missing * rng.uniform(0.0, 3.0),
+    )
+
+
+def _shadow(depth: Float32, disparity_scale: float) -> Bools:
+    """Pixels hidden from a second viewpoint, which is beside the camera along the image's x.
+
+    Args:
+        depth: (height, width) metres.
+        disparity_scale: its distance times the focal length, metres times pixels; negative to
+            the left.
+    """
+    height, width = depth.shape
+    if disparity_scale == 0:
+        return np.zeros(depth.shape, dtype=bool)
+    place = np.arange(width, dtype=np.float32) - np.float32(disparity_scale) / depth
+    # Two columns on either side of the image take what the second viewpoint sees beyond it.
+    column = np.clip(np.floor(place).astype(np.int32), -2, width) + 2
+    cells = column + (width + 4) * np.arange(height, dtype=np.int32)[:, None]
+    nearest = np.full(height * (width + 4), np.inf, dtype=np.float32)
+    for beside in (0, 1):  # neighbours may lie more than a column apart there
+        np.minimum.at(nearest, (cells + beside).ravel(), depth.ravel())
+    hidden = depth > nearest[cells] + SAME_SURFACE + 0.01 * depth
+    return np.asarray(hidden & (column > 1) & (column < width + 2))
+
+
+def _smooth(shape: tuple[int, ...], step: int, rng: np.random.Generator) -> Float32:
+    """Gaussian noise of standard deviation 1 or a little less, interpolated over `step` pixels."""
+    height, width = shape
+    if step <= 1:
+        return rng.standard_normal((height, width), dtype=np.float32)
+    rows, columns = height // step + 2, width // step + 2
+    coarse = rng.standard_normal((rows, columns), dtype=np.float32)
+    across = _weights(width, columns, step, rng)
+    return _weights(height, rows, step, rng) @ (coarse @ across.T) * np.float32(1.5)
+
+
+def _weights(size: int, cells: int, step: int, rng: np.random.Generator) -> Float32:
+    """Linear interpolation of `cells` values at `size` pixels, with a random phase."""
+    place = np.arange(size) / step + rng.random()
+    distance = np.abs(place[:, None] - np.arange(cells))
+    return np.maximum(1.0 - distance, 0.0).astype(np.float32)

@@ -1,0 +1,176 @@
+"""What a scene's objects stand in: a table, an open bin, or a table with larger things on it.
+
+Nothing of it ever moves. The plane that the objects rest on lies at `TABLE_HEIGHT` in every scene.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from edgegrasp_sim.engine import Body, World
+from edgegrasp_sim.poses import Matrix
+
+SIZE = 0.30  # metres, edge of the workspace cube
+TABLE_HEIGHT = 0.05  # metres
+TABLE_EXTENT = (1.2, 1.2, 0.2)  # metres; objects would sink through a thin one
+TABLE_FRICTION = 0.5
+WALL_FRICTION = 0.5
+SUPPORT_CLEARANCE = 0.005  # metres over the table at which the workspace begins
+# Lowest and highest corner of where grasps are looked for on an open table.
+WORKSPACE = (
+    (0.02, 0.02, TABLE_HEIGHT + SUPPORT_CLEARANCE),
+    (SIZE - 0.02, SIZE - 0.02, SIZE),
+)
+MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
+
+BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.30, 0.45), (0.24, 0.35), (0.05, 0.12)  # metres, inside
+BIN_WALL = (0.003, 0.008)  # metres; its floor is as thick
+BIN_STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
+BIN_STAND = (0.1, 0.4)  # metres
+HEAP = 0.10  # metres that a heap may rise over a bin's walls
+
+TABLE_REACH = 0.16  # metres from the middle, along x and y, where objects are put
+TABLE_LENGTH = (0.5, 1.2)  # metres
+TABLE_THICKNESS = 0.04  # metres, seen at its edge; it is filled down to the floor
+TABLE_OVER_FLOOR = (0.4, 0.8)  # metres
+LARGE_THINGS = (1, 3)  # on a table
+LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
+CARTON = ((0.10, 0.40), (0.10, 0.30), (0.05, 0.40))  # metres
+PANEL = ((0.30, 0.55), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
+KERB = ((0.20, 0.40), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box that never moves; metres, world frame.
+
+    Attributes:
+        size: full extent along its own axes.
+        centre: of the box.
+        yaw: radians about world z.
+        friction: lateral.
+        obstacle: whether a hand that hits it has failed. The table is none, as in the reference.
+    """
+
+    size: tuple[float, float, float]
+    centre: tuple[float, float, float]
+    yaw: float = 0.0
+    friction: float = WALL_FRICTION
+    obstacle: bool = True
+
+    def add_to(self, world: World) -> Body:
+        """Put it there."""
+        return world.add_box(self.size, self.centre, friction=self.friction, yaw=self.yaw)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What stays as it is in a scene, and where its objects are.
+
+    Attributes:
+        boxes: all that never moves.
+        workspace: lowest and highest corner of where grasps are looked for, metres.
+        bounds: the same of where an object's centre may be; one that leaves it is taken away.
+    """
+
+    boxes: tuple[Box, ...]
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]]
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
+
+    def add_to(self, world: World) -> frozenset[int]:
+        """Put everything there; returns the ids of the obstacles' bodies."""
+        bodies = [box.add_to(world).uid for box in self.boxes]
+        pairs = zip(bodies, self.boxes, strict=True)
+        return frozenset(uid for uid, box in pairs if box.obstacle)
+
+    def contain(self, body: Body) -> bool:
+        """Whether an object is where objects are."""
+        low, high = np.asarray(self.bounds)
+        position = body.position
+        return bool((position >= low).all() and (position <= high).all())
+
+
+def _slab(size: Matrix, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box:
+    """A box with its top at a height: a table, or a floor."""
+    length, width, height = map(float, size)
+    centre = (x, y, top - height / 2)
+    return Box((length, width, height), centre, friction=TABLE_FRICTION, obstacle=False)
+
+
+OPEN_TABLE = Surroundings(
+    (_slab(np.array(TABLE_EXTENT), TABLE_HEIGHT),),
+    WORKSPACE,
+    ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)),
+)
+
+
+def random_bin(rng: np.random.Generator) -> Surroundings:
+    """An open box on a table or over it, its floor at `TABLE_HEIGHT`."""
+    length, width = rng.uniform(*BIN_LENGTH), rng.uniform(*BIN_WIDTH)
+    height, wall = rng.uniform(*BIN_HEIGHT), rng.uniform(*BIN_WALL)
+    stand = rng.uniform(*BIN_STAND) if rng.random() < BIN_STAND_SHARE else 0.0
+    half = np.array([length, width]) / 2
+    outer = half + wall
+    # The floor reaches down to what the bin stands on: nothing can be pushed through it.
+    floor = Box(
+        (2 * float(outer[0]), 2 * float(outer[1]), wall + stand),
+        (MIDDLE, MIDDLE, TABLE_HEIGHT - (wall + stand) / 2),
+        friction=TABLE_FRICTION,
+        obstacle=False,
+    )
+    boxes = [_slab(np.array(TABLE_EXTENT), TABLE_HEIGHT - wall - stand), floor]
+    z = TABLE_HEIGHT + height / 2
+    for side in (-1.0, 1.0):
+        x, y = MIDDLE + side * (half + wall / 2)
+        boxes.append(Box((wall, 2 * float(outer[1]), height), (float(x), MIDDLE, z)))
+        boxes.append(Box((length, wall, height), (MIDDLE, float(y), z)))
+    low, high = MIDDLE - half, MIDDLE + half
+    top = TABLE_HEIGHT + height + HEAP
+    return Surroundings(
+        tuple(boxes),
+        _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
+        _corners(low, high, 0.0, top),
+    )
+
+
+def random_table(rng: np.random.Generator) -> Surroundings:
+    """A table with an edge near the objects, a floor below, and one to three large things."""
+    reach = np.full(2, TABLE_REACH)
+    low, high = MIDDLE - reach, MIDDLE + reach
+    over = float(rng.uniform(*TABLE_OVER_FLOOR))
+    size = np.array([*rng.uniform(*TABLE_LENGTH, size=2), over])
+    # All the objects' places are on it; an edge may be close to them.
+    aside = rng.uniform(-1.0, 1.0, size=2) * (size[:2] / 2 - reach - 0.02)
+    table = _slab(size, TABLE_HEIGHT, *(MIDDLE + aside))
+    floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
+    boxes = [floor, table]
+    for _ in range(int(rng.integers(LARGE_THINGS[0], LARGE_THINGS[1] + 1))):
+        boxes.append(_large_thing(rng))
+    bottom = TABLE_HEIGHT + SUPPORT_CLEARANCE
+    return Surroundings(
+        tuple(boxes),
+        _corners(low - 0.05, high + 0.05, bottom, TABLE_HEIGHT + 0.30),
+        _corners(low - 0.05, high + 0.05, 0.0, np.inf),
+    )
+
+
+def _large_thing(rng: np.random.Generator) -> Box:
+    """Something too large to grasp that stands beside the objects, turned any way."""
+    kind = (CARTON, CARTON, PANEL, KERB)[int(rng.integers(4))]
+    length, width, height = (float(rng.uniform(*extent)) for extent in kind)
+    yaw, around = rng.uniform(0.0, 2 * np.pi, size=2)
+    away = np.array([np.cos(around), np.sin(around)])
+    along = np.array([np.cos(yaw), np.sin(yaw)])
+    across = np.array([-along[1], along[0]])
+    reach = abs(away @ along) * length / 2 + abs(away @ across) * width / 2
+    x, y = MIDDLE + (reach + rng.uniform(*LARGE_DISTANCE)) * away
+    centre = (float(x), float(y), TABLE_HEIGHT + height / 2)
+    return Box((length, width, height), centre, yaw=float(yaw))
+
+
+def _corners(
+    low: Matrix, high: Matrix, bottom: float, top: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    x_low, y_low = map(float, low)
+    x_high, y_high = map(float, high)
+    return (x_low, y_low, bottom), (x_high, y_high, top)

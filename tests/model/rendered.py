@@ -1,0 +1,102 @@
+"""Scenes of solid boxes, as a depth camera sees them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+WIDTH, HEIGHT, FOCAL_LENGTH = 320, 240, 270.0
+NOISE = 0.0015  # metres at one metre; grows with the square of the distance
+
+
+@dataclass
+class SolidBox:
+    """A box; world frame, metres, z up."""
+
+    center: np.ndarray  # (3,)
+    half: np.ndarray  # (3,)
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3))  # R_world_box
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Distance (N,) of points (N, 3) from the box; 0 inside."""
+        apart = np.abs((points - self.center) @ self.turn) - self.half
+        return np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+
+
+def box(center: object, half: object, yaw: float = 0.0) -> SolidBox:
+    turn = Rotation.from_euler("z", yaw).as_matrix()
+    return SolidBox(np.asarray(center, float), np.asarray(half, float), turn)
+
+
+def table(half_width: float = 0.5, half_depth: float = 0.4) -> SolidBox:
+    """A table top at z = 0."""
+    return box((0, 0, -0.015), (half_width, half_depth, 0.015))
+
+
+FURNITURE = {
+    "floor": [box((0, 0, -0.75), (4, 4, 0.05))],
+    "wall": [box((0, 0.5, 0.4), (3, 0.05, 1.6))],
+    "monitor": [box((-0.38, 0.05, 0.2), (0.03, 0.25, 0.2))],
+}
+
+
+def bin_walls(length: float, width: float, height: float, wall: float = 0.005) -> list[SolidBox]:
+    """An open box on z = 0 around the origin."""
+    x, y, z = length / 2, width / 2, height / 2
+    return [
+        box((x, 0, z), (wall / 2, y, z)),
+        box((-x, 0, z), (wall / 2, y, z)),
+        box((0, y, z), (x, wall / 2, z)),
+        box((0, -y, z), (x, wall / 2, z)),
+        box((0, 0, wall / 2), (x, y, wall / 2)),
+    ]
+
+
+def things(seed: int, count: int = 4) -> list[SolidBox]:
+    """Boxes a hand can grasp, standing apart from each other on z = 0."""
+    rng = np.random.default_rng(seed)
+    placed: list[SolidBox] = []
+    while len(placed) < count:
+        half = rng.uniform([0.012, 0.02, 0.025], [0.025, 0.05, 0.07])
+        x, y = rng.uniform([-0.2, -0.15], [0.2, 0.15])
+        new = box((x, y, half[2]), half, rng.uniform(0, np.pi))
+        if all(np.hypot(*(new.center - other.center)[:2]) > 0.15 for other in placed):
+            placed.append(new)
+    return placed
+
+
+def camera(polar: float, azimuth: float, distance: float) -> np.ndarray:
+    """T_world_camera (4, 4), looking at the origin; x right, y down, z forward."""
+    out = np.array(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = np.stack([right, np.cross(-out, right), -out], axis=1)
+    T_world_camera[:3, 3] = distance * out
+    return T_world_camera
+
+
+def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> np.ndarray:
+    """The organised cloud (HEIGHT, WIDTH, 3) in the camera's frame, NaN where nothing is seen."""
+    row, column = np.indices((HEIGHT, WIDTH))
+    rays = np.stack(
+        [
+            (column - WIDTH / 2) / FOCAL_LENGTH,
+            (row - HEIGHT / 2) / FOCAL_LENGTH,
+            np.ones((HEIGHT, WIDTH)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    in_world, eye = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    depth = np.full(len(rays), np.inf)
+    for one in boxes:
+        start, way = (eye - one.center) @ one.turn, in_world @ one.turn
+        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+        first, last = (-one.half - start) / way, (one.half - start) / way
+        enter, leave = np.minimum(first, last).max(axis=1), np.maximum(first, last).min(axis=1)
+        depth = np.where((enter < leave) & (enter > 0.05), np.minimum(depth, enter), depth)
+    depth[~np.isfinite(depth)] = np.nan
+    noise = np.random.default_rng(seed).normal(0.0, NOISE, len(depth))
+    points = rays * (depth + noise * depth**2)[:, None]
+    return points.reshape(HEIGHT, WIDTH, 3).astype(np.float32)

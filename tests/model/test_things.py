@@ -1,0 +1,151 @@
+"""What a camera sees without being told more: the support, and the things that stand on it."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.results import Detection
+from edgegrasp_model.scene.cloud import CloudInput
+
+from .rendered import FURNITURE, SolidBox, bin_walls, box, camera, render, table, things
+from .scenes import SEED, detector
+
+AROUND = [*sorted(FURNITURE), "edge"]  # of the table, near the things
+AT_CAMERA = {"viewpoint": (0.0, 0.0, 0.0)}
+
+
+def detect(cloud: object, **options: object) -> Detection:
+    return detector().detect(cloud, parse_options(AT_CAMERA | {"num_candidates": 300} | options))
+
+
+def view(rng: np.random.Generator) -> np.ndarray:
+    return camera(rng.uniform(0.5, 1.15), rng.uniform(-2.6, -0.5), rng.uniform(0.6, 0.9))
+
+
+def standing(detection: Detection, boxes: list[SolidBox], T_world_camera: np.ndarray) -> set[int]:
+    """Which of the boxes the objects of an answer are; each object has to be one of them."""
+    found = set()
+    for thing in detection.objects:
+        center = T_world_camera[:3, :3] @ thing.center + T_world_camera[:3, 3]
+        distance = [one.distance(center[None])[0] for one in boxes]
+        assert min(distance) < 0.02, f"{thing} is none of the boxes"
+        found.add(int(np.argmin(distance)))
+    return found
+
+
+@given(seed=st.integers(0, SEED), around=st.sets(st.sampled_from(AROUND)))
+@settings(max_examples=25)
+def test_furniture_around_them_makes_no_other_things(seed: int, around: set[str]) -> None:
+    rng = np.random.default_rng(seed)
+    boxes, T_world_camera = things(seed), view(rng)
+    furniture = [one for name in sorted(around - {"edge"}) for one in FURNITURE[name]]
+    top = table(0.3, 0.24) if "edge" in around else table()
+    plain = detect(render([table(), *boxes], T_world_camera))
+    crowded = detect(render([top, *boxes, *furniture], T_world_camera))
+    assert standing(plain, boxes, T_world_camera) >= standing(crowded, boxes, T_world_camera)
+    assert crowded.support is not None
+    up = T_world_camera[:3, :3] @ crowded.support.normal
+    assert up[2] > np.cos(np.radians(5))
+    height = crowded.support.offset - crowded.support.normal @ (
+        -T_world_camera[:3, :3].T @ T_world_camera[:3, 3]
+    )
+    assert abs(height) < 0.01
+    for grasp in crowded.grasps:
+        contact = T_world_camera[:3, :3] @ grasp.contact_point + T_world_camera[:3, 3]
+        assert min(one.distance(contact[None])[0] for one in boxes) < 0.01
+        assert grasp.approach_direction @ crowded.support.normal < 0.11  # none from below
+        assert grasp.object in {thing.number for thing in crowded.objects}
+
+
+@given(seed=st.integers(0, SEED))
+@settings(max_examples=10)
+def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cloud = render([table(), *things(seed), *FURNITURE["wall"], *FURNITURE["floor"]], view(rng))
+    turn, shift = Rotation.random(rng=rng), rng.uniform(-0.5, 0.5, 3)
+    moved = (turn.apply(cloud.reshape(-1, 3).astype(np.float64)) + shift).reshape(cloud.shape)
+    here, there = detect(cloud), detect(moved, viewpoint=shift.tolist())
+    assert here.support is not None and there.support is not None
+    assert there.support.normal @ turn.apply(here.support.normal) > 1 - 1e-5
+    np.testing.assert_allclose(there.up, turn.apply(here.up), atol=1e-3)
+    assert len(there.objects) == len(here.objects)
+    for one, other in zip(here.objects, there.objects, strict=True):
+        np.testing.assert_allclose(turn.apply(one.center) + shift, other.center, atol=0.004)
+    assert here.grasps and there.grasps
+    best = here.grasps[0]
+    contact = turn.apply(best.contact_point) + shift
+    apart = [np.linalg.norm(grasp.contact_point - contact) for grasp in there.grasps]
+    assert min(apart) < 0.005
+
+
+@pytest.mark.parametrize("polar", [0.05, 0.4])
+def test_a_bin_has_contents_and_no_rims(polar: float) -> None:
+    rng = np.random.default_rng(3)
+    contents = [
+        box((*rng.uniform([-0.12, -0.07], [0.12, 0.07]), 0.03), (0.02, 0.045, 0.025), yaw)
+        for yaw in rng.uniform(0, 3, 4)
+    ]
+    T_world_camera = camera(polar, -1.5, 0.8)
+    cloud = render([table(), *bin_walls(0.45, 0.32, 0.12), *contents], T_world_camera)
+    found = detect(cloud)
+    assert found.grasps
+    for grasp in found.grasps:
+        contact = T_world_camera[:3, :3] @ grasp.contact_point + T_world_camera[:3, 3]
+        assert min(one.distance(contact[None])[0] for one in contents) < 0.01
+
+
+def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
+    boxes = [box((-0.05, 0, 0.05), (0.02, 0.03, 0.05)), box((0.12, 0, 0.05), (0.02, 0.03, 0.05))]
+    cloud = render([table(), *boxes], camera(0.8, -1.5, 0.7))
+    T_world_camera = camera(0.8, -1.5, 0.7)
+    in_world = cloud.reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    asked = {
+        "viewpoint": T_world_camera[:3, 3].tolist(),
+        "workspace": {"min": (-0.2, -0.2, -0.05), "max": (0.05, 0.2, 0.3)},
+        "debug": True,
+    }
+    found = detector().detect(
+        CloudInput(in_world.astype(np.float32)[np.isfinite(in_world).all(axis=1)]),
+        DetectOptions.model_validate(asked),
+    )
+    assert found.grasps and found.debug is not None
+    assert all(grasp.contact_point[0] < 0.051 for grasp in found.grasps)
+    assert found.debug.points[:, 0].max() > 0.1  # the other box is still an obstacle
+    assert len(found.objects) == 1
+
+
+def test_segments_are_the_objects_where_they_are_sent() -> None:
+    boxes, T_world_camera = things(5), camera(0.8, -1.5, 0.7)
+    cloud = render([table(), *boxes], T_world_camera)
+    in_world = cloud.reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    near = np.nan_to_num(in_world, nan=9.0)
+    segment = np.where(boxes[2].distance(near) < 0.004, 7, 0).reshape(cloud.shape[:2])
+    found = detect(CloudInput(cloud, segment_ids=segment))
+    assert {grasp.object for grasp in found.grasps} == {7}
+    assert [thing.number for thing in found.objects] == [7]
+
+
+def test_without_a_support_in_view_everything_is_a_thing_and_the_answer_says_so() -> None:
+    cloud = render([box((0, 0, 0), (0.03, 0.04, 0.06), 0.4)], camera(0.8, -1.5, 0.5))
+    found = detect(cloud)
+    assert found.support is None
+    assert len(found.objects) == 1
+    assert any("no support plane" in warning for warning in found.warnings)
+
+
+def test_a_plane_far_from_the_sent_up_is_told_with_its_tilt() -> None:
+    T_world_camera = camera(0.6, -1.5, 0.7)
+    cloud = render([table(), *things(1)], T_world_camera)
+    tilted = T_world_camera[:3, :3].T @ Rotation.from_euler("x", 50, degrees=True).apply([0, 0, 1])
+    found = detect(cloud, up=tilted.tolist())
+    assert found.support is None
+    assert any("50 degrees" in warning for warning in found.warnings)
+
+
+def test_an_empty_table_is_a_support_with_nothing_on_it() -> None:
+    found = detect(render([table()], camera(0.6, -1.5, 0.7)))
+    assert found.support is not None
+    assert (found.grasps, found.objects) == ([], [])
