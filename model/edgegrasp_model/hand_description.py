@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import runs_along
 from edgegrasp_model.hand_view import (
     APPROACH_LENGTH,
     NEAR,
@@ -20,7 +21,6 @@ from edgegrasp_model.hand_view import (
     mirror_sides,
     reach_of,
 )
-from edgegrasp_model.kernels import runs_along
 from edgegrasp_model.options import Boxes, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.unseen import DepthMap, unseen_space

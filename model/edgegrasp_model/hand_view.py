@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import points_in_hand_boxes
+from edgegrasp_model.hand_kernels import points_in_hand_boxes
 from edgegrasp_model.scene.cloud import UP, Cloud
 
 Float32 = NDArray[np.float32]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import distance_behind
+from edgegrasp_model.hand_kernels import distance_behind
 from edgegrasp_model.options import Corner
 
 Float32 = NDArray[np.float32]

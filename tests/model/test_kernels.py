@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view import hand_views, reach_of
-from edgegrasp_model.kernels import (
+from edgegrasp_model.hand_kernels import (
     any_point_in_boxes,
-    nearest_in_groups,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
+from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import nearest_in_ball
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.options import Collision

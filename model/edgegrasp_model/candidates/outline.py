@@ -18,8 +18,9 @@ from edgegrasp_model.candidates.edge_grasps import (
     support_clearance,
 )
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import free_way
 from edgegrasp_model.hand_view import APPROACH_LENGTH
-from edgegrasp_model.kernels import extents_across, free_way, level_spread
+from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP
 

@@ -23,6 +23,7 @@ NORMAL_NEIGHBORS = 20
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 BORDER = 3  # pixels
 FRAME = 0.05  # of an image's width or height without depths along its border
+CUBE = 8  # voxels along the edge of a cube whose points follow one another
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 
 
@@ -302,9 +303,13 @@ class Voxels:
 def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
     """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
     low = points.min(axis=0).astype(np.float64)
-    cells = np.floor((points - low) / voxel_size).astype(np.int64)  # (N, 3)
-    sizes = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    cells = [((points[:, d] - low[d]) / voxel_size).astype(np.int64) for d in range(3)]
+    # Cube by cube: loops over hands then pass over many points that are far at a time.
+    keys = np.zeros(len(points), dtype=np.int64)
+    for cell in cells:
+        keys = keys * (cell.max() // CUBE + 1) + cell // CUBE
+    for cell in cells:
+        keys = keys * CUBE + cell % CUBE
     _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
     return Voxels(voxel, count)
 
