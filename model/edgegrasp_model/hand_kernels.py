@@ -95,26 +95,6 @@ def distance_behind(
     return behind
 
 
-def runs_along(hand: Int64, y: Float32, num_hands: int, gap: float) -> tuple[Float32, Float32]:
-    """How points lie along an axis of some hands: in one run, or in several with gaps between.
-
-    Args:
-        hand: (P,) of each point, ascending.
-        y: (P,) metres.
-        num_hands: E.
-        gap: Metres without a point that end a run.
-
-    Returns:
-        (E, 2) greatest and least y; (E, 3) the longest part without a point, and the lengths of
-        the runs from the greatest and from the least y on. 0 where there is no point.
-    """
-    ends = np.zeros((num_hands, 2), dtype=np.float32)
-    runs = np.zeros((num_hands, 3), dtype=np.float32)
-    bounds = np.searchsorted(hand, np.arange(num_hands + 1))
-    _runs(np.ascontiguousarray(y), bounds, np.float32(gap), ends, runs)
-    return ends, runs
-
-
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
     """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
@@ -322,23 +302,3 @@ def _behind(
             if (abs(i) <= half) & (abs(j) <= half):
                 first = surface[int(i) + half, int(j) + half]
                 behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
-
-
-@compiled("contract")
-def _runs(y: Float32, bounds: Int64, gap: np.float32, ends: Float32, runs: Float32) -> None:
-    for e in range(len(ends)):
-        along = np.sort(y[bounds[e] : bounds[e + 1]])
-        if len(along) == 0:
-            continue
-        low, high = along[0], along[-1]
-        ends[e, 0], ends[e, 1] = high, low
-        runs[e, 1], runs[e, 2] = high - low, high - low
-        whole = True
-        for i in range(1, len(along)):
-            apart = along[i] - along[i - 1]
-            runs[e, 0] = max(runs[e, 0], apart)
-            if apart > gap:
-                runs[e, 1] = high - along[i]
-                if whole:
-                    runs[e, 2] = along[i - 1] - low
-                whole = False
