@@ -26,7 +26,7 @@ from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch, hand_batch
+from edgegrasp_model.networks.hand import HandBatch, hand_batch, score_best_closely
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import (
     debug_info,
@@ -191,11 +191,18 @@ class GraspDetector:
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
-    def run(self, batch: Batch) -> Float32:
-        """Second stage: the network's logits.  # (E,)."""
+    def run(self, batch: Batch, *, all_closely: bool = False) -> Float32:
+        """Second stage: the network's logits (E,).
+
+        A hand network looks at all hands quickly and at the best closely, unless all are to be.
+        """
+        batch = batch.to(self.device)
         with torch.inference_mode():
-            logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
-        return logits
+            if isinstance(batch, HandBatch) and not all_closely:
+                logits = score_best_closely(self.network, batch)
+            else:
+                logits = self.network(batch)
+        return np.asarray(logits.float().cpu().numpy())
 
     def finish(self, prepared: Prepared, logits: NDArray[np.floating]) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
@@ -269,7 +276,7 @@ class GraspDetector:
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
             scorer = Scorer(
-                lambda batch: self._probability(self.run(batch)),
+                lambda batch: self._probability(self.run(batch, all_closely=True)),
                 prepared.crop_radius,
                 self.metadata.network,
             )
