@@ -1,7 +1,7 @@
 """From the array a caller sends to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,13 +55,14 @@ class CheckedCloud:
 
     def take(self, kept: NDArray[np.bool_] | Int64) -> "CheckedCloud":
         """Some of the points, by truth values (N,) or places; rows are counted as before."""
+        place = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         return CheckedCloud(
-            self.points[kept],
-            self.row[kept],
+            self.points.take(place, axis=0),  # many times faster than by brackets
+            self.row[place],
             self.rows_sent,
-            None if self.normals is None else self.normals[kept],
-            None if self.segment_ids is None else self.segment_ids[kept],
-            None if self.view_ids is None else self.view_ids[kept],
+            None if self.normals is None else self.normals[place],
+            None if self.segment_ids is None else self.segment_ids[place],
+            None if self.view_ids is None else self.view_ids[place],
             self.image_size,
         )
 
@@ -103,7 +104,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
             kept = np.flatnonzero(_finite(points))
-            points = points[kept]
+            points = points.take(kept, axis=0)
             if len(points) == 0:
                 raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
     valid = validate_cloud(points, num_approach_points)
@@ -112,7 +113,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
     _floats("colors", sent.colors, size, None)
     return CheckedCloud(
         valid,
-        row.astype(np.int64),
+        row.astype(np.int64, copy=False),
         size,
         _floats("normals", sent.normals, size, row),
         _integers("segment_ids", sent.segment_ids, size, row),
@@ -314,28 +315,32 @@ def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
     return Voxels(voxel, count)
 
 
-def statistical_outlier_removal(points: Float32) -> NDArray[np.bool_]:
+class Neighbors(NamedTuple):
+    """The points of a cloud that are nearest to each of its N points, itself the first."""
+
+    distance: Float64  # (N, K) metres
+    row: Int64  # (N, K)
+
+    @classmethod
+    def within(cls, points: Float32) -> Self:
+        """Of points (N, 3); K is NORMAL_NEIGHBORS, or N where there are fewer."""
+        k = min(NORMAL_NEIGHBORS, len(points))
+        distance, row = cKDTree(points).query(points, k=range(1, k + 1))
+        return cls(np.asarray(distance), np.asarray(row))
+
+
+def statistical_outlier_removal(near: Neighbors) -> NDArray[np.bool_]:
     """Which points (N,) are not far from their neighbours by the measure of the whole cloud."""
-    if len(points) <= OUTLIER_NEIGHBORS:
-        return np.ones(len(points), dtype=bool)
-    distances, _ = cKDTree(points).query(points, k=range(2, OUTLIER_NEIGHBORS + 2))
-    mean = np.mean(distances, axis=1)
+    if len(near.row) <= OUTLIER_NEIGHBORS:
+        return np.ones(len(near.row), dtype=bool)
+    mean = near.distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
     kept: NDArray[np.bool_] = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
     return kept
 
 
-def estimate_normals(points: Float32) -> Float32:
-    """Unit normals by principal components of each neighbourhood, of either sign.
-
-    Args:
-        points: (N, 3).
-
-    Returns:
-        (N, 3): the direction of least variance among the NORMAL_NEIGHBORS nearest points.
-    """
-    k = min(NORMAL_NEIGHBORS, len(points))
-    _, rows = cKDTree(points).query(points, k=range(1, k + 1))
-    return least_spread(points, np.asarray(rows))
+def estimate_normals(points: Float32, near: Neighbors) -> Float32:
+    """Unit normals (N, 3) of points (N, 3), of either sign: where their neighbours spread least."""
+    return least_spread(points, near.row)
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
