@@ -142,6 +142,15 @@ def _blocks(columns: Float32) -> Float32:
 
 
 @compiled("contract")
+def _around_all(boxes: Float32) -> tuple[Float32, Float32]:
+    """Low and high corner (3,) of the box around boxes (B, 2, 3)."""
+    low, high = boxes[0, 0].copy(), boxes[0, 1].copy()
+    for b in range(1, len(boxes)):
+        low, high = np.minimum(low, boxes[b, 0]), np.maximum(high, boxes[b, 1])
+    return low, high
+
+
+@compiled("contract")
 def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
     """Whether a point of a block may lie between two corners of a hand's frame."""
     x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
@@ -202,8 +211,11 @@ def _fill_within(
 @compiled("contract")
 def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
     sphere = _blocks(columns)
+    least, most = _around_all(boxes)
     for e in range(len(turn)):
         for k in range(len(sphere)):
+            if not _may_reach(sphere[k], turn[e], shift[e], least, most):
+                continue
             inside = 0
             for b in range(len(boxes)):
                 low, high = boxes[b, 0], boxes[b, 1]

@@ -46,8 +46,10 @@ def sample_approach_points(
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = rng.integers(len(points))
     nearest = np.full(len(points), np.inf, dtype=np.float32)
+    columns = np.ascontiguousarray(points.T)
     for i in range(1, count):
-        nearest = np.minimum(nearest, ((points - points[chosen[i - 1]]) ** 2).sum(axis=1))
+        x, y, z = columns - points[chosen[i - 1], :, None]
+        nearest = np.minimum(nearest, x * x + y * y + z * z)
         chosen[i] = int(nearest.argmax())
     return chosen
 
@@ -246,11 +248,12 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
     """
     boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
-    normal = np.asarray(support.normal)
-    normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)
-    origin_height = T_cloud_hand[:, :3, 3] @ normal - support.offset  # (E,)
-    lowest = (normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T).min(axis=1)
-    clearance: Float32 = origin_height + lowest
+    x, y, z = support.normal
+    rows = T_cloud_hand.astype(np.float64)
+    along = x * rows[:, 0] + y * rows[:, 1] + z * rows[:, 2]  # (E, 4): of the axes, the origin
+    normal_in_hand, origin_height = along[:, :3], along[:, 3] - support.offset
+    corners = normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T  # (E, B)
+    clearance: Float32 = origin_height + np.min(list(corners.T), axis=0)
     return clearance.astype(np.float32)
 
 

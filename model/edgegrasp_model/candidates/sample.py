@@ -31,7 +31,8 @@ Bools = NDArray[np.bool_]
 SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
-MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 128  # of a scene
+MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
+FEWEST_EACH = 4  # of an object, however many there are
 OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
@@ -146,7 +147,7 @@ def approach_points(
         wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
         wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
         wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
-        wanted = np.maximum(wanted, 1)
+        wanted = np.maximum(wanted, FEWEST_EACH)
     else:  # the largest objects first where there are fewer approach points than objects
         share = np.sqrt(size) / np.sqrt(size).sum() * options.num_approach_points
         wanted = np.floor(share).astype(np.int64)
