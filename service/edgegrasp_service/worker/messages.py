@@ -172,10 +172,14 @@ def _tagged(message: Message) -> dict[str, Any]:
     return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
 
 
-def _support(message: grasp_pb2.Support) -> dict[str, Any]:
+def _support(message: grasp_pb2.Support) -> dict[str, Any] | None:
     fields = _plain_fields(message)
-    ransac = fields.pop("ransac", None)
-    return fields if ransac is None else {"kind": "ransac"} | fields | ransac
+    if fields.pop("disabled"):
+        return None
+    kinds = {kind: fields.pop(kind) for kind in ("ransac", "auto") if kind in fields}
+    for kind, more in kinds.items():
+        fields |= {"kind": kind} | more
+    return fields
 
 
 def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
