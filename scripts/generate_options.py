@@ -314,8 +314,8 @@ a `Quaternion` `[x, y, z, w]`. Options come first in the table, then the objects
 Where a JSON object has a `kind`, gRPC has a message with one field for each kind; but a given
 support plane has its fields in `Support` itself, where one to look for is the field `auto` or
 `ransac`.
-`"suppression": null` and `"support": null` are `disabled: true` in gRPC; any other `null` is a field
-left out.
+`"suppression": null` and `"support": null` are `disabled: true` in gRPC; any other `null` is a
+field left out.
 
 This page is generated from the server's own definition by `make proto`.
 """

@@ -164,11 +164,11 @@ def models_from(answer: Any, read: Read) -> list[Model]:
 
 def _record(kind: type[Record], answer: Any, read: Read) -> Record:
     """An object whose fields are read as they are, lists of numbers as arrays."""
-    values = {one.name: read(answer, one.name) for one in fields(kind)}
     plain = (str, int, float, type(None))
-    return kind(
-        **{name: one if isinstance(one, plain) else _array(one) for name, one in values.items()}
-    )
+    values: dict[str, Any] = {one.name: read(answer, one.name) for one in fields(kind)}
+    for name, value in values.items():
+        values[name] = value if isinstance(value, plain) else _array(value)
+    return kind(**values)
 
 
 def _array(numbers: Any) -> Float32:
