@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import limits, pack, receive
+from edgegrasp_service.worker.job import Answer, Job, pack, receive
 
 logger = logging.getLogger(__name__)
 
@@ -71,12 +70,12 @@ def replay(path: Path, settings: Settings) -> Replay:
         ValueError: It is no recording.
         EdgeGraspError: Weights cannot be used.
     """
-    from edgegrasp_service.worker.answer import Answerer, load_catalogue
+    from edgegrasp_service.worker import answer as worker
 
     with path.open("rb") as file:
-        job, recorded = receive(file.readinto), receive(file.readinto)
+        job, recorded = receive(file), receive(file)
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
         raise ValueError(f"{path} is no recorded request")
     job = replace(job, remaining=settings.max_request_seconds)
-    answer = Answerer(load_catalogue(settings), limits(settings)).answer(job)
-    return Replay(job, recorded.body, answer)
+    again = worker.answer(job, worker.load_catalogue(settings), settings)
+    return Replay(job, recorded.body, again)

@@ -5,9 +5,12 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import pytest
+from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp_service.recording import replay
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker import answer
 
 
 def npy(cloud: np.ndarray) -> bytes:
@@ -16,7 +19,9 @@ def npy(cloud: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-async def test_recorded_requests_are_replayed(serve, connect, cloud, tmp_path: Path) -> None:
+async def test_recorded_requests_are_replayed(
+    serve, connect, cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     running = await serve(record_folder=tmp_path / "recorded")
     client = connect(running)
     assert (await client.detect(cloud, seed=3)).fine
@@ -24,7 +29,8 @@ async def test_recorded_requests_are_replayed(serve, connect, cloud, tmp_path: P
     running.stop.set()
     await running.serving
     fine, bad = sorted((tmp_path / "recorded").glob("*.job"))
-    settings = Settings(backend="dummy")
+    settings = Settings()
+    monkeypatch.setattr(answer, "load_catalogue", lambda settings: DummyCatalogue())
     again = replay(fine, settings)
     assert again.answer.error is None
     assert again.answer.facts.grasps == 10

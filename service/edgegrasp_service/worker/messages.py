@@ -16,9 +16,8 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
 from edgegrasp_model.results import Detection, Scoring
-from edgegrasp_service.schemas import PER_POINT
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import File
+from edgegrasp_service.worker.request_cloud import PER_POINT, File
 
 MAX_PARTS = 64  # messages in a repeated field; no option takes more
 MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
