@@ -35,6 +35,7 @@ class CloudInput:
     colors: object | None = None  # like points; checked, and not used by any network so far
     segment_ids: object | None = None  # (N,) or (H, W) integers
     view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
+    warnings: tuple[str, ...] = ()  # what was doubtful when it was read, for the answer
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class CheckedCloud:
     normals: Float32 | None = None  # (N, 3)
     segment_ids: NDArray[np.int64] | None = None  # (N,)
     view_ids: NDArray[np.int64] | None = None  # (N,)
+    warnings: tuple[str, ...] = ()
 
     def take(self, kept: NDArray[np.bool_]) -> "CheckedCloud":
         """The points for which `kept` (N,) holds; rows are counted as before."""
@@ -92,6 +94,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         _floats("normals", sent.normals, size, row),
         _integers("segment_ids", sent.segment_ids, size, row),
         _integers("view_ids", sent.view_ids, size, row),
+        sent.warnings,
     )
 
 
@@ -206,10 +209,11 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
         raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        fix = "Send shape (N, 3) or (H, W, 3): x, y, z; a depth image as one of depth_images."
+        raise InvalidRequest("cloud", f"shape {cloud.shape}", fix)
     if cloud.dtype not in (np.float32, np.float64):
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise InvalidRequest("cloud", f"shape {cloud.shape}", "Send shape (N, 3): x, y, z a row.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
     finite = np.isfinite(cloud).all(axis=1)
