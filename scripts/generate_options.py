@@ -277,7 +277,9 @@ def _python_type(name: str, schema: Schema) -> str:
     nullable = any(one.get("type") == "null" for one in schema.get("anyOf", ()))
     if name in UNIONS:
         return f"Sequence[{UNIONS[name]}]"
-    kinds = list(dict.fromkeys(_one_python_type(one) for one in alternatives(schema)))
+    packed = "contentEncoding"  # text in JSON, where Python has arrays
+    parts = [one for one in alternatives(schema) if packed not in one]
+    kinds = list(dict.fromkeys(map(_one_python_type, parts)))
     return " | ".join([*kinds, "None"] if nullable else kinds)
 
 

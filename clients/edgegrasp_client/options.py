@@ -120,7 +120,7 @@ class Mask(TypedDict):
     """Points by one truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
-    # as many values as the cloud has rows
+    # as many values as the cloud has rows; in JSON also base64 of a byte for each
     mask: Sequence[bool] | NDArray[Any]
 
 

@@ -118,7 +118,7 @@ class _Work:
         self.options = options = parse_options(fields["options"])
         for name in ("approach_points", "candidates"):
             most = getattr(settings, f"max_{name}")
-            _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
+            _limit(f"options.num_{name}", getattr(options, f"num_{name}") or 0, most)
         detector = self._catalogue.get(options.model)
         given = {} if self._job.method == "DetectGrasps" else _given(fields, settings)
         cloud, options = decode_cloud(fields, options, settings.max_points)
