@@ -259,8 +259,9 @@ class DetectOptions(TypedDict, total=False):
     top_k: int
     # non-maximum suppression; None: none
     suppression: Suppression | None
-    # what comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    # others by score; or the clearance
+    # what comes first: the score (before others, the best grasp of each object that has one of 0.5
+    # and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    # the clearance
     order: Literal["score", "highest", "clearance"]
     # whether to return the processed cloud and every candidate
     debug: bool

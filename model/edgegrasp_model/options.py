@@ -573,8 +573,9 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="what comes first: the score; the highest TCP along up among scores of 0.9 "
-        "and more, then the others by score; or the clearance",
+        description="what comes first: the score (before others, the best grasp of each object "
+        "that has one of 0.5 and more); the highest TCP along up among scores of 0.9 and more, "
+        "then the others by score; or the clearance",
     )
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"

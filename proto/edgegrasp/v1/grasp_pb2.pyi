@@ -611,8 +611,9 @@ class DetectOptions(_message.Message):
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """What comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    others by score; or the clearance. One of "score", "highest", "clearance".
+    """What comes first: the score (before others, the best grasp of each object that has one of 0.5
+    and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    the clearance. One of "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
@@ -1666,7 +1667,7 @@ class DetectGraspsResponse(_message.Message):
     """Name of the weights used."""
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___Grasp]:
-        """Ranked, best first."""
+        """Ranked as options.order says, the best first."""
 
     @_builtins.property
     def counts(self) -> _containers.ScalarMap[_builtins.str, _builtins.int]:
