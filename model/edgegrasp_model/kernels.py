@@ -159,6 +159,52 @@ def level_spread(
     return least, offset, deviation
 
 
+def distance_behind(
+    surface: Float32,
+    turn: NDArray[np.floating],
+    shift: NDArray[np.floating],
+    places: Float32,
+    cell: float,
+) -> Float32:
+    """How far places of some hands lie behind the first surface that a camera saw.
+
+    Args:
+        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle one ahead; inf
+            where nothing was seen.
+        turn: (E, 3, 3) from each hand's frame to the camera's: across, down, ahead.
+        shift: (E, 3) of each hand in the camera's frame.
+        places: (S, 3) hand frame.
+        cell: Tangent of the angle of a cell.
+
+    Returns:
+        (E, S) metres; 0 in front of the surface, and where nothing was seen.
+    """
+    behind = np.zeros((len(turn), len(places)), dtype=np.float32)
+    turn = np.ascontiguousarray(turn, dtype=np.float32)
+    _behind(surface, turn, shift.astype(np.float32), places, np.float32(1.0 / cell), behind)
+    return behind
+
+
+def runs_along(hand: Int64, y: Float32, num_hands: int, gap: float) -> tuple[Float32, Float32]:
+    """How points lie along an axis of some hands: in one run, or in several with gaps between.
+
+    Args:
+        hand: (P,) of each point, ascending.
+        y: (P,) metres.
+        num_hands: E.
+        gap: Metres without a point that end a run.
+
+    Returns:
+        (E, 2) greatest and least y; (E, 3) the longest part without a point, and the lengths of
+        the runs from the greatest and from the least y on. 0 where there is no point.
+    """
+    ends = np.zeros((num_hands, 2), dtype=np.float32)
+    runs = np.zeros((num_hands, 3), dtype=np.float32)
+    bounds = np.searchsorted(hand, np.arange(num_hands + 1))
+    _runs(np.ascontiguousarray(y), bounds, np.float32(gap), ends, runs)
+    return ends, runs
+
+
 def _columns(points: Float32) -> Float32:
     return np.ascontiguousarray(points.T, dtype=np.float32)  # (3, N)
 
@@ -453,3 +499,43 @@ def _level_spread(
         least[m, 0], least[m, 1], least[m, 2] = s * sx + t * tx, s * sy + t * ty, s * sz + t * tz
         offset[m] = outward
         deviation[m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+
+
+@compiled("contract")
+def _behind(
+    surface: Float32,
+    turn: Float32,
+    shift: Float32,
+    places: Float32,
+    cells: np.float32,
+    behind: Float32,
+) -> None:
+    half = len(surface) // 2
+    for e in range(len(turn)):
+        for s in range(len(places)):
+            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
+            ahead = max(z, np.float32(1e-6))
+            i, j = np.floor(x / ahead * cells), np.floor(y / ahead * cells)
+            if (abs(i) <= half) & (abs(j) <= half):
+                first = surface[int(i) + half, int(j) + half]
+                behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
+
+
+@compiled("contract")
+def _runs(y: Float32, bounds: Int64, gap: np.float32, ends: Float32, runs: Float32) -> None:
+    for e in range(len(ends)):
+        along = np.sort(y[bounds[e] : bounds[e + 1]])
+        if len(along) == 0:
+            continue
+        low, high = along[0], along[-1]
+        ends[e, 0], ends[e, 1] = high, low
+        runs[e, 1], runs[e, 2] = high - low, high - low
+        whole = True
+        for i in range(1, len(along)):
+            apart = along[i] - along[i - 1]
+            runs[e, 0] = max(runs[e, 0], apart)
+            if apart > gap:
+                runs[e, 1] = high - along[i]
+                if whole:
+                    runs[e, 2] = along[i - 1] - low
+                whole = False

@@ -12,7 +12,6 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 from scipy.stats import rankdata
 
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.views import table
 
@@ -148,7 +147,7 @@ def _layers(network: NetworkConfig) -> list[tuple[str, object]]:
     """What comes before the classifier."""
     if network.architecture == "hand":
         return [
-            ("hand description", f"{HAND_DESCRIPTION_SIZE} numbers per edge grasp"),
+            ("hand description", f"{network.description_size} numbers per edge grasp"),
             ("point encoder", f"{network.hand_widths}, {network.hand_points} points of each hand"),
         ]
     return [

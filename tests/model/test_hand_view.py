@@ -11,12 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.hand_description import (
-    BEHIND,
-    DEEP,
     HAND_DESCRIPTION_SIZE,
-    DepthMap,
     describe_hands,
-    occlusion_fractions,
     without_support,
 )
 from edgegrasp_model.hand_view import hand_views, reach_of
@@ -25,6 +21,7 @@ from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.unseen import BEHIND, DEEP, FAR, DepthMap, unseen, unseen_space
 
 from .scenes import PANDA, SEED, TINY, random_hands
 
@@ -143,7 +140,7 @@ def test_points_in_a_finger_and_between_the_fingers_are_counted() -> None:
 def test_without_a_support_plane_heights_are_the_same_stand_in() -> None:
     cloud, candidates = scene(0)
     described = describe_hands(cloud, candidates, PANDA, UP, None)
-    assert (described[:, -3:] == np.float32(0.10)).all()
+    assert (described[:, 58:61] == np.float32(0.10)).all()
     known = describe_hands(cloud, candidates, PANDA, UP, plane(UP, -0.03))
     assert not np.array_equal(known, described)
     np.testing.assert_array_equal(without_support(known), described)
@@ -163,6 +160,14 @@ def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
     torch.testing.assert_close(scores(replace(batch, points=filled)), scores(batch))
     nothing = replace(batch, point_count=torch.zeros_like(batch.point_count))
     assert scores(nothing).isfinite().all()
+
+
+def test_an_older_network_reads_the_numbers_that_it_knows() -> None:
+    batch, older = look(*scene(2)), replace(HAND, description_size=61)
+    fewer = replace(batch, description=batch.description[:, :61].contiguous())
+    assert torch.equal(scores(batch, older), scores(fewer, older))
+    with pytest.raises(ValueError, match="description_size: got 500"):
+        replace(HAND, description_size=500)
 
 
 def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> None:
@@ -194,22 +199,28 @@ def plate(spacing: float = 0.004) -> np.ndarray:
     return np.stack([x, y, np.full_like(x, 0.1)], axis=-1).reshape(-1, 3).astype(np.float32)
 
 
+def behind(cloud: np.ndarray, camera: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Metres that places (S, 3) of the cloud's frame lie behind what a camera saw.  # (S,)."""
+    seen = DepthMap.of_cloud(cloud, camera, UP)
+    return seen.behind(np.eye(4, dtype=np.float32)[None], places.astype(np.float32))[0]
+
+
 @pytest.mark.parametrize("exactly_above", [False, True])
 def test_only_what_is_behind_the_plate_is_hidden(exactly_above: bool) -> None:
     camera = plate().mean(axis=0) + UP / 2 if exactly_above else ABOVE
-    seen = DepthMap.of_cloud(plate(), camera, UP)
     places = np.array(
         [[0, 0, 0.15], [0, 0, 0.1], [0.02, -0.03, 0.0], [0.09, 0, 0.0], [0, 0, -3.0], [3, 0, 0.1]]
     )
-    hidden = seen.hidden(places.astype(np.float32))
+    hidden = unseen(behind(plate(), camera, places))
     np.testing.assert_array_equal(hidden, [0, 0, 1, 0, 1, 0])
 
 
 def test_what_is_just_behind_is_hidden_by_degrees() -> None:
-    seen = DepthMap.of_cloud(plate(), ABOVE, UP)
     depth = np.array([BEHIND / 2, BEHIND + DEEP / 2, BEHIND + 2 * DEEP], dtype=np.float32)
     places = np.stack([0 * depth, 0 * depth, 0.1 - depth], axis=1)
-    np.testing.assert_allclose(seen.hidden(places), [0.0, 0.5, 1.0], atol=0.02)
+    found = behind(plate(), ABOVE, places)
+    np.testing.assert_allclose(found, depth, atol=5e-4)
+    np.testing.assert_allclose(unseen(found), [0.0, 0.5, 1.0], atol=0.02)
 
 
 def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
@@ -217,10 +228,40 @@ def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
     hand = np.eye(4, dtype=np.float32)
     hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     hand[:3, 3] = [-0.1, 0.0, 0.1]
-    parts = occlusion_fractions(plate(), hand[None], ABOVE, UP, PANDA)
-    above, below = parts[0][0], parts[1][0]
-    assert above == 0.0
+    met = np.zeros((1, 2), dtype=np.float32)
+    found = unseen_space(DepthMap.of_cloud(plate(), ABOVE, UP), hand[None], met, PANDA)
+    above, below = found.parts[0][0], found.parts[1][0]
+    assert above == found.depths[0][0] == found.beyond[0][0] == 0.0
     assert below > 0.9
-    unknown = occlusion_fractions(plate(), hand[None], None, UP, PANDA)
-    assert len(unknown) == len(parts)
-    assert not np.any(unknown)
+    assert 0.04 < found.depths[1][0] < FAR
+    assert found.beyond[1][0] > 0.04
+    assert found.ways[0][0] == 0.0
+    unknown = unseen_space(None, hand[None], met, PANDA)
+    assert len(unknown.parts) == len(found.parts)
+    assert not np.any(unknown.parts + unknown.ways + unknown.depths + unknown.beyond)
+
+
+def blocks(gap: float) -> np.ndarray:
+    """The tops of two blocks of 2 by 6 cm with a gap between them along y, at z = 0.  # (N, 3)."""
+    x, y = np.meshgrid(np.arange(-0.03, 0.03, 0.003), np.arange(0.0, 0.0201, 0.002))
+    half = np.stack([x, y + gap / 2, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    return np.concatenate([half, half * (1.0, -1.0, 1.0)]).astype(np.float32)
+
+
+def test_two_things_with_a_gap_between_them_are_not_one() -> None:
+    hand = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+    hand[2, 3] = PANDA.tip_z - 0.015  # the fingertips are 15 mm below the tops
+    index = np.array([0])
+    described = {}
+    for gap in (0.002, 0.03):
+        points = blocks(gap)
+        cloud = Cloud(points, np.broadcast_to(UP, points.shape).astype(np.float32))
+        still = np.zeros(1, dtype=np.float32)
+        grasp = Candidates(index, index, index, UP[None], still, hand[None])
+        described[gap] = describe_hands(cloud, grasp, PANDA, UP, None, ABOVE)[0]
+    free, longest, first, second = described[0.002][-4:]
+    assert free == 0.0
+    np.testing.assert_allclose([longest, first, second], [0.002, 0.042, 0.042], atol=1e-5)
+    free, longest, first, second = described[0.03][-4:]
+    np.testing.assert_allclose([longest, first, second], [0.03, 0.02, 0.02], atol=1e-5)
+    assert 0.01 < free < 0.03

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal, Self, get_args
 
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE
+
 Architecture = Literal["edgegrasp", "vn-edgegrasp", "hand"]
 # Layers of each part of the paper's networks; the classifier may be as deep as it likes.
 _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
@@ -27,6 +29,7 @@ class NetworkConfig:
     classifier_widths: tuple[int, ...] = ()  # hidden layers
     hand_widths: tuple[int, ...] = ()  # of `hand`: shared MLP before the maximum over the points
     hand_points: int = 128  # of `hand`: points around the fingers
+    description_size: int = 61  # of `hand`: numbers it reads of each hand description, the first
     k: int = 16  # neighbours in the graph, the point itself included
     crop_radius: float = 0.05  # ball radius, metres
 
@@ -43,10 +46,15 @@ class NetworkConfig:
             object.__setattr__(self, name, widths)
             if len(widths) != count or not all(_is_count(width) for width in widths):
                 raise ValueError(f"{name}: got {widths}. Give {count} positive whole numbers.")
-        for name in ("hand_points", "k"):
+        for name in ("hand_points", "description_size", "k"):
             if not _is_count(getattr(self, name)):
                 value = getattr(self, name)
                 raise ValueError(f"{name}: got {value!r}. Give a positive whole number.")
+        if self.description_size > HAND_DESCRIPTION_SIZE:
+            raise ValueError(
+                f"description_size: got {self.description_size}. This version describes hands by "
+                f"{HAND_DESCRIPTION_SIZE} numbers."
+            )
         if not 0.0 < self.crop_radius < 1.0:
             raise ValueError(f"crop_radius: got {self.crop_radius!r}. Give metres, such as 0.05.")
 
@@ -120,6 +128,7 @@ HAND = NetworkConfig(
     architecture="hand",
     hand_widths=(32, 64, 128),
     classifier_widths=(256, 128),
+    description_size=HAND_DESCRIPTION_SIZE,
 )
 
 

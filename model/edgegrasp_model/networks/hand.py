@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
+from edgegrasp_model.hand_description import describe_hands
 from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -43,7 +43,7 @@ CHUNK = 32  # hands at a time, so that the work stays in cache
 class HandBatch:
     """E edge grasps, each with what its own hand sees. Metres."""
 
-    description: Tensor  # (E, F) float32
+    description: Tensor  # (E, F) float32, F at least what the network reads
     points: Tensor  # (E, P, 6) float32, positions and normals around the fingers, hand frame
     point_count: Tensor  # (E,) int64, how many of the P there are; zeros follow
 
@@ -96,7 +96,7 @@ class HandBatch:
     def made_up(cls, config: NetworkConfig) -> Self:
         """A fixed batch of 32 hands, to see whether a network computes as it did before."""
         rng = np.random.default_rng(0)
-        description = rng.normal(size=(32, HAND_DESCRIPTION_SIZE))
+        description = rng.normal(size=(32, config.description_size))
         points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
         count = rng.integers(0, config.hand_points + 1, 32)
         return cls(
@@ -140,16 +140,17 @@ class HandNet(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.register_buffer("mean", torch.zeros(HAND_DESCRIPTION_SIZE))
-        self.register_buffer("std", torch.ones(HAND_DESCRIPTION_SIZE))
+        self.register_buffer("mean", torch.zeros(config.description_size))
+        self.register_buffer("std", torch.ones(config.description_size))
         self.point_encoder = mlp((6, *config.hand_widths))
-        inputs = HAND_DESCRIPTION_SIZE + 2 * config.hand_widths[-1]
+        inputs = config.description_size + 2 * config.hand_widths[-1]
         self.classifier = mlp((inputs, *config.classifier_widths, 1))
 
     def set_statistics(self, mean: Tensor, std: Tensor) -> None:
         """Stores mean (F,) and standard deviation (F,) of the training data's descriptions."""
-        self.mean.copy_(mean)
-        self.std.copy_(std.clamp_min(1e-3))
+        size = self.config.description_size
+        self.mean.copy_(mean[:size])
+        self.std.copy_(std[:size].clamp_min(1e-3))
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
         """Scores the edge grasps of a batch: logits (E,) of success.
@@ -158,7 +159,8 @@ class HandNet(nn.Module):
             batch: What E hands see.
             left_out: In training, draws what the classifier is not told; None: it is told all.
         """
-        description = (batch.description - self.mean) / self.std  # (E, F)
+        known = batch.description[:, : self.config.description_size]
+        description = (known - self.mean) / self.std  # (E, F)
         encoder = PackedMlp(self.point_encoder)
         chunks = [
             _around(encoder, points, count)

@@ -1,0 +1,206 @@
+"""What the one camera did not see of the space in and around a hand."""
+
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.kernels import distance_behind
+from edgegrasp_model.options import Corner
+
+Float32 = NDArray[np.float32]
+
+CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
+SPLAT = 2  # cells around its own that a point covers: as far as the next point of the cloud
+BEHIND = 0.004  # metres behind a surface that may still be the surface
+DEEP = 0.02  # metres further behind at which space counts as wholly unknown
+FAR = 0.10  # metres behind a surface; what is farther is no different
+WAY = 0.05  # metres of straight approach on which a finger sweeps space
+LINE = 27  # places on the closing line, from beyond one finger to beyond the other
+NOTHING = np.float32(np.inf)
+STEEP = 1e-3  # sine of the angle to up below which up says nothing about the map
+HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
+FARTHEST = 10 * HALF  # stands for everything farther away
+
+
+class UnseenSpace(NamedTuple):
+    """What was not seen of E hands and of the space around them; all is 0 where all was seen.
+
+    Of two fingers, the one on the side of positive y comes first.
+    """
+
+    parts: list[Float32]  # (E,) each: the unseen share of each of `probes`
+    ways: list[Float32]  # (E,) each: and of the space that each finger sweeps on its way in
+    depths: list[Float32]  # (E,) each: metres that each fingertip is behind a surface
+    beyond: list[Float32]  # (E,) each: unseen metres from what each finger meets first outward
+    free: Float32  # (E,) metres between those two in which nothing is
+
+
+def unseen_space(
+    depth: "DepthMap | None", T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
+) -> UnseenSpace:
+    """Ask a depth map about the hands of some candidates.
+
+    Args:
+        depth: What the only camera saw; None where it is unknown: then all counts as seen.
+        T_cloud_hand: (E, 4, 4), in the map's frame.
+        first_met: (E, 2) greatest and least y of what is between the fingers, hand frame.
+        gripper: Fingers open to its maximum.
+    """
+    if depth is None:
+        nothing = np.zeros(len(T_cloud_hand), dtype=np.float32)
+        both = [nothing, nothing]
+        return UnseenSpace([nothing] * len(probes(gripper)), both, both, both, nothing)
+    parts, ways, (y, line) = probes(gripper), _ways(gripper), _closing_line(gripper)
+    places = [*parts, *ways, line]
+    ends = np.cumsum([len(place) for place in places])[:-1]
+    behind = np.split(depth.behind(T_cloud_hand, np.concatenate(places)), ends, axis=1)
+    shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
+    tips = [np.minimum(part, FAR).mean(axis=1) for part in behind[:2]]
+    along = behind[-1].reshape(len(T_cloud_hand), LINE, -1)  # (E, Y, places at each y)
+    step, high, low = y[1] - y[0], first_met[:, :1], first_met[:, 1:]
+    hidden = unseen(along).mean(axis=2)  # (E, Y)
+    seen = (along < BEHIND).all(axis=2)
+    return UnseenSpace(
+        parts=shares[: len(parts)],
+        ways=shares[len(parts) :],
+        depths=tips,
+        beyond=[step * (hidden * side).sum(axis=1) for side in (y > high, y < low)],
+        free=step * (seen * ((y > low + BEHIND) & (y < high - BEHIND))).sum(axis=1),
+    )
+
+
+def unseen(behind: Float32) -> Float32:
+    """How far metres (...) behind the first surface are space nobody saw: 0 seen, 1 deep."""
+    share: Float32 = np.clip((behind - np.float32(BEHIND)) / np.float32(DEEP), 0.0, 1.0)
+    return share
+
+
+def probes(gripper: Gripper) -> list[Float32]:
+    """Points of each part of the open hand, and of the space around it; hand frame, metres.
+
+    Tips and roots of both fingers, what is beyond each of them, the space between the fingers in
+    three layers, and the hand itself: each (S, 3).
+    """
+    half, inner = gripper.pad_half_width, gripper.max_opening / 2
+    tip, palm = gripper.tip_z, gripper.palm_z
+    thick = max(high[1] for _, high in gripper.finger_boxes) / 2
+    middle, x = (tip + palm) / 2, [-0.7 * half, 0.7 * half]
+    fingers = [
+        _grid(x, side * (inner + np.array([0.3, 1.4]) * thick), np.linspace(low, high, 4)[1:])
+        for low, high in ((middle, tip), (palm, middle))
+        for side in (1.0, -1.0)
+    ]
+    beyond = [
+        _grid([0.0], [side * (inner + thick)], [tip + 0.006, tip + 0.012]) for side in (1.0, -1.0)
+    ]
+    between = [
+        _grid(x, inner * np.array(layer), np.linspace(palm, tip, 5)[1:])
+        for layer in ([0.5, 0.85], [-0.25, 0.25], [-0.85, -0.5])
+    ]
+    inside = [
+        _grid(*(np.linspace(*ends)[1:-1] for ends in _spans(box))) for box in gripper.hand_boxes
+    ]
+    return [*fingers, *beyond, *between, np.concatenate(inside)]
+
+
+def _ways(gripper: Gripper) -> list[Float32]:
+    """Points of the space that each finger sweeps behind its final place: each (S, 3)."""
+    half, inner = gripper.pad_half_width, gripper.max_opening / 2
+    root = min(low[2] for low, _ in gripper.finger_boxes)
+    thick = max(high[1] for _, high in gripper.finger_boxes)
+    x, z = [-0.7 * half, 0.7 * half], root - np.linspace(0.0, WAY, 5)[1:]
+    return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
+
+
+def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
+    """The y (LINE,) of places from beyond one finger to beyond the other, and points at each."""
+    half, length = gripper.pad_half_width, gripper.tip_z - gripper.palm_z
+    thick = max(high[1] for _, high in gripper.finger_boxes)
+    end = gripper.max_opening / 2 + thick
+    y = np.linspace(-end, end, LINE, dtype=np.float32)
+    across = _grid([-0.5 * half, 0.5 * half], [0.0], gripper.tip_z - np.array([0.1, 0.3]) * length)
+    line = across + y[:, None, None] * np.array([0.0, 1.0, 0.0], dtype=np.float32)
+    return y, line.reshape(-1, 3)
+
+
+def _spans(box: tuple[Corner, Corner]) -> list[tuple[float, float, int]]:
+    """Along each axis the ends of a box, and how many points to take from one to the other."""
+    return list(zip(*box, (4, 7, 4), strict=True))
+
+
+def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
+    """All points with these coordinates.  # (X * Y * Z, 3)."""
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid.astype(np.float32)
+
+
+class CameraFrame(NamedTuple):
+    """How a camera looks at a cloud: what directions the cells of its depth map stand for."""
+
+    viewpoint: Float32  # (3,)
+    axes: Float32  # (3, 3) rows: across, down, toward the middle of the cloud
+    cell: float  # tangent of the angle of a cell
+
+    @classmethod
+    def toward(cls, middle: ArrayLike, viewpoint: ArrayLike, up: ArrayLike) -> Self:
+        """A camera that looks at the middle (3,) of a cloud; `up` (3,) turns with the scene."""
+        way = np.asarray(middle, dtype=np.float64) - np.asarray(viewpoint, dtype=np.float64)
+        distance = max(float(np.linalg.norm(way)), 1e-6)
+        ahead = way / distance
+        across = np.cross(ahead, np.asarray(up, dtype=np.float64))
+        if np.linalg.norm(across) < STEEP * np.linalg.norm(up):  # seen from straight above
+            across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+        across /= np.linalg.norm(across)
+        axes = np.stack([across, np.cross(ahead, across), ahead]).astype(np.float32)
+        return cls(np.asarray(viewpoint, dtype=np.float32), axes, CELL / distance)
+
+    def seen(self, positions: Float32) -> tuple[NDArray[np.int64], Float32]:
+        """The cells (N, 2) that positions (N, 3) lie in, the middle one 0, and how far they are."""
+        along = (positions - self.viewpoint) @ self.axes.T  # (N, 3)
+        tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
+        cell = np.clip(np.floor(tangents / np.float32(self.cell)), -FARTHEST, FARTHEST)
+        return cell.astype(np.int64), np.linalg.norm(along, axis=1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Distance of the first surface in each direction from a camera."""
+
+    frame: CameraFrame
+    distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
+
+    @classmethod
+    def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
+        """What a camera there saw of a cloud.
+
+        Args:
+            points: (N, 3), at least one, metres.
+            viewpoint: (3,) in the same frame.
+            up: (3,) turns the map, so that it turns with the scene.
+        """
+        frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
+        cell, distance = frame.seen(points)
+        half = min(int(np.abs(cell).max()) + SPLAT, HALF)
+        depth = np.full((2 * half + 1, 2 * half + 1), NOTHING)
+        order = np.argsort(-distance, kind="stable")  # the nearest is written last
+        cell, distance = cell[order] + half, distance[order]
+        for shift in np.ndindex(2 * SPLAT + 1, 2 * SPLAT + 1):
+            place = cell + np.asarray(shift) - SPLAT
+            inside = ((place >= 0) & (place <= 2 * half)).all(axis=1)
+            nearest = np.full_like(depth, NOTHING)
+            nearest[tuple(place[inside].T)] = distance[inside]
+            np.minimum(depth, nearest, out=depth)
+        return cls(frame, depth)
+
+    def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
+        """Metres (E, S) that places (S, 3) of hands (E, 4, 4) lie behind the first surface.
+
+        0 in front of it, and where nothing was seen.
+        """
+        frame = self.frame
+        turn = frame.axes @ T_cloud_hand[:, :3, :3]
+        shift = (T_cloud_hand[:, :3, 3] - frame.viewpoint) @ frame.axes.T
+        return distance_behind(self.distance, turn, shift, places, frame.cell)
