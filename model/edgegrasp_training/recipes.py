@@ -70,8 +70,8 @@ def start_from(network: nn.Module, start: nn.Module) -> int:
     """
     weights, known = in_units(start).state_dict(), 0
     if isinstance(network, HandNet) and isinstance(start, HandNet):
-        known = len(start.mean)
-        further = len(network.mean) - known
+        known = start.config.description_size
+        further = network.config.description_size - known
         for name in ("mean", "std"):
             weights[name] = torch.cat((weights[name], network.get_buffer(name)[known:].cpu()))
         first = weights["classifier.0.weight"]
