@@ -16,7 +16,7 @@ COPY clients clients
 COPY model model
 COPY proto proto
 COPY service service
-RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt '.[service,otel]'
+RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt '.[service]'
 
 
 FROM python:3.11-slim
@@ -32,8 +32,7 @@ COPY --from=build /venv /venv
 
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
-    EDGEGRASP_HOST=0.0.0.0 \
-    EDGEGRASP_LOG_FORMAT=json
+    EDGEGRASP_HOST=0.0.0.0
 
 USER edgegrasp
 EXPOSE 8000 50051

@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json \
-	proto/edgegrasp/v1/grasp.proto proto/openapi.json clients/edgegrasp_client/options.py docs/options.md
+	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
 .DEFAULT_GOAL := help
 .PHONY: help venv lint format test bench fuzz demo proto constraints clean

@@ -7,7 +7,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent / "results"
 MIB = 2**20
 RUNS = 5
 STOP_SECONDS = 30.0
-SERVE = "from edgegrasp_cli.main import main; main()"
+SERVE = ("-c", "from edgegrasp_cli.main import main; main()")
 
 
 def interleaved(
@@ -111,12 +111,17 @@ class Served:
 
 
 @contextmanager
-def served(*flags: str) -> Iterator[Served]:
-    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
+def served(*flags: str, program: Sequence[str] = SERVE) -> Iterator[Served]:
+    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts.
+
+    Args:
+        flags: Of `edgegrasp serve`.
+        program: What Python is to run as `edgegrasp`.
+    """
     ports = ("--http-port", "0", "--grpc-port", "0")
     quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
     process = psutil.Popen(
-        [sys.executable, "-c", SERVE, "serve", *ports, *quiet, *flags],
+        [sys.executable, *program, "serve", *ports, *quiet, *flags],
         stdout=subprocess.PIPE,
         text=True,
     )

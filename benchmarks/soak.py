@@ -9,6 +9,7 @@ request must have an outcome, the server's memory must not have grown, and it mu
 import argparse
 import io
 import json
+import os
 import queue
 import sys
 import threading
@@ -23,6 +24,7 @@ from typing import Any
 import grpc
 import httpx
 import numpy as np
+from benchmarks import dummy
 from benchmarks.measuring import RESULTS, Served, served, write_results
 from numpy.typing import NDArray
 
@@ -69,7 +71,8 @@ def main() -> None:
     parser.add_argument("--requests", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    with served("--backend", "dummy", "--dummy-seconds", "0.002") as server:
+    os.environ["DUMMY_SECONDS"] = "0.002"
+    with served(program=["-P", dummy.__file__]) as server:
         results = soak(server, plans(given.requests, given.seed), given.requests)
         begun = time.monotonic()
         results["exit_code"] = server.stop()

@@ -7,7 +7,7 @@ from typing import Any
 
 from pages import filled, table
 
-from edgegrasp_service.settings import SECRETS, Settings
+from edgegrasp_service.settings import Settings
 
 PAGE = Path(__file__).parent / "settings.md"
 
@@ -23,8 +23,7 @@ def rows() -> Iterator[list[str]]:
     for name, field in Settings.model_json_schema()["properties"].items():
         default = field.get("default")
         shown = "none" if default in (None, [], "") else f"`{json.dumps(default)}`"
-        words = field["description"] + (" (no flag)" if name in SECRETS else "")
-        yield [f"`{name}`", shown, _range(field), words]
+        yield [f"`{name}`", shown, _range(field), field["description"]]
 
 
 def _range(field: dict[str, Any]) -> str:

@@ -1,6 +1,6 @@
 #!/bin/sh
 # Regenerates the interface: what follows from the options of a request, the Python stubs beside
-# proto/edgegrasp/v1/*.proto, the contract beside them, and the OpenAPI document.
+# proto/edgegrasp/v1/*.proto, the contract beside them, and the options in the OpenAPI document.
 # Into this checkout, or into the same places under the folder given.
 # PYTHON names the interpreter that has the dev extra.
 set -eu

@@ -4,14 +4,16 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers share two cores
 
 import numpy as np
 import pytest
+from benchmarks import dummy
 from hypothesis import HealthCheck, settings
 
 # No busy machine fails a test, and every run tries the same examples; `make fuzz` tries new ones.
@@ -50,11 +52,17 @@ class RunningServer:
 
 
 @contextlib.contextmanager
-def running_server(*flags: str) -> Iterator[RunningServer]:
-    program = "from edgegrasp_cli.main import main; main()"
+def running_server(
+    *flags: str,
+    program: Sequence[str] = ("-c", "from edgegrasp_cli.main import main; main()"),
+    seconds: float = 0.0,
+) -> Iterator[RunningServer]:
     ports = ("--http-port", "0", "--grpc-port", "0")
     process = subprocess.Popen(
-        [sys.executable, "-c", program, "serve", *ports, *flags], stdout=subprocess.PIPE, text=True
+        [sys.executable, *program, "serve", *ports, *flags],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"DUMMY_SECONDS": str(seconds)},
     )
     assert process.stdout is not None
     try:
@@ -75,8 +83,14 @@ def start_server() -> Callable[..., contextlib.AbstractContextManager[RunningSer
 
 
 @pytest.fixture(scope="session")
-def dummy_server() -> Iterator[RunningServer]:
-    with running_server("--backend", "dummy") as server:
+def start_dummy() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
+    """As `start_server`, with the dummy detector, which takes `seconds`."""
+    return partial(running_server, program=("-P", dummy.__file__))
+
+
+@pytest.fixture(scope="session")
+def dummy_server(start_dummy) -> Iterator[RunningServer]:
+    with start_dummy() as server:
         yield server
 
 

@@ -68,10 +68,9 @@ def request(
     from edgegrasp_service.recording import replay as answer_again
     from edgegrasp_service.settings import load_settings
 
-    again = answer_again(file, load_settings(config))
-    refused = again.answer.error
-    print(f"{again.answer.facts.grasps} grasps" if refused is None else refused.detail)
-    before, now = (_without_times(again.job, body) for body in (again.recorded, again.answer.body))
+    job, recorded, answer = answer_again(file, load_settings(config))
+    print(f"{answer.facts.grasps} grasps" if answer.error is None else answer.error.detail)
+    before, now = (_without_times(job, one.body) for one in (recorded, answer))
     if now != before:
         sys.exit("edgegrasp replay: the answer differs from the recorded one")
     print("the answer is the same")

@@ -1,4 +1,4 @@
-"""`edgegrasp serve`: every setting of the server but its secrets is a flag."""
+"""`edgegrasp serve`: every setting of the server is a flag."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,10 @@ from typing import Annotated, Any
 import typer
 
 from edgegrasp_cli.flags import model_flags, takes_flags
-from edgegrasp_service.settings import SECRETS, Settings
+from edgegrasp_service.settings import Settings
 
 
-@takes_flags(settings=model_flags(Settings, leave_out=SECRETS, panel="Settings"))
+@takes_flags(settings=model_flags(Settings, panel="Settings"))
 def serve(
     config: Annotated[
         Path | None,
@@ -26,7 +26,7 @@ def serve(
 
     Prints one line with both addresses once weights are loaded. What no flag sets comes from
     EDGEGRASP_* environment variables, such as EDGEGRASP_HTTP_PORT, then from the file of --config,
-    or else from the defaults. Tokens come from files, or EDGEGRASP_TOKENS.
+    or else from the defaults. Tokens come from files.
     """
     # gRPC's own lines are no JSON, and a pipe that nobody reads would stop it: no lines.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
@@ -34,7 +34,7 @@ def serve(
 
     loaded = load_settings(config, **settings)
     if print_config:
-        print(loaded.model_dump_json(indent=2, exclude=set(SECRETS)))
+        print(loaded.model_dump_json(indent=2))
         return
     from edgegrasp_service.server import run
 

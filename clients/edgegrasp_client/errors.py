@@ -85,7 +85,6 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "unauthenticated": AccessDeniedError,
     "permission-denied": AccessDeniedError,
     "reload-failed": ServerFailedError,
-    "decoder-missing": ServerFailedError,
     "detector-failed": ServerFailedError,
     "not-ready": ServerUnavailableError,
     "overloaded": OverloadedError,

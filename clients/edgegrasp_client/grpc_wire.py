@@ -182,7 +182,7 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
 
 
 def _known(message: Message) -> str:
-    internal = ("disabled", "ransac")  # JSON writes these in another way
+    internal = ("disabled", "ransac", "auto")  # JSON writes these in another way
     return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
@@ -222,13 +222,16 @@ def _shape(message: Message, value: Any, path: str) -> Filled:
 
 
 def _support(message: Any, value: Any, path: str) -> Filled:
+    if value is None or value == "none":
+        return message, {"disabled": True}
+    value = {"kind": value} if isinstance(value, str) else value
     if not isinstance(value, Mapping):
         raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
     kind = value.get("kind", "plane")
-    if kind == "ransac":
-        return message.ransac, _without_kind(value)
-    if kind != "plane" or "ransac" in value:
-        raise invalid(path, repr(kind)[:80], "Set its kind to one of plane, ransac.")
+    if kind in ("auto", "ransac"):
+        return getattr(message, kind), _without_kind(value)
+    if kind != "plane" or {"auto", "ransac"} & value.keys():
+        raise invalid(path, repr(kind)[:80], "Set its kind to one of auto, plane, ransac, none.")
     return message, _without_kind(value)
 
 

@@ -104,7 +104,7 @@ class ScoreRequest(Request):
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as JSON has them: lists instead of arrays, and those left out that are None.
 
-    `suppression` alone has a None of its own: no suppression.
+    `suppression` and `support` alone have a None of their own: none.
 
     Raises:
         InvalidRequestError: An option has no such name.
@@ -117,7 +117,7 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: _plain(value)
         for name, value in options.items()
-        if value is not None or name == "suppression"
+        if value is not None or name in ("suppression", "support")
     }
 
 

@@ -18,6 +18,7 @@ Bools = NDArray[np.bool_]
 
 ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
+JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 BLOCK = 512  # points at a time, so that their positions stay in the first cache
 
 
@@ -51,6 +52,38 @@ def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -
     hit = np.zeros(len(turn), dtype=np.bool_)
     _meet(_columns(points), turn, shift, boxes.astype(np.float32), hit)
     return hit
+
+
+def heights_and_distances(
+    points: Float32, axes: Float64, bow: Float64, max_bow: float, eye: Float64
+) -> tuple[Float32, Float32]:
+    """How high points stand over a bowed plane, and how far they are from a place.
+
+    Args:
+        points: (N, 3) metres.
+        axes: (4, 3): the axes x, y and z of the plane's frame, and its origin on the plane.
+        bow: (6,) rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
+        max_bow: Metres that the rise is limited to.
+        eye: (3,) the place.
+
+    Returns:
+        Height (N,) along z over the bowed plane, and distance (N,) squared from the place.
+    """
+    height, squared = np.empty((2, len(points)), dtype=np.float32)
+    _heights_and_distances(points, axes, bow, max_bow, eye, height, squared)
+    return height, squared
+
+
+def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float32:
+    """Unit direction (M, 3), of either sign, in which points spread least.
+
+    Args:
+        points: (N, 3).
+        rows: (M, K) which of them belong together.
+    """
+    direction = np.empty((len(rows), 3), dtype=np.float32)
+    _least_spread(points.astype(np.float32), rows.astype(np.int64), direction)
+    return direction
 
 
 def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
@@ -243,6 +276,75 @@ def _position(
         turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
         turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
     )
+
+
+@compiled("contract")
+def _heights_and_distances(
+    points: Float32,
+    axes: Float64,
+    bow: Float64,
+    max_bow: float,
+    eye: Float64,
+    height: Float32,
+    squared: Float32,
+) -> None:
+    for i in range(len(points)):
+        a, b, c = points[i, 0] - axes[3, 0], points[i, 1] - axes[3, 1], points[i, 2] - axes[3, 2]
+        x = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2] * c
+        y = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2] * c
+        rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
+        rise = min(max(rise, -max_bow), max_bow)
+        height[i] = axes[2, 0] * a + axes[2, 1] * b + axes[2, 2] * c - rise
+        a, b, c = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+        squared[i] = a * a + b * b + c * c
+
+
+@compiled("contract")
+def _least_spread(points: Float32, rows: Int64, direction: Float32) -> None:
+    count = rows.shape[1]
+    around, spread, axes = np.empty((count, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for m in range(len(rows)):
+        for d in range(3):
+            mean = 0.0
+            for k in range(count):
+                around[k, d] = points[rows[m, k], d]
+                mean += around[k, d]
+            for k in range(count):
+                around[k, d] -= mean / count
+        for i in range(3):
+            for j in range(3):
+                axes[i, j] = 1.0 if i == j else 0.0
+                spread[i, j] = 0.0
+                for k in range(count):
+                    spread[i, j] += around[k, i] * around[k, j]
+        for _ in range(JACOBI_SWEEPS):
+            for turn in range(3):
+                _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
+        least = 0
+        for d in range(1, 3):
+            least = d if spread[d, d] < spread[least, least] else least
+        for d in range(3):
+            direction[m, d] = axes[d, least]
+
+
+@compiled("contract")
+def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
+    """One rotation of Jacobi's method: makes element (p, q) of a symmetric matrix 0."""
+    if matrix[p, q] == 0.0:
+        return
+    ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+    tangent = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
+    tangent = tangent if ratio >= 0.0 else -tangent
+    cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for k in range(3):
+        a, b = matrix[k, p], matrix[k, q]
+        matrix[k, p], matrix[k, q] = cosine * a - sine * b, sine * a + cosine * b
+    for k in range(3):
+        a, b = matrix[p, k], matrix[q, k]
+        matrix[p, k], matrix[q, k] = cosine * a - sine * b, sine * a + cosine * b
+        a, b = axes[k, p], axes[k, q]
+        axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
 
 
 @compiled("contract")

@@ -443,6 +443,15 @@ def _gripper_form(value: object) -> str:
     return "name" if isinstance(value, str) else "inline"
 
 
+SupportKind = Literal["auto", "ransac", "none"]
+SupportRequest = Annotated[
+    Annotated[SupportPlane, Tag("plane")]
+    | Annotated[RansacPlane, Tag("ransac")]
+    | Annotated[AutoPlane, Tag("auto")],
+    Discriminator(_support_kind),
+]
+
+
 class DetectOptions(Strict):
     """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
@@ -492,14 +501,10 @@ class DetectOptions(Strict):
         "normal, else +z",
     )
     support: Annotated[
-        Annotated[
-            Annotated[SupportPlane, Tag("plane")]
-            | Annotated[RansacPlane, Tag("ransac")]
-            | Annotated[AutoPlane, Tag("auto")],
-            Discriminator(_support_kind),
-        ]
-        | None,
-        BeforeValidator(_kind_as_object),
+        SupportRequest | None,
+        BeforeValidator(
+            _kind_as_object, json_schema_input_type=SupportKind | SupportRequest | None
+        ),
     ] = Field(
         default=AutoPlane(),
         description="plane the objects rest on; no part of the hand goes below it; a bare kind "

@@ -59,7 +59,7 @@ def unseen_space(
     behind = np.split(depth.behind(T_cloud_hand, np.concatenate(places)), ends, axis=1)
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
     tips = [np.minimum(part, FAR).mean(axis=1) for part in behind[:2]]
-    along = behind[-1].reshape(len(T_cloud_hand), LINE, -1)  # (E, Y, places at each y)
+    along = behind[-1].reshape(len(T_cloud_hand), LINE, len(line) // LINE)  # (E, Y, P)
     step, high, low = y[1] - y[0], first_met[:, :1], first_met[:, 1:]
     hidden = unseen(along).mean(axis=2)  # (E, Y)
     seen = (along < BEHIND).all(axis=2)

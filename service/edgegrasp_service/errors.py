@@ -28,10 +28,6 @@ class UnsupportedMediaType(_FieldError):  # noqa: N818
     """A body is in a format the server does not read."""
 
 
-class DecoderMissing(_FieldError):  # noqa: N818
-    """A format's reader is not installed on the server."""
-
-
 class Unauthenticated(_FieldError):  # noqa: N818
     """There is no token, or none that the server knows; its value is in no message."""
 
@@ -72,6 +68,9 @@ class RequestTimeout(_FieldError):  # noqa: N818
 class DeadlineExceeded(ServiceError):  # noqa: N818
     """The caller's deadline passed before there was an answer."""
 
+    def __init__(self, message: str = "The deadline passed before there was an answer.") -> None:
+        super().__init__(message)
+
 
 class Cancelled(ServiceError):  # noqa: N818
     """The caller is gone; nobody reads this."""
@@ -99,7 +98,6 @@ STATUS: dict[type[Exception], tuple[str, int]] = {
     UnknownModel: ("NOT_FOUND", 404),
     PayloadTooLarge: ("RESOURCE_EXHAUSTED", 413),
     UnsupportedMediaType: ("INVALID_ARGUMENT", 415),
-    DecoderMissing: ("UNIMPLEMENTED", 501),
     Unauthenticated: ("UNAUTHENTICATED", 401),
     PermissionDenied: ("PERMISSION_DENIED", 403),
     HeadersTooLarge: ("RESOURCE_EXHAUSTED", 431),

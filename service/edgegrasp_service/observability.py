@@ -1,4 +1,4 @@
-"""What is known of a request, and what is logged, counted and traced of it."""
+"""What is known of a request, and what is logged and counted of it."""
 
 import contextlib
 import json
@@ -20,8 +20,8 @@ from typing import Any, TextIO
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.exposition import choose_encoder
 
-from edgegrasp_service.errors import InvalidSettings, Problem
-from edgegrasp_service.settings import Settings, one_line
+from edgegrasp_service.errors import Problem
+from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Facts, Transport
 
 REQUEST_ID_HEADER = "x-request-id"  # of HTTP requests and answers, and in gRPC metadata of both
@@ -39,7 +39,6 @@ class Call:
     peer: str = ""  # address without port
     token: str = ""  # name of the token it came with
     is_admin: bool = False
-    traceparent: str = ""  # W3C trace context, as sent
     long: bool = False  # a stream, whose duration says nothing
     in_stream: bool = False  # one request of a stream
     start: float = field(default_factory=time.monotonic)  # as the event loop's clock
@@ -88,11 +87,22 @@ def current_call() -> Call:
     return call
 
 
-# Logs: JSON lines or text; a thread writes them, so that no log can hold up a request
+# Logs: JSON lines; a thread writes them, so that no log can hold up a request
 
 MAX_WAITING = 4096  # records; more than that, and new ones are dropped
 STOP_SECONDS = 1.0
 PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
+
+LOGGED = [
+    "request_id",
+    "transport",
+    "method",
+    "code",
+    "peer",
+    "token",
+    "bytes_in",
+    "bytes_out",
+]  # of a Call
 
 requests = logging.getLogger("edgegrasp_service.requests")
 
@@ -107,26 +117,19 @@ def log_call(call: Call) -> None:
         level = logging.WARNING
     if not requests.isEnabledFor(level):
         return
-    milliseconds = {name: round(seconds * 1e3, 1) for name, seconds in call.stages.items()}
-    fields = {
-        "transport": call.transport,
-        "method": call.method,
-        "code": call.code,
-        "error": "" if call.problem is None else call.problem.kind,
-        "detail": "" if call.problem is None else call.problem.detail,
+    facts, problem = call.facts, call.problem
+    fields = {name: getattr(call, name) for name in LOGGED} | {
+        "error": problem and problem.kind,
+        "detail": problem and problem.detail,
         "seconds": round(call.seconds, 6),
-        "peer": call.peer,
-        "token": call.token,
-        "bytes_in": call.bytes_in,
-        "bytes_out": call.bytes_out,
-        "model": call.facts.model,
-        "points": call.facts.points,
-        "voxels": call.facts.voxels,
-        "grasps": call.facts.grasps,
-        "milliseconds": milliseconds,
+        "model": facts.model,
+        "points": facts.points,
+        "voxels": facts.counts.get("voxels"),
+        "grasps": facts.grasps,
+        "milliseconds": {name: round(took * 1e3, 1) for name, took in call.stages.items()},
     }
-    known = {name: value for name, value in fields.items() if value not in ("", 0, {})}
-    requests.log(level, "request", extra={"fields": {"request_id": call.request_id} | known})
+    known = {name: value for name, value in fields.items() if value}
+    requests.log(level, "request", extra={"fields": known})
 
 
 class JsonFormatter(logging.Formatter):
@@ -141,28 +144,11 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
         }
         line |= getattr(record, "fields", {})
-        if trace := _traceback(self, record):
-            line["exception"] = trace
+        if told := getattr(record, "traceback", ""):  # by a worker
+            line["exception"] = told
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)
-
-
-class TextFormatter(logging.Formatter):
-    """A line to read; nothing a caller sent can begin another one."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line of a record, and its traceback below."""
-        time = datetime.fromtimestamp(record.created, UTC).isoformat(" ", "milliseconds")[:23]
-        fields = getattr(record, "fields", {})
-        words = " ".join(f"{name}={value}" for name, value in fields.items())
-        line = f"{time} {record.levelname} {record.name}: {record.getMessage()} {words}"
-        trace = _traceback(self, record)
-        return one_line(line.rstrip()) + (f"\n{trace}" if trace else "")
-
-
-def _traceback(formatter: logging.Formatter, record: logging.LogRecord) -> str:
-    """Of this process, or of the worker that told of it; empty: there is none."""
-    told: str = getattr(record, "traceback", "")
-    return formatter.formatException(record.exc_info) if record.exc_info else told
 
 
 class LogQueue(logging.handlers.QueueHandler):
@@ -172,16 +158,14 @@ class LogQueue(logging.handlers.QueueHandler):
         dropped: Lines that no one will read: the disk is full, the stream closed or not read.
     """
 
-    def __init__(self, stream: TextIO | None, formatter: logging.Formatter) -> None:
-        super().__init__(queue.Queue(MAX_WAITING))
-        self.setFormatter(formatter)
+    def __init__(self, stream: TextIO | None) -> None:
+        self._lines: queue.Queue[str | None] = queue.Queue(MAX_WAITING)
+        super().__init__(self._lines)
+        self.setFormatter(JsonFormatter())
         self.dropped = 0
-        self._closed = False
         self._stream = stream
-        writer = logging.Handler()
-        writer.handle = self._write  # type: ignore[method-assign, assignment]
-        self._listener = logging.handlers.QueueListener(self.queue, writer)
-        self._listener.start()
+        self._writer = threading.Thread(target=self._write, daemon=True)
+        self._writer.start()
 
     def prepare(self, record: logging.LogRecord) -> str:
         """The line of a record, while its request is known."""
@@ -196,20 +180,14 @@ class LogQueue(logging.handlers.QueueHandler):
 
     def close(self) -> None:
         """Write what is queued, unless nobody reads it."""
-        if self._closed:
-            return
-        self._closed = True
-        stop = threading.Thread(target=self._stop, daemon=True)
-        stop.start()
-        stop.join(STOP_SECONDS)
+        with contextlib.suppress(queue.Full):
+            self._lines.put(None, timeout=STOP_SECONDS)
+            self._writer.join(STOP_SECONDS)
         super().close()
 
-    def _stop(self) -> None:
-        with contextlib.suppress(queue.Full):
-            self._listener.stop()
-
-    def _write(self, line: str) -> None:
-        self.dropped += not write_line(self._stream, line)
+    def _write(self) -> None:
+        for line in iter(self._lines.get, None):
+            self.dropped += not write_line(self._stream, line)
 
 
 def write_line(stream: TextIO | None, line: str) -> bool:
@@ -235,9 +213,7 @@ def write_line(stream: TextIO | None, line: str) -> bool:
 
 def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
     """Send every record of this process to a stream; close what is returned when it ends."""
-    terminal = stream is not None and not stream.closed and stream.isatty()
-    text = settings.log_format == "text" or (settings.log_format == "auto" and terminal)
-    handler = LogQueue(stream, TextFormatter() if text else JsonFormatter())
+    handler = LogQueue(stream)
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     return handler
@@ -276,7 +252,7 @@ class Metrics:
         self._candidates = histogram("candidates", "candidates of a detection", buckets=MANY)
         self._grasps = histogram("grasps_returned", "grasps of a detection", buckets=FEW)
         self._results = counter("stream_results", "results sent on streams", ("code",))
-        self._workers = counter("workers_replaced", "worker processes that died")
+        self.workers_replaced = counter("workers_replaced", "worker processes that died")
         self._model_info = self._gauge("model_info", "loaded weights", MODEL_LABELS)
         self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
@@ -298,10 +274,6 @@ class Metrics:
         """Count a reload."""
         self._reloads.labels("succeeded" if succeeded else "failed").inc()
 
-    def worker_replaced(self) -> None:
-        """Count a worker that died."""
-        self._workers.inc()
-
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
         """Show a number that is asked for when metrics are read."""
         self._gauge(name, meaning).set_function(value)
@@ -318,74 +290,3 @@ class Metrics:
             self._model_info.labels(*(str(shown.get(name, "")) for name in MODEL_LABELS)).set(1.0)
         encoder, content_type = choose_encoder(accept)
         return encoder(self.registry), content_type
-
-
-# Traces: a span for each request, and one for each of its stages inside it
-
-NANOSECONDS = 1_000_000_000
-
-
-class Tracer:
-    """Makes spans of calls; a caller's `traceparent` is the parent of its request's.
-
-    Args:
-        provider: An OpenTelemetry tracer provider.
-    """
-
-    def __init__(self, provider: Any) -> None:
-        from opentelemetry import trace
-        from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
-
-        self._trace = trace
-        self._propagator = TraceContextTextMapPropagator()
-        self._tracer = provider.get_tracer("edgegrasp_service")
-
-    def trace_call(self, call: Call) -> None:
-        """Make the spans of a call that has ended; of those only that had to do with grasps."""
-        if "admission" not in call.stages:
-            return
-        start = time.time_ns() - int((time.monotonic() - call.start) * NANOSECONDS)
-        attributes: dict[str, str | int] = {
-            "edgegrasp.transport": call.transport,
-            "edgegrasp.request_id": call.request_id,
-            "edgegrasp.model": call.facts.model,
-            "edgegrasp.code": "OK" if call.problem is None else call.problem.code,
-        }
-        for name, count in call.facts.counts.items():
-            attributes[f"edgegrasp.count.{name}"] = count
-        span = self._tracer.start_span(
-            call.method,
-            context=self._propagator.extract({"traceparent": call.traceparent}),
-            kind=self._trace.SpanKind.SERVER,
-            start_time=start,
-            attributes=attributes,
-        )
-        if call.problem is not None and call.problem.status >= 500:
-            span.set_status(self._trace.StatusCode.ERROR, call.problem.kind)
-        inside = self._trace.set_span_in_context(span)
-        begin = start
-        for name, seconds in call.stages.items():
-            end = begin + int(seconds * NANOSECONDS)
-            self._tracer.start_span(name, context=inside, start_time=begin).end(end)
-            begin = end
-        span.end(start + int(call.seconds * NANOSECONDS))
-
-
-def otlp_provider(endpoint: str) -> Any:
-    """A tracer provider that posts spans to an OTLP/HTTP endpoint; shut it down in the end.
-
-    Raises:
-        InvalidSettings: The OpenTelemetry packages are not installed.
-    """
-    try:
-        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
-        from opentelemetry.sdk.resources import SERVICE_NAME, Resource
-        from opentelemetry.sdk.trace import TracerProvider
-        from opentelemetry.sdk.trace.export import BatchSpanProcessor
-    except ModuleNotFoundError as error:
-        raise InvalidSettings(
-            f"otlp_endpoint: got {endpoint!r}. {error}: pip install 'edgegrasp[otel]'."
-        ) from None
-    provider = TracerProvider(resource=Resource.create({SERVICE_NAME: "edgegrasp"}))
-    provider.add_span_processor(BatchSpanProcessor(OTLPSpanExporter(endpoint=endpoint, timeout=5)))
-    return provider

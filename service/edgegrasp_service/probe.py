@@ -3,10 +3,11 @@
 usage: python -m edgegrasp_service.probe    exits with 0 where it is
 """
 
+import contextlib
+import http.client
 import socket
 import ssl
 import sys
-import urllib.request
 
 from edgegrasp_service.settings import Settings, load_settings
 
@@ -24,16 +25,17 @@ def is_ready(settings: Settings) -> bool:
         if settings.tls_client_ca is not None:
             socket.create_connection((host, settings.http_port), TIMEOUT).close()
             return True
-        # The certificate is for the name others call the server by; this asks itself.
-        context = ssl._create_unverified_context() if settings.tls_certificate else None
-        place = f"[{host}]" if ":" in host else host
-        url = f"http{'s' * bool(context)}://{place}:{settings.http_port}/health/ready"
-        opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), urllib.request.HTTPSHandler(context=context)
-        )
-        with opener.open(url, timeout=TIMEOUT):
-            return True
-    except OSError:  # an HTTPError too
+        connection = http.client.HTTPConnection(host, settings.http_port, timeout=TIMEOUT)
+        if settings.tls_certificate is not None:
+            # The certificate is for the name others call the server by; this asks itself.
+            context = ssl._create_unverified_context()
+            connection = http.client.HTTPSConnection(
+                host, settings.http_port, timeout=TIMEOUT, context=context
+            )
+        with contextlib.closing(connection):
+            connection.request("GET", "/health/ready")
+            return connection.getresponse().status == 200
+    except (OSError, http.client.HTTPException):
         return False
 
 

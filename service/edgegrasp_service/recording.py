@@ -5,11 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import limits, pack, receive
+from edgegrasp_service.worker.job import Answer, Job, pack, receive
 
 logger = logging.getLogger(__name__)
 
@@ -51,32 +49,26 @@ class Recorder:
             logger.warning("%s is not recorded: %s", job.request_id, error)
 
 
-class Replay(NamedTuple):
-    """A recorded request, answered again."""
-
-    job: Job
-    recorded: bytes  # the answer's body then; empty for an error
-    answer: Answer  # now
-
-
-def replay(path: Path, settings: Settings) -> Replay:
+def replay(path: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
     """Answer a recorded request again, in this process.
 
     Args:
         path: The file.
         settings: Weights and limits.
 
+    Returns:
+        The request, the answer that is recorded, and the answer now.
+
     Raises:
         OSError: The file cannot be read.
         ValueError: It is no recording.
         EdgeGraspError: Weights cannot be used.
     """
-    from edgegrasp_service.worker.answer import Answerer, load_catalogue
+    from edgegrasp_service.worker import answer as worker
 
     with path.open("rb") as file:
-        job, recorded = receive(file.readinto), receive(file.readinto)
+        job, recorded = receive(file), receive(file)
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
         raise ValueError(f"{path} is no recorded request")
     job = replace(job, remaining=settings.max_request_seconds)
-    answer = Answerer(load_catalogue(settings), limits(settings)).answer(job)
-    return Replay(job, recorded.body, answer)
+    return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)

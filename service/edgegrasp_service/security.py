@@ -84,20 +84,16 @@ class Tokens:
 
 
 def load_tokens(settings: Settings) -> Tokens:
-    """The tokens of settings and of the files they name.
+    """The tokens of the files that the settings name.
 
     Raises:
         InvalidSettings: A file cannot be read, or what it holds is no token.
     """
-    known: list[Token] = []
-    for prefix in ("", "admin_"):
-        secrets = getattr(settings, f"{prefix}tokens")
-        known += _tokens(f"{prefix}tokens", [secret.get_secret_value() for secret in secrets])
-        known += _from_file(f"{prefix}token_file", getattr(settings, f"{prefix}token_file"))
-    return Tokens(known)
+    tokens = _read_tokens("token_file", settings.token_file)
+    return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
 
 
-def _from_file(setting: str, path: Path | None) -> list[Token]:
+def _read_tokens(setting: str, path: Path | None) -> list[Token]:
     if path is None:
         return []
     try:
@@ -106,15 +102,11 @@ def _from_file(setting: str, path: Path | None) -> list[Token]:
         raise InvalidSettings(
             f"{setting}: got {str(path)!r}. It cannot be read: {error}."
         ) from None
-    tokens = _tokens(setting, [line for line in lines if line and not line.startswith("#")])
-    if not tokens:
-        raise InvalidSettings(f"{setting}: got {str(path)!r}. It holds no token; write one a line.")
-    return tokens
-
-
-def _tokens(setting: str, lines: list[str]) -> list[Token]:
-    tokens = []
-    for number, line in enumerate(lines, 1):
+    tokens: list[Token] = []
+    for line in lines:
+        if not line or line.startswith("#"):
+            continue
+        number = len(tokens) + 1
         name, text = _NAMED.fullmatch(line).groups()  # type: ignore[union-attr]  # anything matches
         if not _TOKEN.fullmatch(text):
             raise InvalidSettings(
@@ -123,6 +115,8 @@ def _tokens(setting: str, lines: list[str]) -> list[Token]:
             )
         is_admin = setting.startswith("admin")
         tokens.append(Token(name or f"{setting} {number}", _digest(text), is_admin))
+    if not tokens:
+        raise InvalidSettings(f"{setting}: got {str(path)!r}. It holds no token; write one a line.")
     return tokens
 
 
@@ -167,22 +161,18 @@ class ServerTls:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.set_alpn_protocols(["http/1.1"])
-        wrong = f"tls_certificate: got {str(certificate)!r} with tls_key {str(key)!r}. "
-        wrong += "They are no certificate with its key, in PEM"
         try:
             pair, authorities = (key.read_bytes(), certificate.read_bytes()), None
             context.load_cert_chain(certificate, key, password=_refuse_encrypted_key)
             if ca is not None:
-                wrong = f"tls_client_ca: got {str(ca)!r}. It holds no certificate in PEM"
                 authorities = ca.read_bytes()
                 context.load_verify_locations(ca)
                 context.verify_mode = ssl.CERT_REQUIRED
-        except (ssl.SSLError, ValueError) as error:
-            raise InvalidSettings(f"{wrong}: {error}.") from None
-        except OSError as error:
-            names = {certificate: "tls_certificate", key: "tls_key", ca: "tls_client_ca"}
-            path = Path(error.filename)
-            raise InvalidSettings(f"{names[path]}: got {str(path)!r}. {error.strerror}.") from None
+        except (OSError, ValueError) as error:  # an SSLError too
+            files = f"tls_certificate {certificate}, tls_key {key}"
+            files += f" and tls_client_ca {ca}" if ca else ""
+            wrong = f"{files}: they cannot be read as a certificate with its key, in PEM: {error}."
+            raise InvalidSettings(wrong) from None
         return context, grpc.ssl_server_certificate_configuration([pair], authorities)
 
 
@@ -197,11 +187,6 @@ class _RenewableContext(ssl.SSLContext):
     def wrap_bio(self, *arguments: Any, **named: Any) -> ssl.SSLObject:
         """As asyncio calls it when a connection comes in."""
         return self.current.wrap_bio(*arguments, **named)
-
-
-def load_tls(settings: Settings) -> ServerTls | None:
-    """Of the settings; None where they name no certificate. Raises as ServerTls."""
-    return None if settings.tls_certificate is None else ServerTls(settings)
 
 
 def _refuse_encrypted_key() -> str:

@@ -20,7 +20,7 @@ from edgegrasp_service.front.http_protocol import HttpProtocol
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder
-from edgegrasp_service.security import load_tls, load_tokens
+from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
@@ -60,9 +60,9 @@ class Server:
         nursery: Sequence[str] = NURSERY,
     ) -> None:
         self._settings = settings
-        self._tls = load_tls(settings)
+        self._tls = ServerTls(settings) if settings.tls_certificate else None
         self.metrics = Metrics(lambda: self.pool.models)
-        self.pool = WorkerPool(settings, nursery, self.metrics.worker_replaced)
+        self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
         self._recorder: Recorder | None = None
         if settings.record_folder is not None:
             self._recorder = Recorder(settings.record_folder, settings.record_bytes)
@@ -88,7 +88,6 @@ class Server:
         watch("queue_depth", waiting, lambda: max(0, admission.tickets - pool.busy))
         watch("held_bytes", "bytes of bodies in the server", lambda: admission.held_bytes)
         watch("workers", "worker processes", lambda: len(pool.pids))
-        watch("workers_resident_bytes", "memory of workers", lambda: pool.resident_bytes)
 
     async def serve(
         self,
@@ -145,7 +144,7 @@ class Server:
     async def _drain(self, grpc_server: GrpcServer) -> None:
         """Refuse new requests, and wait until those accepted are answered, or grace is over."""
         self.service.stopping.set()
-        await grpc_server.stop_serving()
+        await grpc_server.set_serving(False)
         notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
         await asyncio.sleep(notice)
         await self.service.drain(self._settings.grace_seconds - notice)
@@ -188,11 +187,13 @@ class _LoopErrors:
         self._next = 0.0
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        if not isinstance(context.get("exception"), OSError):
+        error = context.get("exception")
+        # A socket that is closed before it accepts again has no descriptor: a ValueError.
+        if not isinstance(error, OSError) and "Invalid file descriptor" not in str(error):
             loop.default_exception_handler(context)
         elif loop.time() >= self._next:
             self._next = loop.time() + REPEAT_SECONDS
-            logger.error("%s (%s)", context["message"], context["exception"])
+            logger.error("%s (%s)", context["message"], error)
 
 
 def run(settings: Settings) -> None:
@@ -202,24 +203,14 @@ def run(settings: Settings) -> None:
         AddressInUse: A port cannot be bound.
         EdgeGraspError: Weights cannot be used.
     """
-    with contextlib.ExitStack() as ends:
-        log = ends.enter_context(contextlib.closing(start_logging(settings, sys.stderr)))
-        observers: list[Observer] = []
-        if settings.otlp_endpoint:
-            from edgegrasp_service.observability import Tracer, otlp_provider
-
-            provider = otlp_provider(settings.otlp_endpoint)
-            ends.callback(provider.shutdown)
-            observers.append(Tracer(provider).trace_call)
+    with contextlib.closing(start_logging(settings, sys.stderr)) as log:
         warn(settings)
-        asyncio.run(_serve_until_signalled(settings, observers, log))
+        asyncio.run(_serve_until_signalled(settings, log))
 
 
-async def _serve_until_signalled(
-    settings: Settings, observers: Sequence[Observer], log: LogQueue
-) -> None:
+async def _serve_until_signalled(settings: Settings, log: LogQueue) -> None:
     stop = asyncio.Event()
-    server = Server(settings, observers)
+    server = Server(settings)
     server.metrics.watch("log_lines_dropped", "log lines not written", lambda: log.dropped)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,28 +1,20 @@
 """Settings of the server: defaults, then a TOML file, EDGEGRASP_* variables, and flags."""
 
+import json
 import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, SecretStr, ValidationError, model_validator
-from pydantic_settings import (
-    BaseSettings,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-    SettingsError,
-    TomlConfigSettingsSource,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
-CLIENT_PREFIX = PREFIX + "CLIENT_"  # variables of the client's commands
-# No one may see these, nor give them as flags, which every user of a machine can see.
-SECRETS = ("tokens", "admin_tokens")
+NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
+LISTS = ("weights", "grippers")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
@@ -31,29 +23,18 @@ Wait = Annotated[float, Field(ge=0.0, le=3600.0)]  # seconds
 Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
 
 
-class Settings(BaseSettings):
-    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`.
+class Settings(BaseModel):
+    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
 
-    Made directly, it takes arguments and defaults only; `load_settings` knows every source.
-    """
-
-    model_config = SettingsConfigDict(
-        env_prefix=PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = Field("127.0.0.1", description="address both transports bind to")
     http_port: Port = Field(8000, description="0: any free port")
     grpc_port: Port = Field(50051, description="0: any free port")
-    backend: Literal["weights", "dummy"] = Field(
-        "weights", description="dummy: made-up grasps, for load tests without weights"
-    )
-    dummy_seconds: Wait = Field(0.0, description="service time of the dummy backend, seconds")
     weights: tuple[Path, ...] = Field(
         (), description="weights files or folders of them, besides those that ship"
     )
-    grippers: tuple[Path, ...] = Field(
-        (), description="gripper files (.toml), named by their stem in requests"
-    )
+    grippers: tuple[Path, ...] = Field((), description="gripper files (.toml), named by their stem")
     default_model: str = Field("", description="weights used when a request names none")
     device: str = Field(
         "cpu",
@@ -65,56 +46,33 @@ class Settings(BaseSettings):
     )
     max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
     max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
-    max_approach_points: Count = Field(
-        256, le=256, description="most approach points a request may ask for"
-    )
-    max_candidates: Count = Field(
-        16_000, le=16_000, description="most candidates a request may ask for"
-    )
-    workers: int = Field(
-        0, ge=0, le=1024, description="processes that detect, each with one thread; 0: one a core"
-    )
+    max_approach_points: Count = Field(256, le=256, description="most that a request may ask for")
+    max_candidates: Count = Field(16_000, le=16_000, description="most that a request may ask for")
+    workers: int = Field(0, ge=0, le=1024, description="processes that detect; 0: one a core")
     max_worker_bytes: int = Field(
-        3 * 1024 * MIB,
-        ge=64 * MIB,
-        description="memory a worker may take for its request; one that needs more is replaced",
+        3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may take for its request"
     )
     max_queue_length: int = Field(
         32, ge=0, le=65536, description="most requests in the server beside those at work"
     )
-    max_held_bytes: Size = Field(
-        512 * MIB,
-        description="most bytes of bodies held at a time; who comes then waits to be read",
-    )
+    max_held_bytes: Size = Field(512 * MIB, description="most bytes of bodies held at a time")
     max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
-    max_stream_requests: Count = Field(
-        4, le=1024, description="most requests of one stream read ahead"
-    )
+    max_stream_requests: Count = Field(4, le=1024, description="most of one stream read ahead")
     max_connections: Count = Field(
-        512, le=65536, description="most HTTP connections open at a time"
+        512, le=65536, description="most connections open at a time, of HTTP and of gRPC each"
     )
     max_request_seconds: float = Field(
-        120.0,
-        gt=0.0,
-        le=86400.0,
-        description="longest a request may take, where the caller sets no shorter deadline",
+        120.0, gt=0.0, le=86400.0, description="longest a request may take, whatever its deadline"
     )
     read_seconds: Timeout = Field(
-        10.0,
-        description="time for a gRPC message, or for an HTTP body at min_bytes_per_second and more",
+        10.0, description="time for a body to arrive, and more at min_bytes_per_second"
     )
     write_seconds: Timeout = Field(
         10.0, description="time for an answer to be taken, and more at min_bytes_per_second"
     )
-    min_bytes_per_second: Count = Field(
-        50_000, description="slowest that bodies and answers may be sent"
-    )
-    record_folder: Path | None = Field(
-        None, description="folder that requests and answers are recorded in; none: not"
-    )
-    record_bytes: Size = Field(
-        1024 * MIB, description="most bytes recorded; the oldest are deleted"
-    )
+    min_bytes_per_second: Count = Field(50_000, description="slowest that bodies and answers go")
+    record_folder: Path | None = Field(None, description="folder to record requests and answers in")
+    record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
     max_header_bytes: int = Field(
         32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
@@ -125,29 +83,15 @@ class Settings(BaseSettings):
     tls_client_ca: Path | None = Field(
         None, description="PEM file: CAs of clients, which must then show a certificate"
     )
-    tokens: tuple[SecretStr, ...] = Field(
-        (), description="bearer tokens, one of which a request must carry; none: no need"
-    )
-    token_file: Path | None = Field(None, description="file of further tokens, one a line")
-    admin_tokens: tuple[SecretStr, ...] = Field(
-        (), description="tokens that may reload weights too; none: SIGHUP only"
+    token_file: Path | None = Field(
+        None, description="bearer tokens, one a line, which requests must carry; none: no need"
     )
     admin_token_file: Path | None = Field(
-        None, description="file of further admin tokens, one a line"
+        None, description="tokens that may reload weights too, one a line; none: SIGHUP only"
     )
-    grace_seconds: Wait = Field(
-        10.0, description="time for requests in flight when stopping, seconds"
-    )
-    otlp_endpoint: str = Field(
-        "",
-        pattern=r"^(https?://[^@\s]+)?$",  # no password: it would be printed
-        description="URL that traces are posted to, e.g. http://127.0.0.1:4318/v1/traces",
-    )
+    grace_seconds: Wait = Field(10.0, description="for requests in flight when stopping, seconds")
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="least severe records logged"
-    )
-    log_format: Literal["auto", "json", "text"] = Field(
-        "auto", description="auto: text on a terminal, JSON lines elsewhere"
     )
 
     @model_validator(mode="after")
@@ -157,18 +101,6 @@ class Settings(BaseSettings):
         if self.tls_client_ca is not None and self.tls_certificate is None:
             raise ValueError("tls_client_ca needs tls_certificate and tls_key")
         return self
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Arguments only; `load_settings` reads the file and the environment when it is called."""
-        return (init_settings,)
 
 
 def load_settings(config: Path | None = None, **given: object) -> Settings:
@@ -183,19 +115,16 @@ def load_settings(config: Path | None = None, **given: object) -> Settings:
     """
     named = os.environ.get(CONFIG_VARIABLE)
     path = config or (Path(named) if named else None)
-    sources = {"a flag": given}
+    sources = {"a flag": given, "the environment": _read_environment()}
+    if path is not None:
+        sources[str(path)] = _read_file(path)
+    merged: dict[str, Any] = {}
+    for fields in reversed(sources.values()):
+        merged |= fields
     try:
-        sources["the environment"] = _read_environment()
-        if path is not None:
-            sources[str(path)] = _read_file(path)
-        merged: dict[str, Any] = {}
-        for fields in reversed(sources.values()):
-            merged |= fields
         return Settings(**merged)
     except ValidationError as error:
         raise InvalidSettings(_sentence(error, sources)) from None
-    except SettingsError as error:
-        raise InvalidSettings(f"environment: {error}. Write lists as JSON.") from None
 
 
 def _read_file(path: Path) -> dict[str, Any]:
@@ -203,7 +132,7 @@ def _read_file(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InvalidSettings(f"config: got {str(path)!r}. There is no such file.")
     try:
-        fields = TomlConfigSettingsSource(Settings, path).toml_data
+        fields = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise InvalidSettings(f"config: {path}: {error}.") from None
     return {name: _located(name, value, path.absolute().parent) for name, value in fields.items()}
@@ -220,18 +149,21 @@ def _located(name: str, value: Any, folder: Path) -> Any:
 
 
 def _read_environment() -> dict[str, Any]:
-    """The settings in EDGEGRASP_* variables, and names that are none."""
-    names = [name.upper() for name, value in os.environ.items() if value]
-    ours = {name.removeprefix(PREFIX).lower(): name for name in names if name.startswith(PREFIX)}
-    for name, variable in ours.items():
-        known = name in Settings.model_fields or variable == CONFIG_VARIABLE
-        if not known and not variable.startswith(CLIENT_PREFIX):
-            raise InvalidSettings(f"{one_line(variable)}: no such setting.")
-    return EnvSettingsSource(Settings)()
+    """The settings in EDGEGRASP_* variables, and names that are none; lists are JSON."""
+    fields: dict[str, Any] = {}
+    for variable, text in os.environ.items():
+        if not text or not variable.startswith(PREFIX) or variable.startswith(NO_SETTINGS):
+            continue
+        name = variable.removeprefix(PREFIX).lower()
+        try:
+            fields[name] = json.loads(text) if name in LISTS else text
+        except ValueError:
+            raise InvalidSettings(f"{variable}: got {text!r}. Write lists as JSON.") from None
+    return fields
 
 
 def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str:
-    """The first thing wrong and where it is set; never the value of a secret."""
+    """The first thing wrong and where it is set."""
     first = error.errors(include_url=False)[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:
@@ -240,9 +172,8 @@ def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str
     origin = next(source for source, fields in sources.items() if name in fields)
     if first["type"] == "extra_forbidden":
         return f"{one_line(name)}: no such setting. It comes from {origin}."
-    got = "a secret" if name in SECRETS else repr(first["input"])
     path = ".".join(str(part) for part in first["loc"])
-    return f"{path}: got {got}. {message}. It comes from {origin}."
+    return f"{path}: got {first['input']!r}. {message}. It comes from {origin}."
 
 
 def one_line(text: str) -> str:

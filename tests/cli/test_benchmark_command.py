@@ -106,13 +106,13 @@ def test_two_planners_are_compared_scene_by_scene(oracle, edge_sample, run, tmp_
 
 
 def test_a_server_killed_and_restarted_changes_nothing(
-    start_server: Callable, dummy_server, benchmark: Callable, tmp_path: Path
+    start_dummy: Callable, dummy_server, benchmark: Callable, tmp_path: Path
 ) -> None:
     address = dummy_server.grpc_address
     calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=3)
     shaken = tmp_path / "shaken"
     with ExitStack() as stack:
-        first = stack.enter_context(start_server("--backend", "dummy"))
+        first = stack.enter_context(start_dummy())
         ports = re.findall(r":(\d+)", f"{first.http_url} {first.grpc_address}")
         same = ("--http-port", ports[0], "--grpc-port", ports[1])
 
@@ -121,7 +121,7 @@ def test_a_server_killed_and_restarted_changes_nothing(
                 time.sleep(0.01)
             first.process.kill()
             first.process.wait()
-            stack.enter_context(start_server("--backend", "dummy", *same))
+            stack.enter_context(start_dummy(*same))
 
         thread = threading.Thread(target=restart)
         thread.start()
@@ -132,7 +132,7 @@ def test_a_server_killed_and_restarted_changes_nothing(
 
 
 def test_a_server_that_asks_for_a_token_gets_it(
-    start_server: Callable,
+    start_dummy: Callable,
     benchmark: Callable,
     refused,
     tmp_path: Path,
@@ -141,7 +141,7 @@ def test_a_server_that_asks_for_a_token_gets_it(
     monkeypatch.delenv("EDGEGRASP_CLIENT_TOKEN", raising=False)
     token = tmp_path / "token"
     token.write_text("user-token-0123456789\n")
-    with start_server("--backend", "dummy", "--token-file", str(token)) as server:
+    with start_dummy("--token-file", str(token)) as server:
         asked = ("--server", server.grpc_address)
         known = benchmark(tmp_path / "known", "server", *asked, "--token-file", token, rounds=1)
         assert known["attempts"] > 0

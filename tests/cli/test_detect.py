@@ -129,12 +129,12 @@ def pem(tmp_path: Path) -> dict[str, str]:
     return {name: str(tmp_path / f"{name}.pem") for name in ("ca", "own")}
 
 
-def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_server, monkeypatch):
+def test_a_server_with_tls_and_tokens(file, pem, run, refused, tmp_path, start_dummy, monkeypatch):
     token = tmp_path / "token"
     token.write_text("user-token-0123456789\n")
     certificates = ("--tls-certificate", pem["own"], "--tls-key", pem["own"])
     flags = (*certificates, "--tls-client-ca", pem["ca"], "--token-file", str(token))
-    with start_server("--backend", "dummy", *flags) as server:
+    with start_dummy(*flags) as server:
         for address in (server.grpc_address, server.http_url):
             asked = ("--server", address, *certificates, "--tls-ca", pem["ca"])
             document = json.loads(run("detect", file, *asked, "--token-file", token, "--json"))

@@ -109,7 +109,6 @@ DESCRIBED = [
     (Problem("payload-too-large", Code.RESOURCE_EXHAUSTED, 413), PayloadTooLargeError),
     (Problem("unauthenticated", Code.UNAUTHENTICATED, 401), AccessDeniedError),
     (Problem("permission-denied", Code.PERMISSION_DENIED, 403), AccessDeniedError),
-    (Problem("decoder-missing", Code.UNIMPLEMENTED, 501), ServerFailedError),
     (Problem("detector-failed", Code.INTERNAL, 500), ServerFailedError),
     (AWAY, ServerUnavailableError),
     (BUSY, OverloadedError),
@@ -236,8 +235,8 @@ def test_no_server(scheme: str, closed_port: int, make_client, cloud) -> None:
 
 
 @pytest.fixture(scope="module")
-def slow_server(start_server):
-    with start_server("--backend", "dummy", "--dummy-seconds", "0.5") as server:
+def slow_server(start_dummy):
+    with start_dummy(seconds=0.5) as server:
         yield server
 
 

@@ -1,20 +1,21 @@
 """Whatever comes in, a decoder gives arrays or a 4xx, within memory that the bytes explain."""
 
 import json
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_service.schemas import GIVEN, PER_POINT
-from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
-from edgegrasp_service.worker.job import Job, Limits
-from edgegrasp_service.worker.request_cloud import File, decode_cloud
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import answer
+from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 
 from .conftest import (
     DEPTH_IMAGE,
@@ -105,7 +106,7 @@ FORM = b"".join(
 
 # Whole requests
 
-ANSWERER = Answerer(DummyCatalogue(), Limits(max_points=MAX_POINTS))
+ANSWER = partial(answer, catalogue=DummyCatalogue(), settings=Settings(max_points=MAX_POINTS))
 DOCUMENTS = {
     "points": POINTS.tolist(),
     "point_cloud2": POINT_CLOUD2 | {"data": base64_of(POINT_CLOUD2["data"])},
@@ -123,7 +124,7 @@ def ask(transport: Any, body: bytes, scores: bool, media_type: str = "", query: 
     job = Job(method, transport, body, 60.0, media_type, query)
 
     def work() -> None:
-        answer = ANSWERER.answer(job)
+        answer = ANSWER(job)
         if answer.error is not None:
             assert 400 <= answer.error.status < 500, answer.facts.traceback
             answer.error.detail.encode()  # what cannot be encoded cannot be answered
@@ -195,7 +196,7 @@ def test_what_is_mutated_is_good() -> None:
         ("application/json", json.dumps({name: DOCUMENTS[name]}).encode()) for name in DOCUMENTS
     ]
     for media_type, content in good:
-        answer = ANSWERER.answer(Job("DetectGrasps", "http", content, 60.0, media_type))
+        answer = ANSWER(Job("DetectGrasps", "http", content, 60.0, media_type))
         assert answer.error is None
     for file_format in FILES:
         for content in FILES[file_format]:

@@ -200,7 +200,7 @@ ASK = """
 import os, socket, sys
 with socket.socket(socket.AF_UNIX) as asking:
     asking.connect(sys.argv[1])
-    socket.send_fds(asking, [sys.argv[2].encode()], [0])
+    socket.send_fds(asking, ["\\n".join(sys.argv[2:]).encode()], [0])
     os.close(0)
     asking.recv(1)
 """
@@ -212,6 +212,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...
     path = str(tmp_path_factory.mktemp("nursery") / "socket")
     command = [sys.executable, "-P", str(Path(__file__).parent / "nursery.py"), path]
     environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
+    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
@@ -240,6 +241,10 @@ async def begin(
             if call.method in ("DetectGrasps", "ScoreGrasps") or call.in_stream:
                 calls.append(call)
 
+        for name in ("token", "admin_token"):
+            if tokens := given.pop(f"{name}s", None):
+                given[f"{name}_file"] = folder / name
+                (folder / name).write_text("\n".join(tokens))
         server = Server(Settings(**(ours | given)), [note], (*nursery, str(folder)))
         opened, ready, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
         serving = asyncio.create_task(server.serve(stop, opened.set, ready.set))

@@ -14,12 +14,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.dummy import DummyCatalogue, DummyDetector
+
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel
 from edgegrasp_service import errors
 from edgegrasp_service.errors import Overloaded, kind_of
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer as answer  # what a nursery imports
-from edgegrasp_service.worker.dummy import DummyCatalogue, DummyDetector
 from edgegrasp_service.worker.process import main
 
 PATIENCE = 20  # seconds; longer than anything takes
@@ -27,7 +28,7 @@ FOLDER = Path()  # what a test writes into it tells what happens
 
 
 def fork_nurseries(path: str) -> None:
-    """Each who asks sends the socket of its pool and a folder, and its nursery ends with it."""
+    """Who asks sends the socket of its pool, a folder and settings; its nursery ends with it."""
     global FOLDER
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     listening = socket.socket(socket.AF_UNIX)
@@ -36,16 +37,17 @@ def fork_nurseries(path: str) -> None:
     os.write(1, b"ready\n")
     while True:
         asked, _ = listening.accept()
-        folder, pools, _, _ = socket.recv_fds(asked, 4096, 1)
+        told, pools, _, _ = socket.recv_fds(asked, 2**16, 1)
         if pools and os.fork() == 0:
             listening.close()
             fcntl.fcntl(asked, fcntl.F_SETOWN, os.getpid())
             fcntl.fcntl(asked, fcntl.F_SETFL, os.O_ASYNC)  # SIGIO once who asked is gone: the end
             os.dup2(pools[0], 0)
             os.close(pools[0])
-            FOLDER = Path(folder.decode())
+            folder, settings_json = told.decode().split("\n")
+            FOLDER = Path(folder)
             try:
-                main(load)
+                main(settings_json, load)
             finally:
                 os._exit(0)
         for pool in pools:
@@ -119,10 +121,10 @@ class Detector(DummyDetector):
 class Catalogue(DummyCatalogue):
     """Every load gives the next digest."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self) -> None:
         stage("load")
         self.digest = str((FOLDER / "begun").read_text().split().count("load"))
-        self._detector = Detector(seconds)
+        self._detector = Detector()
 
     def describe(self) -> Sequence[Mapping[str, Any]]:
         return [{**super().describe()[0], "digest": self.digest}]
@@ -132,7 +134,7 @@ def load(settings: Settings) -> Catalogue:
     failing = FOLDER / "fault-weights"  # stays until it is deleted
     if failing.exists():
         raise EdgeGraspError(failing.read_text())
-    return Catalogue(settings.dummy_seconds)
+    return Catalogue()
 
 
 if __name__ == "__main__":

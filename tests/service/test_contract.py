@@ -7,6 +7,7 @@ from typing import Any
 
 import grpc
 import httpx
+import jsonschema
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
@@ -14,7 +15,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
-from edgegrasp_service.schemas import DetectionBody, ModelsBody, ScoringBody
+from edgegrasp_service.front.http import DOCUMENT
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
 
@@ -83,16 +84,22 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
     assert all(grasps_of(answer) == expected for answer in answers)
 
 
+def check(answer: httpx.Response, name: str) -> Any:
+    """The JSON of an answer, which is as its schema says."""
+    jsonschema.validate(answer.json(), DOCUMENT | {"$ref": f"#/components/schemas/{name}"})
+    return answer.json()
+
+
 def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, http) -> None:
     body = {"points": cloud.tolist(), "options": {"debug": True}}
-    debug = DetectionBody.model_validate(http.post("/v1/grasps", json=body).json()).debug
-    assert debug is not None
-    assert len(debug.outcome) == len(debug.score) == len(debug.T_cloud_hand) == 32
-    assert debug.score[-1] is None
+    debug = check(http.post("/v1/grasps", json=body), "Detection")["debug"]
+    assert len(debug["outcome"]) == len(debug["score"]) == len(debug["T_cloud_hand"]) == 32
+    assert debug["score"][-1] is None
     body = {"points": cloud.tolist(), "edges": [[0, 1], [3, 3]]}
-    scoring = ScoringBody.model_validate(http.post("/v1/grasps:score", json=body).json())
-    assert [evaluation.grasp is None for evaluation in scoring.evaluations] == [False, True]
-    ModelsBody.model_validate(http.get("/v1/models").json())
+    scoring = check(http.post("/v1/grasps:score", json=body), "Scoring")
+    assert [evaluation["grasp"] is None for evaluation in scoring["evaluations"]] == [False, True]
+    check(http.get("/v1/models"), "Models")
+    check(http.post("/v1/grasps", json={}), "Problem")
 
 
 def test_nothing_found_is_a_success(cloud: np.ndarray, dummy_server, transport: str) -> None:

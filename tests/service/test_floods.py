@@ -291,6 +291,15 @@ async def test_connections_are_bounded(serve) -> None:
     assert b" 429 " in answer.splitlines()[0]
     for connection in (*held, extra):
         connection.close()
+    opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes.fromhex("000000040000000000")
+    said = []
+    for _ in range(4):
+        held.append(http_socket(f"http://{running.server.grpc_address}"))
+        held[-1].sendall(opening)
+        said.append(await asyncio.to_thread(held[-1].recv, 4096))
+    assert [bool(answer) for answer in said] == [True, True, True, False]
+    for connection in held:
+        connection.close()
     async with httpx.AsyncClient(base_url=url) as http:
         for _ in range(100):  # until the server has seen them go
             with contextlib.suppress(httpx.HTTPError):
@@ -302,7 +311,7 @@ async def test_connections_are_bounded(serve) -> None:
 
 OUT_OF_DESCRIPTORS = """
 import resource, sys
-from edgegrasp_cli.main import main
+from benchmarks.dummy import main
 resource.setrlimit(resource.RLIMIT_NOFILE, (96, 96))
 main()
 """
@@ -310,7 +319,7 @@ main()
 
 def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud) -> None:
     """Row 12."""
-    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve", "--backend", "dummy"]
+    command = [sys.executable, "-c", OUT_OF_DESCRIPTORS, "serve"]
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen(
             [*command, "--http-port", "0", "--grpc-port", "0", "--workers", "1"],

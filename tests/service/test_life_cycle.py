@@ -168,9 +168,9 @@ def call(address: str, cloud: np.ndarray, came: list[str], streams: bool) -> Non
             came.append(type(error).__name__)
 
 
-def test_sigterm_under_load(start_server, cloud: np.ndarray) -> None:
+def test_sigterm_under_load(start_dummy, cloud: np.ndarray) -> None:
     """Every request that was accepted is answered; the others are told, and the exit code is 0."""
-    with start_server("--backend", "dummy", "--dummy-seconds", "0.02") as server:
+    with start_dummy(seconds=0.02) as server:
         ways = [(server.grpc_address, False), (server.grpc_address, True), (server.http_url, False)]
         came: list[list[str]] = [[] for _ in range(3 * len(ways))]
         threads = [
@@ -194,14 +194,14 @@ def test_sigterm_under_load(start_server, cloud: np.ndarray) -> None:
 SERVE_AT_A_TERMINAL = """
 import fcntl, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-from edgegrasp_cli.main import main
+from benchmarks.dummy import main
 main()
 """
 
 
 def test_a_closed_terminal_stops_what_was_started_in_it() -> None:
     terminal, inside = pty.openpty()
-    command = [sys.executable, "-c", SERVE_AT_A_TERMINAL, "serve", "--backend", "dummy"]
+    command = [sys.executable, "-c", SERVE_AT_A_TERMINAL, "serve"]
     process = subprocess.Popen(
         [*command, "--http-port", "0", "--grpc-port", "0"],
         stdin=inside,

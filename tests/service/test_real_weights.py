@@ -16,7 +16,7 @@ from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.answer import Answerer, load_catalogue
+from edgegrasp_service.worker.answer import answer, load_catalogue
 from edgegrasp_service.worker.job import Job
 
 
@@ -161,9 +161,9 @@ def test_scores_are_the_same_everywhere(
 def test_too_many_voxels_are_named() -> None:
     room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
     np.save(file, room)
-    answerer = Answerer(load_catalogue(Settings(max_voxels=20_000)))
+    few = Settings(max_voxels=20_000)
     job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy")
-    error = answerer.answer(job).error
+    error = answer(job, load_catalogue(few), few).error
     assert error is not None
     assert "voxels" in error.value
     assert "workspace" in error.fix

@@ -32,8 +32,13 @@ WRONG = "wrong-token-0123456789"
         ("Bearer \udcff\xff", False, Unauthenticated),
     ],
 )
-def test_check(header: str | None, admin: bool, error: type[Exception] | None) -> None:
-    known = load_tokens(Settings(tokens=[USER, SECOND], admin_tokens=[ADMIN]))
+def test_check(
+    header: str | None, admin: bool, error: type[Exception] | None, tmp_path: Path
+) -> None:
+    users, admins = tmp_path / "tokens", tmp_path / "admin_tokens"
+    users.write_text(f"{USER}\n{SECOND}\n")
+    admins.write_text(ADMIN)
+    known = load_tokens(Settings(token_file=users, admin_token_file=admins))
     if error is None:
         known.check(header, admin=admin)
     else:
@@ -50,9 +55,11 @@ def test_without_tokens_all_but_administration_is_open() -> None:
 def test_tokens_have_names(tmp_path: Path) -> None:
     file = tmp_path / "tokens"
     file.write_text(f"# of the cell\narm-1:{USER}\n  {SECOND}\n")
-    known = load_tokens(Settings(token_file=file, admin_tokens=[ADMIN]))
+    admins = tmp_path / "admins"
+    admins.write_text(ADMIN)
+    known = load_tokens(Settings(token_file=file, admin_token_file=admins))
     names = [known.check(f"Bearer {token}").name for token in (USER, SECOND, ADMIN)]
-    assert names == ["arm-1", "token_file 2", "admin_tokens 1"]
+    assert names == ["arm-1", "token_file 2", "admin_token_file 1"]
     assert USER not in repr(vars(known))
 
 

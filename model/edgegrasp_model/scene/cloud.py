@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.kernels import least_spread
 from edgegrasp_model.options import MAX_CANDIDATES
 
 Float32 = NDArray[np.float32]
@@ -51,8 +52,8 @@ class CheckedCloud:
     view_ids: NDArray[np.int64] | None = None  # (N,)
     image_size: tuple[int, int] | None = None  # (H, W) where it is organised
 
-    def take(self, kept: NDArray[np.bool_]) -> "CheckedCloud":
-        """The points for which `kept` (N,) holds; rows are counted as before."""
+    def take(self, kept: NDArray[np.bool_] | Int64) -> "CheckedCloud":
+        """Some of the points, by truth values (N,) or places; rows are counted as before."""
         return CheckedCloud(
             self.points[kept],
             self.row[kept],
@@ -100,7 +101,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         size_of_image = points.shape[:2]
         points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
-            kept = np.flatnonzero(np.isfinite(points).all(axis=1))
+            kept = np.flatnonzero(_finite(points))
             points = points[kept]
             if len(points) == 0:
                 raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
@@ -236,7 +237,7 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
         raise InvalidRequest("cloud", f"shape {cloud.shape}", "Send shape (N, 3): x, y, z a row.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
-    finite = np.isfinite(cloud).all(axis=1)
+    finite = _finite(cloud)
     if not finite.all():
         bad = int(np.argmin(finite))
         raise InvalidRequest(
@@ -244,14 +245,15 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
             f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
             "Remove points without a finite x, y, z.",
         )
-    extent = float(np.ptp(cloud.astype(np.float64), axis=0).max())
+    low, high = (np.array([axis(column) for column in cloud.T]) for axis in (np.min, np.max))
+    extent = float((high.astype(np.float64) - low).max())
     if extent > MAX_EXTENT:
         raise InvalidRequest(
             "cloud",
             f"an extent of {extent:.4g} m, which suggests millimetres",
             "Send metres: divide by 1000.",
         )
-    furthest = float(np.abs(cloud).max())
+    furthest = float(np.abs([low, high]).max())
     if furthest > MAX_DISTANCE:
         raise InvalidRequest(
             "cloud",
@@ -266,6 +268,12 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
             "Send more points or lower options.num_approach_points.",
         )
     return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
+def _finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points (N, 3) have three finite coordinates."""
+    x, y, z = points.T
+    return np.asarray(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
 
 
 @dataclass(frozen=True)
@@ -322,11 +330,7 @@ def estimate_normals(points: Float32) -> Float32:
     """
     k = min(NORMAL_NEIGHBORS, len(points))
     _, rows = cKDTree(points).query(points, k=range(1, k + 1))
-    columns = [column[rows].astype(np.float64) for column in points.T]  # x, y, z, (N, k) each
-    columns = [column - column.mean(axis=1, keepdims=True) for column in columns]
-    products = [[np.einsum("nk,nk->n", one, other) for other in columns] for one in columns]
-    _, vectors = np.linalg.eigh(np.array(products).transpose(2, 0, 1))  # ascending variance
-    return vectors[:, :, 0].astype(np.float32)
+    return least_spread(points, np.asarray(rows))
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:

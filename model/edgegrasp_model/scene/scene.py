@@ -30,8 +30,8 @@ from edgegrasp_model.scene.cloud import (
 from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
-from edgegrasp_model.scene.support import Seen, Support, find_support, measured, thickness
-from edgegrasp_model.scene.things import PlaneView, find_things, plan_axes
+from edgegrasp_model.scene.support import Seen, Support, find_support, measured
+from edgegrasp_model.scene.things import PlaneView, find_things
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -45,6 +45,7 @@ MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 CELL = 0.05  # metres
+ON = 10_000  # points of the support, at least, that tell its outline
 
 
 @dataclass(frozen=True)
@@ -106,11 +107,15 @@ def select_points(
         return SelectedPoints(
             sent, np.where(inside, _given_numbers(sent), -1), None, up, viewpoints
         )
-    height, margin = support.heights(sent.points), support.margin(seen.distance())
-    above = np.asarray(height > margin)
-    counts["above_support"] = int((above & inside).sum())
-    number = _numbers(seen, sent, height, margin, inside, support, options, warnings)
-    kept = above & near_things(seen, number, support)
+    height, margin, thick = support.heights(seen)
+    on, above = np.flatnonzero(np.abs(height) < thick), np.flatnonzero(height > margin)
+    on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
+    sent, seen, inside = sent.take(above), seen.take(above), inside[above]
+    counts["above_support"] = int(inside.sum())
+    plan = support.plan(sent.points)
+    view = PlaneView(plan, height[above], margin[above], on_plan, seen.at_border)
+    number = _numbers(view, sent, inside, options, warnings)
+    kept = near_things(view.plan, number)
     return SelectedPoints(sent.take(kept), number[kept], support, up, viewpoints)
 
 
@@ -232,47 +237,39 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
 
 
 def _numbers(
-    seen: Seen,
+    view: PlaneView,
     sent: CheckedCloud,
-    height: NDArray[np.floating],
-    margin: NDArray[np.floating],
     inside: Bools,
-    support: Support,
     options: DetectOptions,
     warnings: list[str],
 ) -> Int64:
-    """The object (N,) of each point over the support; -1: none.
+    """The object (M,) of each point over the support; -1: none.
 
     What the caller says are objects are: segments, or regions by rows.
     """
-    above = np.asarray(height > margin)
     by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
     if sent.segment_ids is not None or by_rows or options.objects == "off":
-        return np.where(above & inside, _given_numbers(sent), -1)
-    plan = seen.points @ plan_axes(support.normal, seen.viewpoint, seen.points).T
-    on = np.abs(height) < thickness(seen.distance())
+        return np.where(inside, _given_numbers(sent), -1)
     sure = None if options.workspace is None else inside
-    view = PlaneView(plan, height, margin, on, seen.at_border)
     number = np.where(inside, find_things(view, options.max_object_size, sure), -1)
-    if (number >= 0).any() or not (above & inside).any():
+    if (number >= 0).any() or not inside.any():
         return number
     warnings.append(
         "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
         "by the image, or not on the plane): all that is over it is taken for things."
     )
-    number[above & inside] = 0
-    return number
+    return np.where(inside, 0, -1)
 
 
-def near_things(seen: Seen, number: Int64, support: Support) -> Bools:
-    """Which points (N,) a hand at any of the things could meet."""
-    plan = seen.points @ plan_axes(support.normal, seen.viewpoint, seen.points).T
+def near_things(plan: Float64, number: Int64) -> Bools:
+    """Which points (M,), with places (M, 2) along the support, a hand at any thing could meet."""
+    if not (number >= 0).any():
+        return np.zeros(len(plan), dtype=bool)
     cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
     held = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     held[tuple(cell[number >= 0].T)] = True
-    near = ndimage.binary_dilation(
-        held, np.ones((3, 3), dtype=bool), iterations=math.ceil(REACH / CELL)
-    )
+    square = np.ones((3, 3), dtype=bool)
+    near = ndimage.binary_dilation(held, square, iterations=math.ceil(REACH / CELL))
     return np.asarray(near[tuple(cell.T)])
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from edgegrasp_model.kernels import heights_and_distances, least_spread
 from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane
 from edgegrasp_model.scene.things import PlaneView, find_things, plan_axes
 
@@ -16,16 +17,17 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+THICKNESS = 0.004, 0.006  # metres, and per squared metre of distance, within which a plane holds
 MAX_TILT = math.radians(30)  # between a plane that is looked for and an `up` that was sent
-SAMPLE = 2500  # points that planes are made of and judged by
+SAMPLE = 2000  # points that planes are made of and judged by
 NEIGHBORS = 12  # points around one, itself included, that give its normal
-JUDGED = 150  # planes that are judged in search of the next one
+JUDGED = 100  # planes that are judged in search of the next one
 MAX_PLANES = 8
 CROWD_RADIUS = 0.02  # metres around a point in which others share its surface
 SAME_WAY, ROUGHLY_SAME_WAY = 0.9, 0.75  # cosines between a plane's normal and those of its points
 REFINEMENTS = 4  # least squares over the plane's points
 MIN_SHARE = 0.02  # of the seen surface that a plane holds
-VIEW = 20_000  # points that say what stands on a plane
+VIEW = 12_000  # points that say what stands on a plane
 CELL = 0.02  # metres
 NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
 MAX_BELOW = 0.5  # share of what is seen at and right under a plane that lies under it
@@ -37,6 +39,7 @@ MIN_MARGIN, MAX_MARGIN = 0.004, 0.02  # metres over the plane that still belong 
 GIVEN_MARGIN = 0.005  # metres, over a plane that is given and not seen
 DEVIATIONS = 4.0  # of a plane's own points that still belong to it
 MAX_BOW = 0.025  # metres by which a support may rise over its plane, as seen
+STIFF = 1e-6 * np.eye(6)  # keeps a support flat where too little of it is seen
 MIN_SEEN = 200  # points of a given plane from which its residual is measured
 
 
@@ -51,28 +54,40 @@ class Support:
     distance: float  # metres from the camera to its points, the median
     least: float  # metres over it that belong to it anyway
     bow: Float64  # (6,) rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2
-    axes: Float64  # (3, 3) rows x and y along the plane, and their origin; cloud frame
-
-    def heights(self, points: NDArray[np.floating]) -> Float64:
-        """Heights (N,) of points (N, 3) over the support, which may be bowed, metres."""
-        plan = (points - self.axes[2]) @ self.axes[:2].T
-        rise = np.clip(_squares(plan) @ self.bow, -MAX_BOW, MAX_BOW)
-        return np.asarray(self.plane.heights(points) - rise)
+    axes: Float64  # (4, 3) x and y along the plane, its normal, and an origin on it; cloud frame
 
     @property
     def normal(self) -> Float64:
         """(3,) unit."""
-        return np.asarray(self.plane.normal, dtype=np.float64)
+        return np.asarray(self.axes[2])
 
-    def margin(self, distance: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Metres over the plane below which points seen from `distance` (N,) belong to it.
+    def plan(self, points: NDArray[np.floating]) -> Float64:
+        """Places (N, 2) along the plane of points (N, 3), metres."""
+        return np.asarray((points - self.axes[3]) @ self.axes[:2].T)
+
+    def heights(self, seen: "Seen") -> tuple[Float32, Float32, Float32]:
+        """How high points stand over the support, which may be bowed, and what belongs to it.
 
         The noise of depth cameras grows with the square of the distance.
+
+        Args:
+            seen: N points.
+
+        Returns:
+            The height (N,) of each, the height (N,) up to which it belongs to the support, and
+            the distance (N,) from the plane within which it may be a point of it; metres.
         """
+        eye = seen.viewpoint
+        height, squared = heights_and_distances(
+            seen.points, self.axes, self.bow, MAX_BOW, self.axes[3] if eye is None else eye
+        )
+        if eye is None:
+            squared = np.full(len(squared), USUAL_DISTANCE**2, dtype=np.float32)
+        thick = np.asarray(THICKNESS[0] + THICKNESS[1] * squared)
         if math.isnan(self.spread):
-            return np.full(len(distance), self.least, dtype=np.float32)
-        grown = DEVIATIONS * self.spread * np.square(distance / self.distance)
-        return np.asarray(np.clip(grown, self.least, max(MAX_MARGIN, self.least)))
+            return height, np.full_like(height, self.least), thick
+        grown = np.float32(DEVIATIONS * self.spread / self.distance**2) * squared
+        return height, np.clip(grown, self.least, max(MAX_MARGIN, self.least)), thick
 
 
 class Seen(NamedTuple):
@@ -107,7 +122,7 @@ class _Plane(NamedTuple):
 
 def thickness(distance: NDArray[np.floating]) -> NDArray[np.floating]:
     """Metres from a plane within which points seen from `distance` (N,) may belong to it."""
-    return np.asarray(0.004 + 0.006 * np.square(distance))
+    return np.asarray(THICKNESS[0] + THICKNESS[1] * np.square(distance))
 
 
 def find_support(
@@ -162,22 +177,26 @@ def measured(
         least: Metres over it that belong to it anyway.
         share: Of the seen surface, where it is known.
     """
-    rows = np.random.default_rng(0).permutation(len(seen.points))[:VIEW]
-    sample = seen.take(np.sort(rows))
+    sample = seen.take(np.arange(0, len(seen.points), max(len(seen.points) // VIEW, 1)))
     points, distance = sample.points.astype(np.float64), sample.distance()
-    normal = np.asarray(plane.normal)
-    origin = points.mean(axis=0)
-    axes = np.stack([*plan_axes(normal, seen.viewpoint, points), origin])
-    height, thick = plane.heights(points), thickness(distance)
+    normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
+    origin = points.mean(axis=0) if len(points) else np.zeros(3)
+    thick = thickness(distance)
+    height: Float64 = plane.heights(points).astype(np.float64)
+    origin -= float(plane.heights(origin)) * normal
+    x, y = plan_axes(normal, seen.viewpoint, points)
+    axes = np.stack([x, y, normal, origin])
     near = np.abs(height) < thick
     # Where the cloud was cut off above the plane, only what stands on it is near.
     if near.sum() < MIN_SEEN or (height[near] < 0).mean() < 0.2:
         flat, unknown = np.zeros(6), math.nan
         return Support(plane, unknown, share or 0.0, unknown, USUAL_DISTANCE, least, flat, axes)
-    terms, bow = _squares((points - origin) @ axes[:2].T), np.zeros(6)
+    terms = _squares((points - origin) @ axes[:2].T)
+    bow: Float64 = np.zeros(6)
     for _ in range(REFINEMENTS):
         near = np.abs(height - terms @ bow) < thick
-        bow = np.linalg.lstsq(terms[near], height[near], rcond=None)[0]
+        held = terms[near]
+        bow = np.asarray(np.linalg.solve(held.T @ held + STIFF, held.T @ height[near]))
     off, apart = np.abs(height - terms @ bow)[near], distance[near]
     middle = float(np.median(apart))
     spread = 1.4826 * float(np.median(off / np.square(apart / middle)))
@@ -195,12 +214,14 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
     """The planes of what is seen, the largest first, each turned to where it is seen from."""
     if len(seen.points) < NEIGHBORS:
         return []
-    rows = rng.choice(len(seen.points), min(SAMPLE, len(seen.points)), replace=False)
+    size = len(seen.points)
+    rows = rng.choice(size, min(SAMPLE, size), replace=False, shuffle=False)
     sample = seen.take(rows)
     points = sample.points.astype(np.float64)
     thick = thickness(sample.distance())
     tree = cKDTree(points)
-    normals = _turned(_normals(points, tree), points, seen.viewpoint, up)
+    _, around = tree.query(points, k=NEIGHBORS)
+    normals = _turned(least_spread(points, np.asarray(around)), points, seen.viewpoint, up)
     # Surfaces near the camera have more points: weigh each point by the surface it stands for.
     weight = 1.0 / tree.query_ball_point(points, CROWD_RADIUS, return_length=True)
     weight /= weight.sum()
@@ -226,24 +247,15 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
     return sorted(planes, key=lambda plane: -plane.share)
 
 
-def _normals(points: Float64, tree: cKDTree) -> Float64:
-    """Unit normals (N, 3) of either sign."""
-    _, rows = tree.query(points, k=NEIGHBORS)
-    around = points[rows] - points[rows].mean(axis=1, keepdims=True)
-    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
-    normals: Float64 = vectors[:, :, 0]
-    return normals
-
-
 def _turned(
-    normals: Float64, points: Float64, viewpoint: Float64 | None, up: Float64 | None
+    normals: Float32, points: Float64, viewpoint: Float64 | None, up: Float64 | None
 ) -> Float64:
     """Normals on the side of the camera; of `up`, or +z, where there is none."""
     toward = np.array([0.0, 0.0, 1.0]) if up is None else up
     side = normals @ toward
     if viewpoint is not None:
         side = np.einsum("nd,nd->n", normals, viewpoint - points)
-    return np.where(side[:, None] < 0, -normals, normals)
+    return np.where(side[:, None] < 0, -normals, normals).astype(np.float64)
 
 
 def _fitted(points: Float64, weight: Float64, side: Float64) -> _Plane:
@@ -267,8 +279,7 @@ def _most_stood_on(
     warnings: list[str],
 ) -> _Plane | None:
     """The plane of greatest worth; None where none is a support at all."""
-    rows = rng.choice(len(seen.points), min(VIEW, len(seen.points)), replace=False)
-    sample = seen.take(rows)
+    sample = seen.take(np.arange(0, len(seen.points), max(len(seen.points) // VIEW, 1)))
     best, worth, second = None, 0.0, 0.0
     for plane in planes:
         this = _worth(sample, plane, max_size, least=worth * ALIKE)
@@ -300,7 +311,9 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
         return 0.0
     if size / far <= least:  # were everything on it a thing, it would not be worth more
         return 0.0
-    view = PlaneView(plan, height, 2 * thick, on, seen.at_border)
+    out = np.flatnonzero(height > 2 * thick)
+    border = None if seen.at_border is None else seen.at_border[out]
+    view = PlaneView(plan[out], height[out], 2 * thick[out], plan[on], border)
     things = int((find_things(view, max_size) >= 0).sum())
     if things == 0 and plane.share < BARE:
         return 0.0

@@ -36,12 +36,12 @@ FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside
 
 
 class PlaneView(NamedTuple):
-    """M points as a plane sees them."""
+    """M points that stand out from a plane, as it sees them."""
 
     plan: Float64  # (M, 2) metres along the plane
     height: NDArray[np.floating]  # (M,) metres over it
     margin: NDArray[np.floating]  # (M,) metres over it that still belong to it
-    on: Bools  # (M,) belongs to it
+    on: Float64  # (K, 2) points that belong to it, metres along it
     at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
 
 
@@ -74,11 +74,9 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
         (M,) number of each point's thing, from 0; -1: of none.
     """
     number = np.full(len(view.height), -1, dtype=np.int64)
-    rows = np.flatnonzero(view.height > view.margin)
     found = 0
-    outline = support_outline(view.plan[view.on])
-    for cluster in clusters(view.plan[rows], view.height[rows]):
-        mine = rows[cluster]
+    outline = support_outline(view.on)
+    for mine in clusters(view.plan, view.height):
         if np.percentile(view.height[mine] / view.margin[mine], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[mine], view.height[mine])

@@ -90,7 +90,7 @@ class Admission:
         except TimeoutError:
             if ticket._timeout is None or not ticket._timeout.expired():
                 raise
-            raise ticket._reason or deadline_exceeded() from None
+            raise ticket._reason or DeadlineExceeded() from None
         finally:
             self._leave(ticket)
 
@@ -140,7 +140,7 @@ class Admission:
     def _check_pace(self, deadline: float) -> None:
         remaining = deadline - asyncio.get_running_loop().time()
         if remaining <= 0.0:
-            raise deadline_exceeded()
+            raise DeadlineExceeded()
         wait = self._wait
         if self._tickets and wait * MARGIN > remaining:
             seconds = _whole_seconds(wait)
@@ -175,11 +175,6 @@ class Admission:
             del self._client_bytes[ticket.client]
         if not self._tickets:
             self._empty.set()
-
-
-def deadline_exceeded() -> DeadlineExceeded:
-    """The error for an answer that comes too late."""
-    return DeadlineExceeded("The deadline passed before there was an answer.")
 
 
 def _whole_seconds(wait: float) -> int:

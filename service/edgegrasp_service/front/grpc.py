@@ -7,6 +7,7 @@ method then reads its message once there is room for it, and knows when its answ
 import asyncio
 import logging
 import math
+import struct
 import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -14,10 +15,13 @@ from functools import partial
 from typing import Any, NoReturn
 
 import grpc
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import any as any_message
+from google.protobuf import duration
 from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.duration_pb2 import Duration
+from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
+from google.protobuf.unknown_fields import UnknownFieldSet
+from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
     BadRequest,
     ErrorInfo,
@@ -57,6 +61,9 @@ SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, v
 SMALL_READS = 8  # messages of health checks and reflection read at a time
 SMALL_READ_SECONDS = 2.0
 
+# Number and wire type, 2 of bytes and 1 of a double, of those of a DetectGraspsStreamRequest.
+STREAM_FIELDS = {(1, 2): "request_id", (2, 2): "request", (3, 1): "timeout"}
+
 DOMAIN = "edgegrasp"  # of google.rpc.ErrorInfo
 ERROR_METADATA = "edgegrasp-error-bin"  # trailing: an ErrorDetail
 STATUS_METADATA = "grpc-status-details-bin"  # trailing: a google.rpc.Status
@@ -92,6 +99,7 @@ class GrpcServer:
             # What is compressed is unpacked before its length is known: none of it.
             ("grpc.compression_enabled_algorithms_bitset", 1),
             ("grpc.so_reuseport", 0),
+            ("grpc.max_allowed_incoming_connections", settings.max_connections),
             # A cloud comes in one go, without waiting for leave to send the rest of it.
             ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
             ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
@@ -102,8 +110,7 @@ class GrpcServer:
         ]
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=options)
-        router = _Router(service, _Methods(service, reloader, self._health).behaviours())
-        self._server.add_generic_rpc_handlers((router,))
+        self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         place = f"{host}:{settings.grpc_port}"
         try:
@@ -126,26 +133,39 @@ class GrpcServer:
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
 
-    async def stop_serving(self) -> None:
-        """Tell health checks that the server is stopping."""
-        await self._health.enter_graceful_shutdown()
-
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
         await self._server.stop(grace_seconds)
 
 
-class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
-    """Every method, named, counted and logged.
+class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
+    """Those of edgegrasp.v1.GraspService, health checks and reflection; named, counted, logged."""
 
-    Args:
-        service: Told of every call.
-        behaviours: The name of the method of each path, and what it does.
-    """
-
-    def __init__(self, service: GraspService, behaviours: dict[str, tuple[str, Behaviour]]) -> None:
+    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
         self._service = service
-        self._behaviours = behaviours
+        self._reloader = reloader
+        self._checks = checks
+        names = (SERVICE.full_name, HEALTH, *REFLECTION)
+        self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
+        self._small_reads = asyncio.Semaphore(SMALL_READS)
+        self._streams = 0
+        ours: dict[str, Behaviour] = {
+            "DetectGrasps": partial(self._answer, "DetectGrasps"),
+            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
+            "DetectGraspsStream": self._stream,
+            "ListModels": self._list_models,
+            "ReloadModels": self._reload_models,
+        }
+        # By path: what a method is called in metrics and the log, and what it does.
+        self._behaviours: dict[str, tuple[str, Behaviour]] = {
+            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
+            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
+            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
+            **{
+                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
+                for name in REFLECTION
+            },
+        }
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
         """The handler of a path, also of one that there is not."""
@@ -160,8 +180,10 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
         metadata = context.invocation_metadata() or ()
         headers = {name: value for name, value in metadata if isinstance(value, str)}
         method, behave = self._behaviours.get(path, ("other", _unimplemented))
-        with self._service.call("grpc", method, headers, _address(context.peer())) as call:
-            call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
+        request_id, peer = headers.get(REQUEST_ID_HEADER, ""), _address(context.peer())
+        call = Call("grpc", method, request_id, peer)
+        call.long = method in ("DetectGraspsStream", "HealthWatch", "Reflection")
+        with self._service.observe(call):
             if (remaining := context.time_remaining()) is not None:
                 call.limit(remaining)
             name = ((REQUEST_ID_HEADER, call.request_id),)
@@ -182,38 +204,6 @@ class _Router(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in i
             except Exception as error:
                 logger.exception("%s failed", method)
                 await _abort(context, report(error))
-
-
-class _Methods:
-    """What the methods do: those of edgegrasp.v1.GraspService, health checks and reflection."""
-
-    def __init__(self, service: GraspService, reloader: Reloader, checks: Any) -> None:
-        self._service = service
-        self._reloader = reloader
-        self._checks = checks
-        names = (SERVICE.full_name, HEALTH, *REFLECTION)
-        self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._small_reads = asyncio.Semaphore(SMALL_READS)
-        self._streams = 0
-
-    def behaviours(self) -> dict[str, tuple[str, Behaviour]]:
-        """By the methods' paths; and what each is called in metrics and the log."""
-        ours: dict[str, Behaviour] = {
-            "DetectGrasps": partial(self._answer, "DetectGrasps"),
-            "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
-            "DetectGraspsStream": self._stream,
-            "ListModels": self._list_models,
-            "ReloadModels": self._reload_models,
-        }
-        return {
-            **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
-            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
-            f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
-            **{
-                f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
-                for name in REFLECTION
-            },
-        }
 
     async def _answer(self, method: Method, context: Any) -> None:
         service = self._service
@@ -245,10 +235,12 @@ class _Methods:
             self._streams -= 1
 
     async def _list_models(self, context: Any) -> None:
-        await context.write(grasp_pb2.ListModelsResponse(models=self._service.models()))
+        models = [grasp_pb2.Model(**facts) for facts in self._service.models()]
+        await context.write(grasp_pb2.ListModelsResponse(models=models))
 
     async def _reload_models(self, context: Any) -> None:
-        models = await self._reloader.reload(current_call())
+        loaded = await self._reloader.reload(current_call())
+        models = [grasp_pb2.Model(**facts) for facts in loaded]
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, context: Any) -> None:
@@ -327,29 +319,20 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
 
 def _error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
     """An error as the message of edgegrasp.v1."""
-    return grasp_pb2.ErrorDetail(
-        kind=problem.kind,
-        field=problem.field,
-        value=problem.value,
-        fix=problem.fix,
-        retry_after=problem.retry_after,
-    )
+    names = [field.name for field in grasp_pb2.ErrorDetail.DESCRIPTOR.fields]
+    return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
 
 
 def _details(problem: Problem) -> list[AnyMessage]:
     reason = problem.kind.upper().replace("-", "_")
     details: list[Any] = [ErrorInfo(reason=reason, domain=DOMAIN)]
     if problem.retry_after is not None:
-        delay = Duration()
-        delay.FromMilliseconds(int(problem.retry_after * 1000))
+        delay = duration.from_milliseconds(int(problem.retry_after * 1000))
         details.append(RetryInfo(retry_delay=delay))
     if problem.field:
         violation = BadRequest.FieldViolation(field=problem.field, description=problem.detail)
         details.append(BadRequest(field_violations=[violation]))
-    packed = [AnyMessage() for _ in details]
-    for envelope, detail in zip(packed, details, strict=True):
-        envelope.Pack(detail)
-    return packed
+    return [any_message.pack(detail) for detail in details]
 
 
 # Streams: requests of one at work side by side, answered in their order
@@ -375,7 +358,7 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
     """
     ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
     stopping = asyncio.create_task(service.stopping.wait())
-    reading: asyncio.Task[Any] | None = asyncio.create_task(_next_envelope(context))
+    reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
     try:
         while reading or ahead:
             waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
@@ -389,7 +372,7 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
                 if request is not None:
                     ahead.append(asyncio.create_task(_answer(service, stream, request)))
                 last = request is None or stopping.done()
-                reading = None if last else asyncio.create_task(_next_envelope(context))
+                reading = None if last else asyncio.create_task(_next_request(context))
             elif reading:  # the server is stopping
                 reading.cancel()
                 reading = None
@@ -401,31 +384,33 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
                 task.cancel()
 
 
-async def _next_envelope(context: Any) -> Any:
-    """The next envelope; None: there are no more."""
+async def _next_request(context: Any) -> dict[str, Any] | None:
+    """The fields of the next DetectGraspsStreamRequest; None: there are no more.
+
+    It is read as a message without fields of its own, which keeps what is inside of it as bytes.
+    """
     data = await context.read()
     if data is EOF:
         return None
     try:
-        envelope = _RequestEnvelope.FromString(data)
-        envelope.request_id.decode()
+        found = UnknownFieldSet(Empty.FromString(data))
+        fields: dict[str, Any] = {"request_id": b"", "request": b"", "timeout": None}
+        for one in (found[row] for row in range(len(found))):
+            name = STREAM_FIELDS.get((one.field_number, one.wire_type), "unknown")
+            fields[name] = one.data
+        return fields | {"request_id": fields["request_id"].decode()}
     except (DecodeError, UnicodeDecodeError):
         raise _no_message(data) from None
-    return envelope
 
 
-async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes:
+async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) -> bytes:
     """A serialized DetectGraspsStreamResponse."""
-    request_id: str = envelope.request_id.decode()
-    call = Call(
-        "grpc", stream.method, request_id, stream.peer, stream.token,
-        traceparent=stream.traceparent, in_stream=True,
-    )  # fmt: skip
-    body: bytes = envelope.request
+    request_id, body = request["request_id"], request["request"]
+    call = Call("grpc", stream.method, request_id, stream.peer, stream.token, in_stream=True)
     detection = b""
 
     async def read() -> bytes:
-        return body
+        return body  # type: ignore[no-any-return]  # bytes
 
     async def write(answer: Answer) -> None:
         nonlocal detection
@@ -433,57 +418,30 @@ async def _answer(service: GraspService, stream: Call, envelope: Any) -> bytes:
 
     try:
         with service.observe(call):
-            _check(envelope)
-            if envelope.HasField("timeout"):
-                call.limit(envelope.timeout)
-            await service.answer(
-                call, Job("DetectGrasps", "grpc", b"", 0.0), len(body), read, write
-            )
+            call.limit(_timeout(request))
+            job = Job("DetectGrasps", "grpc", b"", 0.0)
+            await service.answer(call, job, len(body), read, write)
     except Exception as error:
         if not isinstance(error, EdgeGraspError):
             logger.exception("a request of a stream failed")
-    response = _ResponseEnvelope(request_id=envelope.request_id)
+    response = grasp_pb2.DetectGraspsStreamResponse(request_id=request_id)
     if (problem := call.problem) is None:
-        response.detection = detection
-    else:
-        number, detail = grpc.StatusCode[problem.code].value[0], _error_detail(problem)
-        told = grasp_pb2.StreamError(code=number, message=problem.detail, detail=detail)
-        response.error = told.SerializeToString()
+        # Field 2 as it is on the wire: field 1 of BytesValue, under another number.
+        return _serialized(response) + b"\x12" + _serialized(BytesValue(value=detection))[1:]
+    response.error.code = grpc.StatusCode[problem.code].value[0]
+    response.error.message = problem.detail
+    response.error.detail.CopyFrom(_error_detail(problem))
     return _serialized(response)
 
 
-def _check(envelope: Any) -> None:
-    if envelope.HasField("timeout") and not 0.0 < envelope.timeout < math.inf:
-        fix = "Send seconds, or leave it out."
-        raise InvalidRequest("timeout", str(envelope.timeout), fix)
-    size = envelope.ByteSize()
-    envelope.DiscardUnknownFields()
-    if envelope.ByteSize() != size:
+def _timeout(request: dict[str, Any]) -> float:
+    """Seconds; raises InvalidRequest for a field that is wrong or unknown."""
+    if "unknown" in request:
         fix = "Send the fields of this server's .proto file only."
         raise InvalidRequest("request", "a field that this server does not know", fix)
-
-
-def _envelope(name: str, **fields: int) -> Any:
-    """A class for messages with these fields, numbered from 1; messages inside stay bytes.
-
-    Bytes and a message are the same on the wire, so what a request holds is left to the workers.
-    """
-    file = descriptor_pb2.FileDescriptorProto(name=f"{name}.proto", package="edgegrasp.envelopes")
-    message = file.message_type.add(name=name)
-    for number, (field, kind) in enumerate(fields.items(), 1):
-        message.field.add(name=field, number=number, type=kind, label=1)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return message_factory.GetMessageClass(
-        pool.FindMessageTypeByName(f"edgegrasp.envelopes.{name}")
-    )
-
-
-_BYTES = descriptor_pb2.FieldDescriptorProto.TYPE_BYTES
-_DOUBLE = descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE
-_RequestEnvelope = _envelope(
-    "DetectGraspsStreamRequest", request_id=_BYTES, request=_BYTES, timeout=_DOUBLE
-)
-_ResponseEnvelope = _envelope(
-    "DetectGraspsStreamResponse", request_id=_BYTES, detection=_BYTES, error=_BYTES
-)
+    if request["timeout"] is None:
+        return math.inf
+    (timeout,) = struct.unpack("<d", struct.pack("<Q", request["timeout"]))
+    if not 0.0 < timeout < math.inf:
+        raise InvalidRequest("timeout", str(timeout), "Send seconds, or leave it out.")
+    return float(timeout)

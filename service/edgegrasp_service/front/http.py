@@ -1,8 +1,10 @@
 """The HTTP transport: routes, and the middleware around every request."""
 
 import asyncio
+import json
 import math
 from collections.abc import Coroutine
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -12,26 +14,17 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from edgegrasp.v1.grasp_pb2 import Model
+from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
-from edgegrasp_service.errors import STATUS, Cancelled, Problem, UnsupportedMediaType, report
+from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.http_protocol import problem_document
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
-from edgegrasp_service.schemas import (
-    TIMEOUT,
-    DetectionBody,
-    HealthBody,
-    ModelsBody,
-    ProblemBody,
-    ScoringBody,
-    openapi_detect,
-    openapi_score,
-)
 from edgegrasp_service.worker.job import Answer, Job, Method
 
 ASSETS = "/docs/assets"
 CHALLENGE = 'Bearer realm="edgegrasp"'
+TIMEOUT = "X-Request-Timeout"
 
 # Values of the label `method`: the gRPC method's name where there is one.
 METHODS = {
@@ -49,14 +42,8 @@ METHODS = {
 # Without a token: whoever restarts a server need not know one, and the pages tell no secret.
 OPEN = ("Live", "Ready", "Docs")
 
-DESCRIPTION = """Grasp detection as a service: point clouds in, scored 6-DoF grasps out.
-
-Metres, radians, seconds. Positions and directions are in the frame of the cloud sent;
-`T_cloud_hand` maps hand coordinates to cloud coordinates. Errors are problem documents that name
-the field, the value received and the fix."""
-
-PROBLEM = {"content": {"application/problem+json": {"schema": ProblemBody.model_json_schema()}}}
-OF_REQUESTS = (400, 401, 404, 408, 413, 415, 429, 431, 500, 501, 503, 504)
+# The contract, written by hand as grasp.proto is.
+DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_text())
 
 
 class HttpMiddleware:
@@ -75,7 +62,8 @@ class HttpMiddleware:
         method = METHODS.get(path, "Docs" if path.startswith(f"{ASSETS}/") else "other")
         peer = scope["client"][0] if scope["client"] else ""
         whole = headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
-        with self._service.call("http", method, headers, peer) as call:
+        call = Call("http", method, headers.get(REQUEST_ID_HEADER, ""), peer)
+        with self._service.observe(call):
 
             async def receive_noting() -> Message:
                 nonlocal whole
@@ -123,87 +111,48 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         reloader: What reloads.
     """
     app: FastAPI = FastAPIOffline(
-        title="EdgeGrasp",
-        version="v1",
-        description=DESCRIPTION,
-        redoc_url=None,
-        static_url=ASSETS,
-        redirect_slashes=False,
+        title="EdgeGrasp", redoc_url=None, static_url=ASSETS, redirect_slashes=False
     )
+    app.openapi = lambda: DOCUMENT  # type: ignore[method-assign]
     for kind in (EdgeGraspError, Exception):
         app.add_exception_handler(kind, _answer_error)
     app.add_exception_handler(HTTPException, _answer_http_error)
 
-    @app.post(
-        "/v1/grasps",
-        summary="Find grasps in one cloud",
-        response_model=DetectionBody,
-        responses=_problems(*OF_REQUESTS),
-        openapi_extra=openapi_detect(),
-    )
+    @app.post("/v1/grasps")
     async def detect_grasps() -> Response:
         return _GraspResponse(service, "DetectGrasps")
 
-    @app.post(
-        "/v1/grasps:score",
-        summary="Score edges or hand poses in one cloud",
-        response_model=ScoringBody,
-        responses=_problems(*OF_REQUESTS),
-        openapi_extra=openapi_score(),
-    )
+    @app.post("/v1/grasps:score")
     async def score_grasps() -> Response:
         return _GraspResponse(service, "ScoreGrasps")
 
-    @app.get(
-        "/v1/models",
-        summary="List the loaded weights",
-        response_model=ModelsBody,
-        responses=_problems(401, 503),
-    )
-    async def list_models() -> JSONResponse:
-        return _models_response(service.models())
+    @app.get("/v1/models")
+    async def list_models() -> Response:
+        return JSONResponse({"models": service.models()})
 
-    @app.post(
-        "/v1/models:reload",
-        summary="Load weights, tokens and certificates anew; needs an admin token",
-        response_model=ModelsBody,
-        responses=_problems(401, 403, 409, 503),
-    )
-    async def reload() -> JSONResponse:
-        return _models_response(await reloader.reload(current_call()))
+    @app.post("/v1/models:reload")
+    async def reload() -> Response:
+        return JSONResponse({"models": await reloader.reload(current_call())})
 
-    @app.get("/health/live", summary="Does the process answer?", response_model=HealthBody)
-    async def live() -> JSONResponse:
+    @app.get("/health/live")
+    async def live() -> Response:
         return JSONResponse({"status": "live"})
 
-    @app.get(
-        "/health/ready",
-        summary="Are weights loaded and warmed up?",
-        response_model=HealthBody,
-        responses={503: {"description": "Not yet, or no longer.", "model": HealthBody}},
-    )
-    async def ready() -> JSONResponse:
+    @app.get("/health/ready")
+    async def ready() -> Response:
         status = "ready" if service.ready else "not ready"
         return JSONResponse({"status": status}, status_code=200 if service.ready else 503)
 
-    @app.get("/metrics", include_in_schema=False)
+    @app.get("/metrics")
     async def read_metrics(request: Request) -> Response:
         body, content_type = metrics.page(request.headers.get("accept", ""))
         return PlainTextResponse(body, headers={"content-type": content_type})
 
-    @app.get("/", include_in_schema=False)
+    @app.get("/")
     async def index() -> Response:
         return RedirectResponse("/docs")
 
     return app
-
-
-def _problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Documentation of answers: what each error of a status means."""
-    meanings: dict[int, list[str]] = {}
-    for kind, (_, status) in STATUS.items():
-        meanings.setdefault(status, []).append((kind.__doc__ or "").partition("\n")[0])
-    return {status: {"description": " ".join(meanings[status]), **PROBLEM} for status in statuses}
 
 
 class _GraspResponse(Response):
@@ -295,12 +244,6 @@ def _timeout(headers: Headers) -> float:
     if not 0.0 < timeout < math.inf:
         raise InvalidRequest(TIMEOUT, brief(text), "Send seconds, such as 2.5, or leave it out.")
     return timeout
-
-
-def _models_response(models: list[Model]) -> JSONResponse:
-    names = [field.name for field in Model.DESCRIPTOR.fields]
-    facts = [{name: getattr(model, name) for name in names} for model in models]
-    return JSONResponse({"models": facts})
 
 
 def _problem_response(call: Call, problem: Problem) -> Response:

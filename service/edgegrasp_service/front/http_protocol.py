@@ -9,7 +9,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_service.errors import HeadersTooLarge, Overloaded, Problem, RequestTimeout, report
-from edgegrasp_service.schemas import KIND_PREFIX
 from edgegrasp_service.settings import Settings
 
 LINGER_SECONDS = 5.0  # for a client to take what is not sent yet, though it may still send
@@ -167,15 +166,7 @@ class _GentleTransport:
 
 def problem_document(problem: Problem) -> bytes:
     """An error as a problem document (RFC 9457)."""
-    return orjson.dumps(
-        {
-            "type": KIND_PREFIX + problem.kind,
-            "title": problem.kind.replace("-", " ").capitalize(),
-            "status": problem.status,
-            "detail": problem.detail,
-            "field": problem.field,
-            "value": problem.value,
-            "fix": problem.fix,
-            "retry_after": problem.retry_after,
-        }
-    )
+    title = problem.kind.replace("-", " ").capitalize()
+    document = {"type": f"urn:edgegrasp:error:{problem.kind}", "title": title} | vars(problem)
+    del document["kind"], document["code"]
+    return orjson.dumps(document)

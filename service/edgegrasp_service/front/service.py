@@ -4,12 +4,11 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from edgegrasp.v1.grasp_pb2 import Model
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
     STOPPING,
@@ -23,10 +22,10 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front.admission import Admission
-from edgegrasp_service.observability import CALL, REQUEST_ID_HEADER, Call
+from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job, Transport
+from edgegrasp_service.worker.job import Answer, Job
 from edgegrasp_service.worker.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -77,10 +76,10 @@ class GraspService:
         """Whether requests are answered."""
         return bool(self.pool.models) and not self.stopping.is_set()
 
-    def models(self) -> list[Model]:
-        """The weights a request can name; raises NotReady."""
+    def models(self) -> list[dict[str, Any]]:
+        """The weights a request can name, keyed as edgegrasp.v1.Model; raises NotReady."""
         self.check_ready()
-        return [Model(**facts) for facts in self.pool.models]
+        return self.pool.models
 
     def check_ready(self) -> None:
         """Raise NotReady while weights are loading, and when the server is stopping."""
@@ -90,28 +89,8 @@ class GraspService:
             raise NotReady("Weights are still loading. Try again in some seconds.")
 
     @contextmanager
-    def call(
-        self, transport: Transport, method: str, headers: Mapping[str, str], peer: str
-    ) -> Iterator[Call]:
-        """Name one call, and tell the observers when it has ended.
-
-        Args:
-            transport: The way it came.
-            method: For metrics and the log.
-            headers: By their lower-case names.
-            peer: Its address.
-
-        Yields:
-            The call; of HTTP the transport sets the `code`.
-        """
-        call = Call(transport, method, headers.get(REQUEST_ID_HEADER, ""), peer)
-        call.traceparent = headers.get("traceparent", "")
-        with self.observe(call):
-            yield call
-
-    @contextmanager
     def observe(self, call: Call) -> Iterator[None]:
-        """As `call`, for one that has a name, such as a request of a stream."""
+        """Work on a call, and tell the observers when it has ended; HTTP sets its `code`."""
         CALL.set(call)
         self.in_flight += 1
         try:
@@ -264,21 +243,6 @@ class Reloader:
         self._lock = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def reload(self, call: Call) -> list[Model]:
-        """Load anew for a caller with an admin token.
-
-        Returns:
-            What is loaded now.
-
-        Raises:
-            PermissionDenied: The caller has none.
-            NotReady: The first weights are still loading, or the server is stopping.
-            ReloadFailed: Something cannot be used, and all is as before; or a reload is under way.
-        """
-        if not call.is_admin:
-            raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
-        return await self._reload()
-
     def reload_soon(self) -> None:
         """Begin a reload in the running event loop; what comes of it is in the log."""
         task = asyncio.get_running_loop().create_task(self._reload_quietly())
@@ -287,11 +251,26 @@ class Reloader:
 
     async def _reload_quietly(self) -> None:
         try:
-            await self._reload()
+            await self.reload()
         except EdgeGraspError as error:
             logger.warning("SIGHUP: %s", error)
 
-    async def _reload(self) -> list[Model]:
+    async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
+        """Load anew.
+
+        Args:
+            call: Of who asks; None: the process itself.
+
+        Returns:
+            What is loaded now.
+
+        Raises:
+            PermissionDenied: Who asks has no admin token.
+            NotReady: The first weights are still loading, or the server is stopping.
+            ReloadFailed: Something cannot be used, and all is as before; or a reload is under way.
+        """
+        if call is not None and not call.is_admin:  # however its path was spelled
+            raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
         service = self._service
         service.check_ready()
         if self._lock.locked():
@@ -311,10 +290,9 @@ class Reloader:
             if self._tls is not None and certificates is not None:
                 self._tls.use(certificates)
             self._reloaded(True)
-            models = service.models()
-            digests = {model.name: model.digest for model in models}
+            digests = {model["name"]: model["digest"] for model in service.pool.models}
             logger.info("reloaded", extra={"fields": {"digests": digests}})
-            return models
+            return service.pool.models
 
 
 def check_headers(kind: str, count: int, size: int = 0, most: int = 0) -> None:

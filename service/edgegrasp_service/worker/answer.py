@@ -8,39 +8,32 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
-from edgegrasp_service.schemas import GIVEN
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
-from edgegrasp_service.worker.dummy import DummyCatalogue
-from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
-from edgegrasp_service.worker.request_cloud import decode_array, decode_cloud
+from edgegrasp_service.worker.job import Answer, Facts, Job
+from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
 
-Catalogue = Union["ModelCatalogue", DummyCatalogue]  # detectors by the name of their weights
 
-
-def load_catalogue(settings: Settings) -> Catalogue:
+def load_catalogue(settings: Settings) -> "ModelCatalogue":
     """Load the detectors that the settings name and warm them up; takes seconds.
 
     Raises:
         EdgeGraspError: Weights cannot be used, or the device is not there.
     """
-    if settings.backend == "dummy":
-        return DummyCatalogue(settings.dummy_seconds)
-    # Torch takes seconds to import, and the dummy does without.
+    # Torch takes seconds to import, and tests do without.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     device = choose_device(settings.device)
@@ -51,64 +44,47 @@ def load_catalogue(settings: Settings) -> Catalogue:
     return catalogue
 
 
-def describe(catalogue: Catalogue) -> list[dict[str, Any]]:
-    """The facts of each set of weights, keyed as the fields of edgegrasp.v1.Model."""
-    known = grasp_pb2.Model.DESCRIPTOR.fields_by_name
-    return [
-        {name: value for name, value in facts.items() if name in known}
-        for facts in catalogue.describe()
-    ]
+def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
+    """Decode a job, detect, and encode the answer; nothing of it is kept for the next.
 
+    Returns:
+        The answer; or, for a request that cannot be answered, an empty one with its Problem.
 
-class Answerer:
-    """Answers jobs with the detectors of a catalogue; keeps nothing of one for the next."""
-
-    def __init__(self, catalogue: Catalogue, limits: Limits | None = None) -> None:
-        """Wrap a catalogue; `limits` bound every request."""
-        self._catalogue = catalogue
-        self._limits = limits or Limits()
-
-    def answer(self, job: Job) -> Answer:
-        """Decode a job, detect, and encode the answer.
-
-        Returns:
-            The answer; or, for a request that cannot be answered, an empty one with its Problem.
-
-        Raises:
-            MemoryError: There is not enough; the process is better replaced.
-        """
-        work = _Work(job, self._catalogue, self._limits)
-        try:
-            return Answer(work.answer(), work.facts)
-        except EdgeGraspError as error:
-            problem = report(error)
-        except Exception as error:
-            if _out_of_memory(error):
-                raise MemoryError(str(error)) from None
-            problem = report(error)
-            work.facts.traceback = traceback.format_exc()
-            if work.options is not None:  # rows in it may be millions
-                work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
-        return Answer(b"", work.facts, problem)
+    Raises:
+        MemoryError: There is not enough; the process is better replaced.
+    """
+    work = _Work(job, catalogue, settings)
+    try:
+        return Answer(work.answer(), work.facts)
+    except EdgeGraspError as error:
+        problem = report(error)
+    except Exception as error:
+        if _out_of_memory(error):
+            raise MemoryError(str(error)) from None
+        problem = report(error)
+        work.facts.traceback = traceback.format_exc()
+        if work.options is not None:  # rows in it may be millions
+            work.facts.options = work.options.model_dump_json(exclude_defaults=True)[:2000]
+    return Answer(b"", work.facts, problem)
 
 
 class _Work:
     """One job on its way to an answer."""
 
-    def __init__(self, job: Job, catalogue: Catalogue, limits: Limits) -> None:
+    def __init__(self, job: Job, catalogue: "ModelCatalogue", settings: Settings) -> None:
         self.facts = Facts()
         self.options: DetectOptions | None = None  # known once they are parsed
         self._job = job
         self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
-        self._limits = limits
+        self._settings = settings
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
         """The body of the answer; raises any error that there may be."""
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
         self.facts.model = result.model
-        self._count(result.counts)
+        self.facts.counts = dict(result.counts)
         with self._stage("encode"):
             body: bytes = self._encoding.write(result)
         return body
@@ -118,7 +94,7 @@ class _Work:
             detector, cloud, options, _ = self._decode()
         with self._stage("prepare"):
             prepared = detector.prepare(cloud, options)
-            self._count(prepared.counts)
+            self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
             logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
         prepared.seconds["network"] = self.facts.seconds["network"]
@@ -137,36 +113,32 @@ class _Work:
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
-        limits = self._limits
+        settings = self._settings
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
         for name in ("approach_points", "candidates"):
-            most = getattr(limits, f"max_{name}")
+            most = getattr(settings, f"max_{name}")
             _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
         detector = self._catalogue.get(options.model)
-        given = {} if self._job.method == "DetectGrasps" else _given(fields, limits)
-        cloud, options = decode_cloud(fields, options, limits.max_points)
+        given = {} if self._job.method == "DetectGrasps" else _given(fields, settings)
+        cloud, options = decode_cloud(fields, options, settings.max_points)
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
-
-    def _count(self, counts: Mapping[str, int]) -> None:
-        self.facts.counts = dict(counts)
-        self.facts.voxels = counts.get("voxels", 0)
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         """Time a stage; raises DeadlineExceeded instead of beginning it too late."""
         start = time.monotonic()
         if start > self._deadline:
-            raise DeadlineExceeded("The deadline passed before there was an answer.")
+            raise DeadlineExceeded()
         try:
             yield
         finally:
             self.facts.seconds[name] = time.monotonic() - start
 
 
-def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]:
+def _given(fields: Mapping[str, Any], settings: Settings) -> dict[str, NDArray[Any]]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
@@ -175,10 +147,10 @@ def _given(fields: Mapping[str, Any], limits: Limits) -> dict[str, NDArray[Any]]
         raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
-        given = decode_array(name, given, limits.max_points)
+        given = decode_array(name, given, settings.max_points)
     rows = given.shape[0] if given.ndim else 0
     if rows <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
-        _limit(name, rows, limits.max_candidates)
+        _limit(name, rows, settings.max_candidates)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.errors import DecoderMissing, PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
 
 Array = NDArray[Any]
 Records = NDArray[np.void]
@@ -59,7 +59,6 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
     Raises:
         InvalidRequest: The file is truncated, or no file of that format.
         PayloadTooLarge: More than `max_points` points.
-        DecoderMissing: The reader of this format is not installed.
         UnsupportedMediaType: No such format.
     """
     if file_format not in _READERS:
@@ -169,7 +168,7 @@ def cloud_of_records(rows: Records) -> CloudInput:
     """
     colors = _stacked(rows, "red", "green", "blue")
     for name in ("rgb", "rgba"):
-        if colors is None and name in _names(rows) and rows.dtype[name].itemsize == 4:
+        if colors is None and name in (rows.dtype.names or ()) and rows.dtype[name].itemsize == 4:
             # 0x00RRGGBB, kept in a float32 or uint32
             packed = np.ascontiguousarray(rows[name]).view(np.uint32)
             colors = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1)
@@ -180,13 +179,17 @@ def cloud_of_records(rows: Records) -> CloudInput:
 
 def _stacked(rows: Records, *names: str) -> Array | None:
     """Fields of the rows side by side; None where one of them is missing."""
-    if not {*names} <= {*_names(rows)}:
+    if not {*names} <= {*(rows.dtype.names or ())}:
         return None
     return np.stack([rows[name] for name in names], axis=-1)
 
 
-def _names(rows: Records) -> tuple[str, ...]:
-    return rows.dtype.names or ()
+def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]], re.Match[bytes]]:
+    """The words of the lines before the last one, and where that is."""
+    end = last.search(data[:MAX_HEADER])
+    if end is None:
+        raise ValueError("no header")
+    return [line.split() for line in data[: end.start()].decode("latin-1").splitlines()], end
 
 
 def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]:
@@ -248,10 +251,7 @@ PLY_HEADER_END = re.compile(rb"^end_header[ \t\r]*\n", re.MULTILINE)
 
 def _read_ply(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the vertices, and nx, ny, nz and red, green, blue where there are any."""
-    end = PLY_HEADER_END.search(data[:MAX_HEADER])
-    if end is None or not data.startswith(b"ply"):
-        raise ValueError("no header")
-    lines = [line.split() for line in data[: end.start()].decode("latin-1").splitlines()]
+    lines, end = _read_header(data, PLY_HEADER_END)
     encoding = next((line[1] for line in lines if line[:1] == ["format"]), "")
     elements = [row for row, line in enumerate(lines) if line[:1] == ["element"]]
     if not elements or encoding not in PLY_ORDERS or lines[elements[0]][1] != "vertex":
@@ -276,11 +276,8 @@ PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r
 
 def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb where there are any."""
-    end = PCD_HEADER_END.search(data[:MAX_HEADER])
-    if end is None:
-        raise ValueError("no header")
-    lines = data[: end.start()].decode("latin-1").splitlines()
-    header = {words[0]: words[1:] for line in lines if (words := line.split())}
+    lines, end = _read_header(data, PCD_HEADER_END)
+    header = {words[0]: words[1:] for words in lines if words}
     if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
         raise ValueError(f"no line {', '.join(missing)}")
     names = header["FIELDS"]
@@ -316,14 +313,8 @@ def _read_compressed_pcd(
     if unpacked > MAX_UNPACKED:
         fix = f"Send at most {MAX_UNPACKED} bytes, or fields x, y and z alone."
         raise PayloadTooLarge("cloud", f"a PCD file of {unpacked} bytes once unpacked", fix)
-    try:
-        import open3d
-    except ImportError as error:
-        raise DecoderMissing(
-            "cloud",
-            f"a compressed PCD file, which Open3D reads, and it does not load ({error})",
-            "Send an uncompressed PCD file, or install Open3D and its libraries on the server.",
-        ) from None
+    import open3d  # it takes a second, and is needed for nothing else
+
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cloud.pcd"
         path.write_bytes(data)

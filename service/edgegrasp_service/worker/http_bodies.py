@@ -3,12 +3,10 @@
 A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 """
 
-import gc
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from email.message import Message
-from email.parser import HeaderParser
 from functools import partial
 from pathlib import PurePath
 from typing import Any
@@ -16,18 +14,22 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import orjson
+from werkzeug.exceptions import HTTPException
+from werkzeug.formparser import MultiPartParser
+from werkzeug.http import parse_options_header
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Grasp, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.schemas import FILE_TYPES, DetectRequest, ScoreRequest
+from edgegrasp_service.worker.formats import FILE_FORMATS
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import File
+from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File
 
 JSON, FORM = "application/json", "multipart/form-data"
+FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
+FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
-MAX_PART_HEADER = 8192  # bytes
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
@@ -35,15 +37,15 @@ def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
     Returns:
-        Those of the body's model that were sent, JSON or File, or `cloud`, a File; and `options`.
+        Those that were sent, JSON or File, or `cloud`, a File; and `options`.
 
     Raises:
         InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
             there are query parameters beside one that has its own options.
         UnsupportedMediaType: There is no reader for the content type.
     """
-    header = _header(f"Content-Type: {job.content_type}")
-    media_type = job.content_type.partition(";")[0].strip().lower()
+    media_type, named = parse_options_header(job.content_type)
+    media_type = media_type.lower()
     scores = job.method == "ScoreGrasps"
     accepted = (JSON, FORM) if scores else (JSON, *FILE_TYPES, FORM)
     if media_type not in accepted:
@@ -60,15 +62,14 @@ def read_request(job: Job) -> dict[str, Any]:
     if parameters:
         fix = "Send options in the part `options`."
         raise InvalidRequest(parameters[0][0], "a query parameter", fix)
-    known = tuple((ScoreRequest if scores else DetectRequest).model_fields)
+    known = ("points" if media_type == JSON else "cloud", *FIELDS, *(GIVEN if scores else ()))
     if media_type == JSON:
         fields: dict[str, Any] = read_json("body", job.body)
         if not isinstance(fields, dict):
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
-        known = ("cloud", *known[1:])
-        fields = _fields_of_form(job, header.get_boundary(), known)
+        fields = _fields_of_form(job.body, named.get("boundary", ""), known)
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
@@ -117,15 +118,10 @@ def read_json(field: str, text: bytes) -> Any:
     if lists > len(text) // 7 + MAX_SHORT_LISTS:
         value = f"{lists} lists and objects in {len(text)} bytes"
         raise InvalidRequest(field, value, "Send lists that hold numbers.")
-    collecting = gc.isenabled()
-    gc.disable()  # it would look through millions of lists again and again, and find nothing
     try:
         return json.loads(text, object_pairs_hook=partial(_object, field))
     except (ValueError, RecursionError) as error:
         raise InvalidRequest(field, f"no valid JSON ({error})", "Send a JSON object.") from None
-    finally:
-        if collecting:
-            gc.enable()
 
 
 def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -178,10 +174,10 @@ def _value(name: str, text: str) -> object:
 # Forms
 
 
-def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> dict[str, Any]:
+def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[str, Any]:
     """Files as File, other parts as the JSON that they hold."""
     fields: dict[str, Any] = {}
-    for name, file_format, data in _parts(job.body, boundary, len(known) + 1):
+    for name, file_format, data in _parts(body, boundary, len(known) + 1):
         _refuse_unknown([name], known, "part")
         if name in fields:
             raise InvalidRequest(name, "two parts", "Send one.")
@@ -195,46 +191,25 @@ def _fields_of_form(job: Job, boundary: str | None, known: tuple[str, ...]) -> d
     return fields
 
 
-def _parts(body: bytes, boundary: str | None, most: int) -> Iterator[tuple[str, str | None, bytes]]:
+def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | None, bytes]]:
     """Name, file format (None: no file) and data of the parts of a multipart body.
 
-    What is no such body costs no more than one look at it.
+    The format is what a part's content type names, or else its file name's ending.
     """
-    if not boundary:
-        raise _no_form("no boundary in its Content-Type")
-    delimiter = b"\r\n--" + boundary.encode("utf-8", "replace")
-    pieces = (b"\r\n" + body).split(delimiter, most + 1)
-    for piece in pieces[1:]:
-        if piece.startswith(b"--"):
-            return
-        if len(pieces) > most + 1:
-            raise _no_form(f"more than {most} parts")
-        padding, _, rest = piece.partition(b"\r\n")
-        end = rest.find(b"\r\n\r\n", 0, MAX_PART_HEADER)
-        if padding.strip(b" \t") or end < 0:
-            raise _no_form("a part without a header of its own")
-        header = _header(rest[:end].decode("utf-8", "replace"))
-        name = header.get_param("name", header="Content-Disposition")
-        if not isinstance(name, str):
-            raise _no_form("a part without a name")
-        yield name, _format_of(header), rest[end + 4 :]
-    raise _no_form("no boundary at its end")
-
-
-def _no_form(fault: str) -> InvalidRequest:
-    fix = "Send a file part `cloud` and a JSON part `options`."
-    return InvalidRequest("body", f"a form that cannot be read ({fault})", fix)
-
-
-def _header(text: str) -> Message:
-    whole_characters = text.encode("utf-8", "replace").decode()
-    return HeaderParser().parsestr(whole_characters, headersonly=True)
-
-
-def _format_of(header: Message) -> str | None:
-    """The format a part's content type names, or else its file name's ending; None: no file."""
-    file_name = header.get_filename()
-    if file_name is None:
-        return None
-    suffix = PurePath(file_name.replace("\0", "")).suffix
-    return FILE_TYPES.get(header.get_content_type()) or suffix[1:].lower()
+    parser = MultiPartParser(
+        lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # it is called so
+        max_form_memory_size=None,
+        max_form_parts=most,
+    )
+    try:
+        if not boundary:
+            raise ValueError("no boundary in its Content-Type")
+        form, files = parser.parse(io.BytesIO(body), boundary.encode("utf-8", "replace"), len(body))
+    except (ValueError, HTTPException) as error:
+        fix = "Send a file part `cloud` and a JSON part `options`."
+        raise InvalidRequest("body", f"a form that cannot be read ({error})", fix) from None
+    for name, text in form.items(multi=True):
+        yield str(name), None, text.encode()
+    for name, file in files.items(multi=True):
+        suffix = PurePath((file.filename or "").replace("\0", "")).suffix
+        yield str(name), FILE_TYPES.get(file.mimetype) or suffix[1:].lower(), file.read()

@@ -1,9 +1,13 @@
-"""What crosses the pipe between the front and a worker: bytes and small plain values."""
+"""What crosses between the front and its workers: plain values as JSON, and bodies as bytes."""
 
+import json
+import struct
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, BinaryIO, Literal
 
 from edgegrasp_service.errors import Problem
+
+HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 
 Method = Literal["DetectGrasps", "ScoreGrasps"]
 Transport = Literal["http", "grpc"]
@@ -24,11 +28,10 @@ class Job:
 
 @dataclass
 class Facts:
-    """What logs, metrics and traces tell of a request, as far as it came."""
+    """What logs and metrics tell of a request, as far as it came."""
 
     model: str = ""  # name of the weights
     points: int = 0  # in the cloud as sent, holes included
-    voxels: int = 0  # of the processed cloud
     grasps: int = 0  # returned, or evaluated where the caller gave them
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
     counts: dict[str, int] = field(default_factory=dict)  # what passed each stage
@@ -46,9 +49,44 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """The settings that bound one request."""
+class Ready:
+    """What the nursery and its workers say first."""
 
-    max_points: int = 2_000_000  # in a cloud, before downsampling
-    max_approach_points: int = 256
-    max_candidates: int = 16_000
+    pid: int
+    models: list[dict[str, Any]]  # what a catalogue tells of its weights; of workers
+    failure: str = ""  # why there is none after all
+
+
+MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}
+
+
+def pack(message: object) -> tuple[bytes, bytes]:
+    """One of MESSAGES as bytes: the lengths and its plain fields, and its body, not copied."""
+    text = json.dumps([type(message).__name__, message], default=_plain).encode()
+    body: bytes = getattr(message, "body", b"")
+    return HEADER.pack(len(text), len(body)) + text, body
+
+
+def unpack(text: bytes, body: bytes) -> Any:
+    """The message of its plain fields, as JSON, and its body."""
+    name, fields = json.loads(text)
+    if "body" in fields:
+        fields["body"] = body
+    if name == "Answer":
+        fields["facts"] = Facts(**fields["facts"])
+        fields["error"] = fields["error"] and Problem(**fields["error"])
+    return MESSAGES[name](**fields)
+
+
+def receive(file: BinaryIO) -> Any:
+    """The next message; None: there are no more."""
+    head = file.read(HEADER.size)
+    if len(head) < HEADER.size:
+        return None
+    length, body_length = HEADER.unpack(head)
+    return unpack(file.read(length), file.read(body_length))
+
+
+def _plain(value: Any) -> Any:
+    """Of JSON, where it does not know a value: the fields of a message, and nothing of a body."""
+    return "" if isinstance(value, bytes) else vars(value)

@@ -16,13 +16,11 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
 from edgegrasp_model.results import Detection, Scoring
-from edgegrasp_service.schemas import PER_POINT
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import File
+from edgegrasp_service.worker.request_cloud import PER_POINT, File
 
 MAX_PARTS = 64  # messages in a repeated field; no option takes more
 MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
-CLOUD_FIX = "Send one of points, encoded, point_cloud2 and depth_images."
 
 
 def read_request(job: Job) -> dict[str, Any]:
@@ -33,8 +31,8 @@ def read_request(job: Job) -> dict[str, Any]:
         as arrays.
 
     Raises:
-        InvalidRequest: It is no such message, has no cloud or two, a pose that is none, more parts
-            than any request needs, or a field that this server does not know.
+        InvalidRequest: It is no such message, has a pose that is none, more parts than any request
+            needs, or a field that this server does not know.
     """
     scores = job.method == "ScoreGrasps"
     kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
@@ -106,21 +104,18 @@ def _check(message: Message, name: str) -> None:
 
 
 def _cloud(message: Any) -> dict[str, Any]:
-    """The cloud of either request; both have it in the same fields."""
-    which = message.WhichOneof("cloud")
+    """The cloud of either request, or clouds; both have it in the same fields."""
+    fields: dict[str, Any] = {}
+    if message.HasField("points"):
+        fields["points"] = message.points
+    if message.HasField("encoded"):
+        fields["cloud"] = File(message.encoded.format, message.encoded.data)
+    if message.HasField("point_cloud2"):
+        fields["point_cloud2"] = _plain_fields(message.point_cloud2)
     if message.depth_images:
-        if which is not None:
-            raise InvalidRequest("depth_images", f"images beside {which}", CLOUD_FIX)
         images = enumerate(message.depth_images)
-        return {"depth_images": [_depth_image(image, row) for row, image in images]}
-    match which:
-        case "points":
-            return {"points": message.points}
-        case "encoded":
-            return {"cloud": File(message.encoded.format, message.encoded.data)}
-        case "point_cloud2":
-            return {"point_cloud2": _plain_fields(message.point_cloud2)}
-    raise InvalidRequest("cloud", "nothing", CLOUD_FIX)
+        fields["depth_images"] = [_depth_image(image, row) for row, image in images]
+    return fields
 
 
 def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:
@@ -177,10 +172,14 @@ def _tagged(message: Message) -> dict[str, Any]:
     return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
 
 
-def _support(message: grasp_pb2.Support) -> dict[str, Any]:
+def _support(message: grasp_pb2.Support) -> dict[str, Any] | None:
     fields = _plain_fields(message)
-    ransac = fields.pop("ransac", None)
-    return fields if ransac is None else {"kind": "ransac"} | fields | ransac
+    if fields.pop("disabled"):
+        return None
+    kinds = {kind: fields.pop(kind) for kind in ("ransac", "auto") if kind in fields}
+    for kind, more in kinds.items():
+        fields |= {"kind": kind} | more
+    return fields
 
 
 def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:

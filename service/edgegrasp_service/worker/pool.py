@@ -4,35 +4,23 @@ import asyncio
 import contextlib
 import logging
 import os
-import resource
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
-from edgegrasp_service.settings import SECRETS, Settings
-from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.process import (
-    HEADER,
-    LOST,
-    Ready,
-    Start,
-    pack,
-    receive,
-    send,
-    unpack,
-)
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
+from edgegrasp_service.worker.process import LOST
 
+MAIN = "import sys; from edgegrasp_service.worker.process import main; main(sys.argv[1])"
 # -P: nothing is imported from the folder the server was started in.
-NURSERY = (
-    sys.executable, "-P", "-c", "from edgegrasp_service.worker.process import main; main()"
-)  # fmt: skip
+NURSERY = (sys.executable, "-P", "-c", MAIN)
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 WORKER_LOST = kind_of(WorkerLost)
@@ -47,7 +35,7 @@ class WorkerPool:
 
     Args:
         settings: How many workers, and what they load.
-        nursery: The command that starts the process which they fork from.
+        nursery: The command of the process which they fork from; the settings are added to it.
         replaced: Called for each worker that dies and is replaced.
 
     Attributes:
@@ -64,13 +52,12 @@ class WorkerPool:
         self._nursery_command = nursery
         self._replaced = replaced
         self.models: list[dict[str, Any]] = []
-        self.size = worker_count(settings)
+        self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
         # The last one in is the first one out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._closed = False
 
     @property
     def pids(self) -> list[int]:
@@ -82,15 +69,6 @@ class WorkerPool:
         """Workers that have a job."""
         return sum(worker.answer is not None for worker in self._workers)
 
-    @property
-    def resident_bytes(self) -> int:
-        """Memory of the workers; what they share is counted for each."""
-        pages = 0
-        for pid in self.pids:
-            with contextlib.suppress(OSError):  # it died just now, or there is no /proc
-                pages += int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-        return pages * resource.getpagesize()
-
     async def start(self) -> None:
         """Load, and start the workers; those of a start before end when they have answered.
 
@@ -98,7 +76,7 @@ class WorkerPool:
             EdgeGraspError: Weights cannot be used.
         """
         nursery = await _Nursery.start(self._nursery_command, self._settings)
-        workers = [_Worker(self, nursery) for _ in range(self.size)]
+        workers = [_Worker(nursery) for _ in range(self.size)]
         try:
             await asyncio.gather(*(worker.start() for worker in workers))
         except BaseException:
@@ -113,7 +91,7 @@ class WorkerPool:
         self.models = workers[0].models
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
-            self._free(worker)
+            self._spawn(self._tend(worker))
         if old_nursery is not None:
             old_nursery.close()
         for worker in old_workers:
@@ -147,7 +125,6 @@ class WorkerPool:
 
     def close(self) -> None:
         """End every worker, whatever it does."""
-        self._closed = True
         for task in self._tasks:
             task.cancel()
         for worker in list(self._workers):
@@ -162,29 +139,41 @@ class WorkerPool:
             if worker in self._workers:  # and not dead
                 return worker
 
-    def _free(self, worker: "_Worker") -> None:
-        """A worker has nothing to do: the next job, or the end where there are newer ones."""
-        if worker in self._workers:
-            self._idle.put_nowait(worker)
-        else:
+    async def _tend(self, worker: "_Worker") -> None:
+        """Give a worker jobs until it dies, and start another in its place then."""
+        try:
+            usable = True
+            while True:
+                if worker not in self._workers:
+                    worker.close()  # there are newer ones
+                elif usable:
+                    self._idle.put_nowait(worker)
+                answer = await worker.receive()
+                worker.finish(answer)
+                if answer is None:
+                    break
+                usable = answer.error is None or answer.error.kind != WORKER_LOST
+                if not usable:
+                    worker.kill()  # it ran out of memory: what is left of it cannot be trusted
+        finally:
+            worker.finish(None)
             worker.close()
-
-    def _lost(self, worker: "_Worker") -> None:
-        """A worker died: start another in its place."""
-        if worker in self._workers and not self._closed:
+        if worker in self._workers:
             logger.warning("worker %d died and is replaced", worker.pid)
             self._workers.discard(worker)
             self._replaced()
-            self._spawn(self._until_done(worker.nursery, lambda: self._replace(worker.nursery)))
+            await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
 
     async def _replace(self, nursery: "_Nursery") -> None:
-        worker = _Worker(self, nursery)
-        await worker.start()
-        if nursery is not self._nursery:
+        worker = _Worker(nursery)
+        try:
+            await worker.start()
+        except BaseException:
             worker.close()
-            return
-        self._workers.add(worker)
-        self._free(worker)
+            raise
+        if nursery is self._nursery:
+            self._workers.add(worker)
+        self._spawn(self._tend(worker))
 
     async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
         """Start again what died of a nursery, until that succeeds or there is a newer nursery."""
@@ -206,12 +195,6 @@ class WorkerPool:
         task.add_done_callback(self._tasks.discard)
 
 
-def worker_count(settings: Settings) -> int:
-    """How many workers there are: as set, or one for each core this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return settings.workers or cores or 1
-
-
 class _Nursery:
     """The process that has loaded everything, and forks workers."""
 
@@ -225,19 +208,18 @@ class _Nursery:
         control, theirs = socket.socketpair()
         with theirs:
             environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-            process = subprocess.Popen(command, stdin=theirs.fileno(), env=environment)
+            told = settings.model_dump_json()
+            process = subprocess.Popen([*command, told], stdin=theirs.fileno(), env=environment)
         nursery = cls(process, control)
         try:
-            send(control, Start(settings.model_dump(mode="json", exclude=set(SECRETS))))
-            answer = await asyncio.to_thread(receive, control.recv_into)
+            ready = await asyncio.to_thread(receive, control.makefile("rb"))
+            if ready is None or ready.failure:
+                raise InvalidSettings(
+                    ready.failure if ready else "the process that loads weights died"
+                )
         except BaseException:
             nursery.close()
             raise
-        if answer is None or answer.failure:
-            nursery.close()
-            raise InvalidSettings(
-                answer.failure if answer else "the process that loads weights died"
-            )
         control.setblocking(False)
         return nursery
 
@@ -271,37 +253,54 @@ class _Nursery:
         self._control.close()
 
 
-class _Worker(asyncio.Protocol):
+class _Worker:
     """One worker process, at the other end of a socket."""
 
-    def __init__(self, pool: WorkerPool, nursery: _Nursery) -> None:
-        loop = asyncio.get_running_loop()
+    def __init__(self, nursery: _Nursery) -> None:
         self.nursery = nursery
         self.pid = 0
         self.models: list[dict[str, Any]] = []
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
-        self._pool = pool
-        self._ready: asyncio.Future[None] = loop.create_future()
-        self._transport: asyncio.Transport | None = None
-        self._received = bytearray()
+        self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
         """Fork it, and wait until it is ready; raises InvalidSettings where it cannot load."""
-        loop = asyncio.get_running_loop()
         ours = self.nursery.fork()
-        ours.setblocking(False)
-        await loop.create_unix_connection(lambda: self, sock=ours)
-        await self._ready
+        self._reader, self._writer = await asyncio.open_unix_connection(sock=ours)
+        ready = await self.receive()
+        if ready is None or ready.failure:
+            raise InvalidSettings(ready.failure if ready else "a worker died as it started")
+        self.pid, self.models = ready.pid, ready.models
+
+    async def receive(self) -> Any:
+        """Its next message; None: it has ended."""
+        try:
+            length, body_length = HEADER.unpack(await self._reader.readexactly(HEADER.size))
+            text = await self._reader.readexactly(length)
+            return unpack(text, await self._reader.readexactly(body_length))
+        except (asyncio.IncompleteReadError, OSError):
+            return None
 
     def begin(self, job: Job) -> asyncio.Future[Answer]:
         """Give it a job."""
         self.answer = asyncio.get_running_loop().create_future()
         self.answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
-        assert self._transport is not None
+        assert self._writer is not None
         for part in pack(job):
-            self._transport.write(part)
+            self._writer.write(part)
         return self.answer
+
+    def finish(self, answer: Answer | None) -> None:
+        """Hand on the answer of its job, if it has one; None: it died."""
+        if self._killing is not None:
+            self._killing.cancel()
+            self._killing = None
+        waiting, self.answer = self.answer, None
+        if waiting is not None and answer is not None:
+            waiting.set_result(answer)
+        elif waiting is not None:
+            waiting.set_exception(WorkerLost(LOST))
 
     def abandon(self) -> None:
         """Nobody waits for its answer: kill it unless it is done soon."""
@@ -317,51 +316,5 @@ class _Worker(asyncio.Protocol):
 
     def close(self) -> None:
         """Let it end, which it does when it has nothing to do."""
-        if self._transport is not None:
-            self._transport.close()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Of asyncio: the socket is ours."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-
-    def data_received(self, data: bytes) -> None:
-        """Of asyncio: a part of a message."""
-        self._received += data
-        if len(self._received) < HEADER.size:
-            return
-        length, body_length = HEADER.unpack_from(self._received)
-        end = HEADER.size + length
-        if len(self._received) < end + body_length:
-            return
-        message = unpack(self._received[HEADER.size : end], bytes(memoryview(self._received)[end:]))
-        self._received = bytearray()
-        self._take(message)
-
-    def _take(self, message: object) -> None:
-        if isinstance(message, Ready) and message.failure:
-            self._ready.set_exception(InvalidSettings(message.failure))
-        elif isinstance(message, Ready):
-            self.pid, self.models = message.pid, message.models
-            self._ready.set_result(None)
-        elif isinstance(message, Answer) and self.answer is not None:
-            answer, self.answer = self.answer, None
-            if self._killing is not None:
-                self._killing.cancel()
-                self._killing = None
-            answer.set_result(message)
-            if message.error is not None and message.error.kind == WORKER_LOST:
-                self.kill()  # it ran out of memory: what is left of it cannot be trusted
-            else:
-                self._pool._free(self)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        """Of asyncio: the process ended."""
-        if self._killing is not None:
-            self._killing.cancel()
-        if not self._ready.done():
-            self._ready.set_exception(InvalidSettings("a worker died as it started"))
-        if self.answer is not None:
-            answer, self.answer = self.answer, None
-            answer.set_exception(WorkerLost(LOST))
-        self._pool._lost(self)
+        if self._writer is not None:
+            self._writer.close()

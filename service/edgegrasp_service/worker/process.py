@@ -12,44 +12,41 @@ import os
 import resource
 import signal
 import socket
-import struct
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import Problem, WorkerLost, report
+from edgegrasp_service.errors import WorkerLost, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Facts, Job, Limits
+from edgegrasp_service.worker.job import Answer, Facts, Ready, pack, receive
 
 ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
-HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 
 
-def main(load: Callable[[Settings], Any] | None = None) -> None:
-    """Load, then fork a worker for each socket that comes; until the pool is gone.
+def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
+    """Load, then fork a worker for each socket that comes on standard input, until its end.
 
     Args:
+        told: The settings, as JSON.
         load: Makes the catalogue; None: `load_catalogue`.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
-    pool = socket.socket(fileno=0)
-    if (told := receive(pool.recv_into)) is None:
-        return
-    settings = Settings(**told.settings)
+    pool, settings = socket.socket(fileno=0), Settings(**json.loads(told))
     try:
         start = _prepare(settings, load)
-        send(pool, Ready(os.getpid(), []))
     except EdgeGraspError as error:
-        send(pool, Ready(os.getpid(), [], str(error)))
+        _send(pool, Ready(os.getpid(), [], str(error)))
         return
+    _send(pool, Ready(os.getpid(), []))
     gc.collect()
     gc.freeze()  # collecting would write to pages that are shared
+    gc.disable()  # it would look through millions of lists of points again and again
     while True:
         _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
         if not descriptors:
@@ -66,7 +63,7 @@ def main(load: Callable[[Settings], Any] | None = None) -> None:
 
 
 def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
-    """Import and load; returns what gives each worker its answerer and facts of its models.
+    """Import and load; returns what gives each worker its `answer` and facts of its models.
 
     A GPU's context cannot be forked: with one, every worker loads the weights for itself.
     """
@@ -77,36 +74,33 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
 
     def start() -> tuple[Any, list[dict[str, Any]]]:
         loaded = catalogue or load(settings)
-        return answer.Answerer(loaded, limits(settings)), answer.describe(loaded)
+        return partial(answer.answer, catalogue=loaded, settings=settings), loaded.describe()
 
     return start
-
-
-def limits(settings: Settings) -> Limits:
-    """The settings that bound one request."""
-    return Limits(**{name: getattr(settings, name) for name in Limits.__dataclass_fields__})
 
 
 def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> None:
     """Answer jobs, one after the other, until the pool closes the socket."""
     try:
-        answerer, models = start()
+        work, models = start()
     except EdgeGraspError as error:
-        send(pool, Ready(os.getpid(), [], str(error)))
+        _send(pool, Ready(os.getpid(), [], str(error)))
         return
     _limit_memory(settings.max_worker_bytes)
-    send(pool, Ready(os.getpid(), models))
-    while (job := receive(pool.recv_into)) is not None:
+    _send(pool, Ready(os.getpid(), models))
+    jobs = pool.makefile("rb")
+    while (job := receive(jobs)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
         try:
-            answer: Answer = answerer.answer(job)
+            answer: Answer = work(job)
         except BaseException:  # out of memory
             facts = Facts(traceback=traceback.format_exc())
-            send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
+            _send(pool, Answer(b"", facts, report(WorkerLost(LOST))))
             return
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        send(pool, answer)
+        _send(pool, answer)
         del job, answer  # or the next request would add to them
+        gc.collect()
 
 
 def _limit_memory(most: int) -> None:
@@ -117,71 +111,6 @@ def _limit_memory(most: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
-# Messages between the pool and its processes: plain JSON, and bodies as bytes
-
-
-@dataclass(frozen=True)
-class Start:
-    """What the nursery is told first."""
-
-    settings: dict[str, Any]  # those that are not secret
-
-
-@dataclass(frozen=True)
-class Ready:
-    """What the nursery and its workers say first."""
-
-    pid: int
-    models: list[dict[str, Any]]  # as `answer.describe` gives them; of workers
-    failure: str = ""  # why there is none after all
-
-
-MESSAGES = {kind.__name__: kind for kind in (Start, Ready, Job, Answer)}
-
-
-def send(to: socket.socket, message: object) -> None:
-    """Send one message."""
-    head, body = pack(message)
-    to.sendall(head)
-    to.sendall(body)
-
-
-def receive(read_into: Callable[[memoryview], int]) -> Any:
-    """The next message of a socket or a file; None: it has ended."""
-    if not (head := _read(read_into, HEADER.size)):
-        return None
-    length, body_length = HEADER.unpack(head)
-    return unpack(_read(read_into, length), bytes(_read(read_into, body_length)))
-
-
-def pack(message: object) -> tuple[bytes, bytes]:
-    """One of MESSAGES as bytes: the lengths and its plain fields, and its body, not copied."""
-    text = json.dumps([type(message).__name__, message], default=_plain).encode()
-    body: bytes = getattr(message, "body", b"")
-    return HEADER.pack(len(text), len(body)) + text, body
-
-
-def unpack(text: bytes | bytearray, body: bytes) -> Any:
-    """The message of its plain fields, as JSON, and its body."""
-    name, fields = json.loads(text)
-    if "body" in fields:
-        fields["body"] = body
-    if name == "Answer":
-        fields["facts"] = Facts(**fields["facts"])
-        fields["error"] = fields["error"] and Problem(**fields["error"])
-    return MESSAGES[name](**fields)
-
-
-def _plain(value: Any) -> Any:
-    """Of JSON, where it does not know a value: the fields of a message, and nothing of a body."""
-    return "" if isinstance(value, bytes) else vars(value)
-
-
-def _read(read_into: Callable[[memoryview], int], size: int) -> bytearray:
-    """So many bytes; empty where there are not so many any more."""
-    data = bytearray(size)
-    view, done = memoryview(data), 0
-    with contextlib.suppress(ConnectionError):
-        while done < size and (count := read_into(view[done:])):
-            done += count
-    return data if done == size else bytearray()
+def _send(to: socket.socket, message: object) -> None:
+    for part in pack(message):
+        to.sendall(part)

@@ -5,18 +5,35 @@ a form or a message carries it; or bytes, little-endian numbers that a message c
 arrays suit is for the detector to say.
 """
 
+import base64
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    SkipValidation,
+    StrictBool,
+    ValidationError,
+)
 
 from edgegrasp_model.errors import InvalidRequest, brief
-from edgegrasp_model.options import MAX_VIEWS, DetectOptions, invalid_options
+from edgegrasp_model.options import (
+    FARTHEST,
+    MAX_VIEWS,
+    DetectOptions,
+    Finite,
+    Integer,
+    Strict,
+    invalid_options,
+    numeric,
+)
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.schemas import PACKED, PER_POINT, Depth, DepthImage, PointCloud2
 from edgegrasp_service.worker.formats import (
     PCL_FIELDS,
     cloud_of_records,
@@ -28,6 +45,16 @@ from edgegrasp_service.worker.formats import (
 Array = NDArray[Any]
 Schema = TypeVar("Schema", bound=BaseModel)
 
+# Points and arrays beside them, where they come packed: numbers a row, and their type.
+PACKED = {
+    "points": (3, "float32"),
+    "normals": (3, "float32"),
+    "colors": (3, "float32"),
+    "segment_ids": (1, "int32"),
+    "view_ids": (1, "int32"),
+}
+PER_POINT = tuple(PACKED)[1:]
+GIVEN = ("edges", "hand_poses")  # what a caller may want scored
 SOURCES = ("points", "cloud", "point_cloud2", "depth_images")  # `cloud` is a File
 
 
@@ -54,7 +81,6 @@ def decode_cloud(
     Raises:
         InvalidRequest: It cannot be decoded, or the same thing is sent twice.
         PayloadTooLarge: More than `max_points` points.
-        DecoderMissing: The reader of the file's format is not installed.
         UnsupportedMediaType: There is no reader for the file's format.
     """
     source = _source(fields)
@@ -89,8 +115,8 @@ def _source(fields: Mapping[str, Any]) -> str:
     """Which of SOURCES a request has."""
     sources = [name for name in SOURCES if fields.get(name) is not None]
     if not sources:
-        fix = "Send a list of [x, y, z] in metres, point_cloud2, depth_images or a file."
-        raise InvalidRequest("points", "nothing", fix)
+        fix = "Send points in metres, point_cloud2, depth_images or a file."
+        raise InvalidRequest("cloud", "nothing", fix)
     if len(sources) > 1:
         raise InvalidRequest(sources[1], f"a cloud beside {sources[0]}", "Send one cloud.")
     return sources[0]
@@ -170,6 +196,97 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
     raise InvalidRequest(field, brief(row), "Send numbers only, whole ones of 64 bits.")
 
 
+# What requests hold besides arrays, checked
+
+
+def _from_base64(value: object) -> object:
+    """JSON has no bytes; gRPC does."""
+    return base64.b64decode(value, validate=True) if isinstance(value, str) else value
+
+
+Bytes = Annotated[bytes, BeforeValidator(_from_base64, json_schema_input_type=str)]
+Size = Annotated[int, Field(ge=0, lt=2**31), numeric]
+Pixels = Annotated[int, Field(ge=1, le=65536), numeric]
+FocalLength = Annotated[float, Field(gt=0.0, le=FARTHEST), numeric]
+PoseRow = tuple[Finite, Finite, Finite, Finite]
+
+
+def _rigid(pose: tuple[PoseRow, ...]) -> tuple[PoseRow, ...]:
+    matrix = np.array(pose)
+    rotation = matrix[:3, :3]
+    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
+    return pose
+
+
+Pose = Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(_rigid)]
+
+
+class PointField(Strict):
+    """One field of every point."""
+
+    name: str
+    offset: Size = Field(description="bytes from the start of the point")
+    datatype: Integer = Field(ge=1, le=8, description="as in sensor_msgs/PointField; 7 is float32")
+    count: Size = Field(default=1, description="numbers in the field; 0 means 1")
+
+
+class PointCloud2(Strict):
+    """A cloud in the layout of sensor_msgs/PointCloud2, metres."""
+
+    height: Size
+    width: Size
+    fields: tuple[PointField, ...] = Field(min_length=3, max_length=64)
+    is_bigendian: StrictBool = False
+    point_step: Size = Field(description="bytes from point to point")
+    row_step: Size = Field(description="bytes from row to row")
+    data: Bytes = Field(description="height * row_step bytes, as base64 in JSON")
+
+
+class Depth(Strict):
+    """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
+
+    height: Pixels
+    width: Pixels
+    encoding: Literal["32FC1", "64FC1", "16UC1"] = Field(
+        description="32FC1 or 64FC1, metres; 16UC1, millimetres"
+    )
+    data: Bytes = Field(description="packed little-endian pixels, as base64 in JSON")
+
+
+class Intrinsics(Strict):
+    """A pinhole camera without distortion; the centre of the top left pixel is (0, 0)."""
+
+    fx: FocalLength = Field(description="pixels")
+    fy: FocalLength = Field(description="pixels")
+    cx: Finite = Field(description="pixels")
+    cy: Finite = Field(description="pixels")
+
+
+class DepthImage(Strict):
+    """What a camera saw. Camera frame: x right, y down, z forward."""
+
+    depth: SkipValidation[list[list[float]] | Depth] = Field(
+        description="rows of metres, or an object as Depth"
+    )
+    intrinsics: Intrinsics
+    T_cloud_camera: Pose = Field(description="maps camera coordinates to cloud coordinates, metres")
+
+
+def _parse(schema: type[Schema], fields: object, name: str) -> Schema:
+    """Check plain values against a schema; raises InvalidRequest that names the field."""
+    try:
+        return schema.model_validate(fields)
+    except ValidationError as error:
+        problem = invalid_options(error, fields, name)
+        if error.errors(include_url=False)[0]["type"] == "extra_forbidden":
+            problem = InvalidRequest(problem.field, problem.value, "Remove it.")
+        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
+            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
+        raise problem from None
+
+
 # sensor_msgs/PointCloud2
 
 POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -210,37 +327,24 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
 def _record(layout: PointCloud2) -> np.dtype[Any]:
     """The layout of a point, with the fields that are read."""
     order = ">" if layout.is_bigendian else "<"
-    found: dict[str, tuple[str, int]] = {}
-    for row, field in enumerate(layout.fields):
-        here = f"point_cloud2.fields.{row}"
-        kind = order + POINT_TYPES[field.datatype]
-        size = np.dtype(kind).itemsize * max(1, field.count)
-        if field.offset + size > layout.point_step:
-            value = f"{field.name!r} of {size} bytes at {field.offset}"
-            fix = f"Send fields within point_step = {layout.point_step}."
-            raise InvalidRequest(f"{here}.offset", value, fix)
-        if field.name in found:
-            raise InvalidRequest(f"{here}.name", repr(field.name), "Send it once.")
-        if field.name in ("x", "y", "z") and (field.datatype not in (7, 8) or field.count > 1):
-            value = f"{field.datatype} with count {field.count} for {field.name!r}"
-            raise InvalidRequest(
-                f"{here}.datatype", value, "Send one 7 (float32) or 8 (float64), metres."
-            )
-        if field.count <= 1:
-            found[field.name] = (kind, field.offset)
-    missing = [axis for axis in "xyz" if axis not in found]
-    if missing:
-        value = ", ".join(found)[:80] or "no single numbers"
-        raise InvalidRequest("point_cloud2.fields", value, f"Send {', '.join(missing)} too.")
-    names = [name for name in PCL_FIELDS if name in found]
-    return np.dtype(
-        {
-            "names": names,
-            "formats": [found[name][0] for name in names],
-            "offsets": [found[name][1] for name in names],
-            "itemsize": layout.point_step,
-        }
-    )
+    found = [field for field in layout.fields if field.name in PCL_FIELDS and field.count <= 1]
+    kinds = {field.name: field.datatype for field in found}
+    if missing := [axis for axis in "xyz" if kinds.get(axis) not in (7, 8)]:
+        value = ", ".join(f"{field.name} of type {field.datatype}" for field in layout.fields)
+        fix = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
+        raise InvalidRequest("point_cloud2.fields", value[:80], fix)
+    try:
+        return np.dtype(
+            {
+                "names": [field.name for field in found],
+                "formats": [order + POINT_TYPES[field.datatype] for field in found],
+                "offsets": [field.offset for field in found],
+                "itemsize": layout.point_step,
+            }
+        )
+    except ValueError as error:  # a name that is there twice, a field beyond point_step
+        fix = f"Send each field once, within point_step = {layout.point_step}."
+        raise InvalidRequest("point_cloud2.fields", str(error), fix) from None
 
 
 # Depth images
@@ -321,16 +425,3 @@ def _points_of_pixels(depth: NDArray[np.float64], view: DepthImage) -> NDArray[n
         points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
         in_cloud: NDArray[np.float32] = points.astype(np.float32)
     return in_cloud
-
-
-def _parse(schema: type[Schema], fields: object, name: str) -> Schema:
-    """Check plain values against a schema; raises InvalidRequest that names the field."""
-    try:
-        return schema.model_validate(fields)
-    except ValidationError as error:
-        problem = invalid_options(error, fields, name)
-        if error.errors(include_url=False)[0]["type"] == "extra_forbidden":
-            problem = InvalidRequest(problem.field, problem.value, "Remove it.")
-        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
-            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
-        raise problem from None

@@ -4,31 +4,29 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_service.errors import Problem
-from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.job import Answer, Job
 
 
 class Asker:
-    """Hands requests to an Answerer, as the front does."""
+    """Hands requests to a worker's `answer`, as the front does."""
 
     transport = "http"
 
-    def __init__(self, answerer: Answerer) -> None:
-        self.answerer = answerer
-
     def answer(self, method: str, body: bytes, media_type: str = "", query: str = "") -> Answer:
         job = Job(method, self.transport, body, 30.0, media_type, query)
-        answer = self.answerer.answer(job)
-        assert bool(answer.body) == (answer.error is None)
-        if answer.error is not None:
-            assert answer.error.status < 500, answer.facts.traceback
-            answer.error.detail.encode()  # what cannot be encoded cannot be sent
-            assert len(answer.error.detail) < 2000
-        return answer
+        told = answer(job, DummyCatalogue(), Settings())
+        assert bool(told.body) == (told.error is None)
+        if told.error is not None:
+            assert told.error.status < 500, told.facts.traceback
+            told.error.detail.encode()  # what cannot be encoded cannot be sent
+            assert len(told.error.detail) < 2000
+        return told
 
     def problem(self, method: str, body: bytes, media_type: str = "", query: str = "") -> Problem:
         error = self.answer(method, body, media_type, query).error
@@ -64,12 +62,12 @@ class GrpcAsker(Asker):
 
 @pytest.fixture(scope="session")
 def rest() -> RestAsker:
-    return RestAsker(Answerer(DummyCatalogue()))
+    return RestAsker()
 
 
 @pytest.fixture(scope="session")
 def grpc_() -> GrpcAsker:
-    return GrpcAsker(Answerer(DummyCatalogue()))
+    return GrpcAsker()
 
 
 @pytest.fixture(params=["rest", "grpc_"])

@@ -1,15 +1,16 @@
-"""The Answerer: the same answer over both transports, facts, deadlines and faults."""
+"""The worker: the same answer over both transports, facts, deadlines and faults."""
 
+import io
 import json
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.dummy import DummyCatalogue
 
-from edgegrasp_service.worker.answer import Answerer
-from edgegrasp_service.worker.dummy import DummyCatalogue
-from edgegrasp_service.worker.job import Answer, Job
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import answer
+from edgegrasp_service.worker.job import Answer, Job, pack, receive
 
 
 class FailingCatalogue(DummyCatalogue):
@@ -34,10 +35,15 @@ def job(points: np.ndarray, remaining: float = 30.0, **options: Any) -> Job:
     return Job("DetectGrasps", "http", body, remaining, "application/json")
 
 
+def sent(message: Any) -> Any:
+    """As it is at the other end."""
+    return receive(io.BytesIO(b"".join(pack(message))))
+
+
 def test_facts(points: np.ndarray) -> None:
-    asked = pickle.loads(pickle.dumps(job(points, top_k=3)))
-    answer: Answer = pickle.loads(pickle.dumps(Answerer(DummyCatalogue()).answer(asked)))
-    facts = answer.facts
+    asked = sent(job(points, top_k=3))
+    told: Answer = sent(answer(asked, DummyCatalogue(), Settings()))
+    facts = told.facts
     assert (facts.model, facts.points, facts.grasps) == ("dummy", 60, 3)
     assert list(facts.seconds) == ["decode", "prepare", "network", "finish", "encode"]
     assert facts.counts["returned"] == 3
@@ -45,23 +51,23 @@ def test_facts(points: np.ndarray) -> None:
 
 
 def test_the_deadline_is_kept_between_stages(points: np.ndarray) -> None:
-    late = Answerer(DummyCatalogue(0.2)).answer(job(points, remaining=0.1))
+    late = answer(job(points, remaining=0.1), DummyCatalogue(0.2), Settings())
     assert late.error is not None
     assert late.error.kind == "deadline-exceeded"
     assert late.facts.points == 60  # known as far as it came
-    passed = Answerer(DummyCatalogue()).answer(job(points, remaining=-1.0))
+    passed = answer(job(points, remaining=-1.0), DummyCatalogue(), Settings())
     assert passed.error is not None
     assert passed.facts.seconds == {}
 
 
 def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
-    answerer = Answerer(FailingCatalogue(ZeroDivisionError("a secret")))
-    answer = answerer.answer(job(points, seed=7))
-    assert answer.error is not None
-    assert (answer.error.kind, answer.error.status) == ("detector-failed", 500)
-    assert "secret" not in answer.error.detail
-    assert "ZeroDivisionError: a secret" in answer.facts.traceback
-    assert json.loads(answer.facts.options) == {"seed": 7}
+    failing = FailingCatalogue(ZeroDivisionError("a secret"))
+    told = answer(job(points, seed=7), failing, Settings())
+    assert told.error is not None
+    assert (told.error.kind, told.error.status) == ("detector-failed", 500)
+    assert "secret" not in told.error.detail
+    assert "ZeroDivisionError: a secret" in told.facts.traceback
+    assert json.loads(told.facts.options) == {"seed": 7}
 
 
 @pytest.mark.parametrize(
@@ -69,4 +75,4 @@ def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
 )
 def test_a_process_without_memory_says_so(points: np.ndarray, error: Exception) -> None:
     with pytest.raises(MemoryError):
-        Answerer(FailingCatalogue(error)).answer(job(points))
+        answer(job(points), FailingCatalogue(error), Settings())

@@ -127,11 +127,11 @@ CASES = {
     ),
     # PointCloud2.
     "PointCloud2 without z": Malformed(
-        "point_cloud2.fields", "x, y, w", "Send z",
+        "point_cloud2.fields", "w of type 7", "Send z",
         ros=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "name": "w"}]),
     ),
     "PointCloud2 of integers": Malformed(
-        "point_cloud2.fields.2.datatype", "5", "float32",
+        "point_cloud2.fields", "z of type 5", "float32",
         ros=ros(fields=[*ros()["fields"][:2], {**ros()["fields"][2], "datatype": 5}]),
     ),
     "PointCloud2 truncated": Malformed(
@@ -333,7 +333,7 @@ CLOUD = part("cloud", npy(POINTS), '; filename="a.npy"')
         (form(part("cloud", npy(POINTS), '; filename="a.las"')), "format"),
         (form(part("cluod", npy(POINTS), '; filename="a.npy"')), "cluod"),
         (form(part("cloud", npy(POINTS))), "cloud"),
-        (form(part("options", b"{}", '; filename="o.json"')), "points"),
+        (form(part("options", b"{}", '; filename="o.json"')), "cloud"),
         (form(CLOUD, CLOUD), "cloud"),
         (form(CLOUD, part("options", b"{")), "options"),
         (form(CLOUD, part("options", b"[]")), "options"),

@@ -220,9 +220,9 @@ def test_normals_and_colours(kind: str) -> None:
         ({"fields": []}, "point_cloud2.fields"),
         ({"width": 2**31}, "point_cloud2.width"),
         ({"row_step": 2**30, "height": 1000}, "point_cloud2.data"),
-        ({"point_step": 0}, "point_cloud2.fields.0.offset"),
+        ({"point_step": 0}, "point_cloud2.fields"),
         ({"row_step": 1}, "point_cloud2.row_step"),
-        ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields.5.name"),
+        ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields"),
         ({"height": -1}, "point_cloud2.height"),
     ],
 )

@@ -2,14 +2,18 @@
 
 import dataclasses
 import inspect
-import json
+from typing import Any
 
 import pytest
 
 import edgegrasp_client as client
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model import results
-from edgegrasp_service import schemas
+from edgegrasp_service.errors import STATUS
+from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.worker import request_cloud
+
+SCHEMAS = DOCUMENT["components"]["schemas"]
 
 
 def fields(message: str) -> list[str]:
@@ -18,7 +22,7 @@ def fields(message: str) -> list[str]:
 
 @pytest.mark.parametrize("name", ["PointCloud2", "PointField", "DepthImage", "Intrinsics", "Depth"])
 def test_clouds(name: str) -> None:
-    assert fields(name) == list(getattr(schemas, name).model_fields)
+    assert fields(name) == list(getattr(request_cloud, name).model_fields)
     if name != "Depth":
         assert fields(name) == list(getattr(client, name).__annotations__)
 
@@ -27,14 +31,11 @@ def test_requests() -> None:
     """The same fields on both transports and in the client, but for the cloud itself."""
     detect, score = fields("DetectGraspsRequest"), fields("ScoreGraspsRequest")
     assert score == [*detect, "edges", "hand_poses"]
-    for document, names in ((schemas.openapi_detect(), detect), (schemas.openapi_score(), score)):
-        content = document["requestBody"]["content"]
-        body = content["application/json"]["schema"]["properties"]
-        form = content["multipart/form-data"]["schema"]["properties"]
+    for kind, names in (("Detect", detect), ("Score", score)):
+        body, form = (SCHEMAS[f"{kind}{what}"]["properties"] for what in ("Request", "Form"))
         assert set(body) == set(names) - {"encoded"}
         assert set(form) == set(names) - {"encoded", "points"} | {"cloud"}
-        assert list(body["options"]["properties"]) == fields("DetectOptions")
-        assert "$ref" not in json.dumps(document)
+    assert list(SCHEMAS["DetectOptions"]["properties"]) == fields("DetectOptions")
     for method, names in ((client.GraspClient.detect, detect), (client.GraspClient.score, score)):
         ours = set(inspect.signature(method).parameters) - {"self", "timeout"}
         assert ours == set(names) - {"points", "encoded", "point_cloud2"} | {"cloud"}
@@ -42,8 +43,14 @@ def test_requests() -> None:
 
 def test_errors() -> None:
     """ErrorDetail has the fields of a problem document that a gRPC status does not hold."""
-    ours = set(schemas.ProblemBody.model_fields) - {"type", "title", "status", "detail"}
+    ours = set(SCHEMAS["Problem"]["properties"]) - {"type", "title", "status", "detail"}
     assert ours == set(fields("ErrorDetail")) - {"kind"}
+    told = {int(status) for path in DOCUMENT["paths"].values() for status in statuses(path)}
+    assert told - {200} == {status for _, status in STATUS.values()} - {499}
+
+
+def statuses(path: dict[str, Any]) -> list[str]:
+    return [status for operation in path.values() for status in operation["responses"]]
 
 
 @pytest.mark.parametrize(
@@ -61,5 +68,6 @@ def test_answers(message: str, name: str) -> None:
     kinds = [getattr(client, name)] + ([getattr(results, name)] if name != "Model" else [])
     for kind in kinds:
         assert [field.name for field in dataclasses.fields(kind)] == fields(message)
-    body = getattr(schemas, f"{name.removesuffix('Info')}Body")
-    assert set(body.model_fields) == set(fields(message))
+    assert (
+        set(SCHEMAS[name]["properties"]) == set(SCHEMAS[name]["required"]) == set(fields(message))
+    )

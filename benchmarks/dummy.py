@@ -1,5 +1,10 @@
-"""A detector of known service time and made-up grasps, to measure and test the service alone."""
+"""A detector of known service time and made-up grasps, to measure and test the service alone.
 
+usage: python benchmarks/dummy.py serve [FLAG ...]    `edgegrasp serve` with it, and no weights
+"""
+
+import os
+import sys
 import time
 import zlib
 from dataclasses import dataclass, field
@@ -27,6 +32,7 @@ TCP_Z = 0.1  # metres along the hand's z
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 GRASPS = 10  # made at most
 WARNING = "The dummy detector made these grasps up."
+SECONDS = float(os.environ.get("DUMMY_SECONDS", "0"))  # of service time
 
 
 @dataclass(frozen=True)
@@ -127,8 +133,9 @@ class DummyCatalogue:
 
     def describe(self) -> list[dict[str, Any]]:
         """The facts of the dummy."""
-        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "default": True}
-        return [facts | {"device": "cpu"}]
+        facts = {"name": NAME, "architecture": NAME, "gripper": "panda", "device": "cpu"}
+        sizes = {"digest": "", "parameters": 0, "crop_radius": 0.0, "voxel_size": 0.0}
+        return [facts | sizes | {"default": True, "hand_description": False}]
 
 
 def _top_down(point: Float32, score: float) -> Grasp:
@@ -137,3 +144,20 @@ def _top_down(point: Float32, score: float) -> Grasp:
     T_cloud_hand = T_cloud_tcp.copy()
     T_cloud_hand[:3, 3] -= TCP_Z * DOWN
     return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, DOWN, True, 0.0)
+
+
+def main() -> None:
+    """The program `edgegrasp` with the dummy; with settings as JSON, what its workers fork from."""
+    from edgegrasp_service.worker import pool, process
+
+    if sys.argv[1].startswith("{"):
+        process.main(sys.argv[1], lambda settings: DummyCatalogue(SECONDS))
+        return
+    pool.NURSERY = (sys.executable, "-P", __file__)
+    from edgegrasp_cli.main import main
+
+    main()
+
+
+if __name__ == "__main__":
+    main()
