@@ -33,7 +33,7 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
-from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train
+from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train, start_from
 from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import load_view
 
@@ -78,6 +78,7 @@ class Trainer:
         options: TrainingOptions,
         device: torch.device | str = "cpu",
         teacher: Teacher | None = None,
+        start: Path | None = None,
     ) -> None:
         """Set up, and resume from the folder's last state if there is one.
 
@@ -89,9 +90,11 @@ class Trainer:
             options: The recipe.
             device: Where the network runs.
             teacher: Scores further candidates to learn from.
+            start: Weights to start from; None: random ones.
 
         Raises:
-            ValueError: The network is one of hands, which no teacher can teach.
+            InvalidCheckpoint: The weights to start from cannot be read.
+            ValueError: They do not fit, or the network is one of hands, which no teacher can teach.
         """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
@@ -105,6 +108,11 @@ class Trainer:
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
+        self.started_from: CheckpointMetadata | None = None
+        known = 0
+        if start is not None:
+            trained, self.started_from = load_checkpoint(start)
+            known = start_from(self.network, trained)
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
@@ -115,7 +123,7 @@ class Trainer:
         if (folder / STATE_FILE).is_file():
             self._resume()
         else:
-            self._standardise()
+            self._standardise(known)
 
     @property
     def finished(self) -> bool:
@@ -180,6 +188,9 @@ class Trainer:
         if self.teacher is not None:
             taught = self.teacher.metadata
             training |= {"teacher": taught.name, "teacher_digest": taught.digest}
+        if self.started_from is not None:
+            started = self.started_from
+            training |= {"started_from": started.name, "started_from_digest": started.digest}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         self._save_average(metadata)
         card = self.folder / f"{self.metadata.name}.md"
@@ -265,13 +276,15 @@ class Trainer:
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
 
-    def _standardise(self) -> None:
-        """Fit the mean and spread of the hand descriptions to the training views."""
+    def _standardise(self, known: int) -> None:
+        """Fit mean and spread of the hand descriptions to the training views, but the first few."""
         if not isinstance(self.network, HandNet):
             return
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
+        # Weights that were trained with other statistics keep them.
+        mean[:known], std[:known] = self.network.mean[:known].cpu(), self.network.std[:known].cpu()
         self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
         self.average.load_state_dict(self.network.state_dict())
 
