@@ -89,6 +89,9 @@ def train(
         Path | None,
         Option(help="Weights to start from, of the same model; use a lower --learning-rate."),
     ] = None,
+    keep: Annotated[
+        float, Option(help="Share of the weights of --start-from in the result.", min=0.0, max=1.0)
+    ] = 0.0,
     crop_radius: Annotated[
         float | None,
         Option(
@@ -126,6 +129,7 @@ def train(
         views_per_step=views_per_step,
         balls_per_view=balls_per_view,
         learning_rate=learning_rate,
+        keep=keep,
         schedule=schedule,
         rotations=rotations,
         evaluate_every=evaluate_every,

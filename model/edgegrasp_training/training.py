@@ -63,6 +63,7 @@ class TrainingOptions:
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate
     mixed_precision: bool = False  # matrix products in bfloat16, for a GPU
+    keep: float = 0.0  # share of the weights started from in the result
     seed: int = 0
 
 
@@ -108,6 +109,7 @@ class Trainer:
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
+        self.start = start
         self.started_from: CheckpointMetadata | None = None
         known = 0
         if start is not None:
@@ -175,6 +177,8 @@ class Trainer:
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
         self.average.load_state_dict(in_units(best).state_dict())
+        if self.start is not None and self.options.keep > 0.0:
+            self._mix_in(self.start)
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
@@ -191,11 +195,24 @@ class Trainer:
         if self.started_from is not None:
             started = self.started_from
             training |= {"started_from": started.name, "started_from_digest": started.digest}
+            training |= {"kept_of_it": self.options.keep}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         self._save_average(metadata)
         card = self.folder / f"{self.metadata.name}.md"
         write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
+
+    def _mix_in(self, start: Path) -> None:
+        """Move the result toward the weights it started from, so that less is forgotten.
+
+        The mean of both keeps most of what either can do (Wortsman et al., Robust fine-tuning of
+        zero-shot models, CVPR 2022).
+        """
+        first = deepcopy(self.average)
+        start_from(first, load_checkpoint(start, self.device)[0])
+        with torch.no_grad():
+            for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
+                new.lerp_(old, self.options.keep)
 
     def _train_step(self) -> float:
         self.network.train()
