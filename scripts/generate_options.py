@@ -277,7 +277,9 @@ def _python_type(name: str, schema: Schema) -> str:
     nullable = any(one.get("type") == "null" for one in schema.get("anyOf", ()))
     if name in UNIONS:
         return f"Sequence[{UNIONS[name]}]"
-    kinds = list(dict.fromkeys(_one_python_type(one) for one in alternatives(schema)))
+    packed = "contentEncoding"  # text in JSON, where Python has arrays
+    parts = [one for one in alternatives(schema) if packed not in one]
+    kinds = list(dict.fromkeys(map(_one_python_type, parts)))
     return " | ".join([*kinds, "None"] if nullable else kinds)
 
 
@@ -314,8 +316,8 @@ a `Quaternion` `[x, y, z, w]`. Options come first in the table, then the objects
 Where a JSON object has a `kind`, gRPC has a message with one field for each kind; but a given
 support plane has its fields in `Support` itself, where one to look for is the field `auto` or
 `ransac`.
-`"suppression": null` and `"support": null` are `disabled: true` in gRPC; any other `null` is a field
-left out.
+`"suppression": null` and `"support": null` are `disabled: true` in gRPC; any other `null` is a
+field left out.
 
 This page is generated from the server's own definition by `make proto`.
 """

@@ -169,6 +169,8 @@ def _set(message: Message, name: str, value: object, path: str) -> None:
 
 
 def _extend(container: Any, values: object, path: str, messages: bool) -> None:
+    if isinstance(values, np.ndarray):
+        values = values.tolist()
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise invalid(path, repr(values)[:80], "Give a list.")
     if messages:
@@ -178,7 +180,9 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
     try:
         container.extend(values)
     except (TypeError, ValueError) as error:
-        raise invalid(path, repr(values)[:80], f"{error}.") from None
+        nested = any(isinstance(value, Sequence) for value in values)
+        fix = "Give one list without lists in it, or an array of bool." if nested else f"{error}."
+        raise invalid(path, repr(values)[:80], fix) from None
 
 
 def _known(message: Message) -> str:

@@ -120,7 +120,7 @@ class Mask(TypedDict):
     """Points by one truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
-    # as many values as the cloud has rows
+    # as many values as the cloud has rows; in JSON also base64 of a byte for each
     mask: Sequence[bool] | NDArray[Any]
 
 
@@ -259,8 +259,9 @@ class DetectOptions(TypedDict, total=False):
     top_k: int
     # non-maximum suppression; None: none
     suppression: Suppression | None
-    # what comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    # others by score; or the clearance
+    # what comes first: the score (before others, the best grasp of each object that has one of 0.5
+    # and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    # the clearance
     order: Literal["score", "highest", "clearance"]
     # whether to return the processed cloud and every candidate
     debug: bool

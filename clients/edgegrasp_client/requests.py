@@ -104,6 +104,8 @@ class ScoreRequest(Request):
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as JSON has them: lists instead of arrays, and those left out that are None.
 
+    Masks stay arrays, which each transport packs: (N,) bool.
+
     `suppression` and `support` alone have a None of their own: none.
 
     Raises:
@@ -136,6 +138,8 @@ async def async_enumerate(
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype == bool:
+        return value.ravel()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):

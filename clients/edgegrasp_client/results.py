@@ -1,6 +1,6 @@
 """What a server answers, as typed values, and how they are read from either transport."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -131,6 +131,15 @@ class StreamAnswer:
         return self.detection
 
 
+# The stages of the server, as it goes through them: gRPC carries counts and seconds in no order.
+_STAGES = (
+    *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
+    *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
+    *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
+    *("suppressed", "returned", "description", "network", "ranking", "total"),
+)
+
+
 Record = TypeVar("Record", Model, FoundSupport, DetectedObject)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
@@ -164,11 +173,11 @@ def models_from(answer: Any, read: Read) -> list[Model]:
 
 def _record(kind: type[Record], answer: Any, read: Read) -> Record:
     """An object whose fields are read as they are, lists of numbers as arrays."""
-    values = {one.name: read(answer, one.name) for one in fields(kind)}
     plain = (str, int, float, type(None))
-    return kind(
-        **{name: one if isinstance(one, plain) else _array(one) for name, one in values.items()}
-    )
+    values: dict[str, Any] = {one.name: read(answer, one.name) for one in fields(kind)}
+    for name, value in values.items():
+        values[name] = value if isinstance(value, plain) else _array(value)
+    return kind(**values)
 
 
 def _array(numbers: Any) -> Float32:
@@ -177,11 +186,16 @@ def _array(numbers: Any) -> Float32:
 
 def _common(answer: Any, read: Read) -> dict[str, Any]:
     return {
-        "counts": dict(read(answer, "counts")),
-        "seconds": dict(read(answer, "seconds")),
+        "counts": _in_order(read(answer, "counts")),
+        "seconds": _in_order(read(answer, "seconds")),
         "model": read(answer, "model"),
         "warnings": list(read(answer, "warnings")),
     }
+
+
+def _in_order(stages: Mapping[str, Any]) -> dict[str, Any]:
+    """By stage; stages of a newer server come last."""
+    return {name: stages[name] for name in (*_STAGES, *sorted(stages)) if name in stages}
 
 
 def _evaluation(answer: Any, read: Read) -> Evaluation:

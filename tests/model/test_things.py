@@ -68,13 +68,15 @@ def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> N
     turn, shift = Rotation.random(rng=rng), rng.uniform(-0.5, 0.5, 3)
     moved = (turn.apply(cloud.reshape(-1, 3).astype(np.float64)) + shift).reshape(cloud.shape)
     here, there = detect(cloud), detect(moved, viewpoint=shift.tolist())
-    assert here.support is not None and there.support is not None
+    assert here.support is not None
+    assert there.support is not None
     assert there.support.normal @ turn.apply(here.support.normal) > 1 - 1e-5
     np.testing.assert_allclose(there.up, turn.apply(here.up), atol=1e-3)
     assert len(there.objects) == len(here.objects)
     for one, other in zip(here.objects, there.objects, strict=True):
         np.testing.assert_allclose(turn.apply(one.center) + shift, other.center, atol=0.004)
-    assert here.grasps and there.grasps
+    assert here.grasps
+    assert there.grasps
     best = here.grasps[0]
     contact = turn.apply(best.contact_point) + shift
     apart = [np.linalg.norm(grasp.contact_point - contact) for grasp in there.grasps]
@@ -111,7 +113,8 @@ def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
         CloudInput(in_world.astype(np.float32)[np.isfinite(in_world).all(axis=1)]),
         DetectOptions.model_validate(asked),
     )
-    assert found.grasps and found.debug is not None
+    assert found.grasps
+    assert found.debug is not None
     assert all(grasp.contact_point[0] < 0.051 for grasp in found.grasps)
     assert found.debug.points[:, 0].max() > 0.1  # the other box is still an obstacle
     assert len(found.objects) == 1

@@ -459,6 +459,9 @@ class DepthImage(_message.Message):
     DEPTH_FIELD_NUMBER: _builtins.int
     INTRINSICS_FIELD_NUMBER: _builtins.int
     T_CLOUD_CAMERA_FIELD_NUMBER: _builtins.int
+    DEPTH_SCALE_FIELD_NUMBER: _builtins.int
+    depth_scale: _builtins.float
+    """Metres that one unit of the depth is worth. Absent: 0.001 of whole numbers, 1 of floats."""
     @_builtins.property
     def depth(self) -> Global___Depth:
         """Distance along z at each pixel."""
@@ -467,7 +470,9 @@ class DepthImage(_message.Message):
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
     def T_cloud_camera(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres."""
+        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres. None: the
+        cloud's frame is the camera's.
+        """
 
     def __init__(
         self,
@@ -475,12 +480,15 @@ class DepthImage(_message.Message):
         depth: Global___Depth | None = ...,
         intrinsics: Global___Intrinsics | None = ...,
         T_cloud_camera: _abc.Iterable[_builtins.float] | None = ...,
+        depth_scale: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_depth_scale", b"_depth_scale", "depth", b"depth", "depth_scale", b"depth_scale", "intrinsics", b"intrinsics"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_camera", b"T_cloud_camera", "depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_camera", b"T_cloud_camera", "_depth_scale", b"_depth_scale", "depth", b"depth", "depth_scale", b"depth_scale", "intrinsics", b"intrinsics"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__depth_scale: _TypeAlias = _typing.Literal["depth_scale"]  # noqa: Y015
+    _WhichOneofArgType__depth_scale: _TypeAlias = _typing.Literal["_depth_scale", b"_depth_scale"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__depth_scale) -> _WhichOneofReturnType__depth_scale | None: ...
 
 Global___DepthImage: _TypeAlias = DepthImage  # noqa: Y015
 
@@ -497,9 +505,11 @@ class Depth(_message.Message):
     height: _builtins.int
     width: _builtins.int
     encoding: _builtins.str
-    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres."""
+    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres. Or "png": the file
+    of a 16-bit greyscale image, millimetres, which knows its height and width.
+    """
     data: _builtins.bytes
-    """Packed little-endian pixels; base64 in JSON."""
+    """Packed little-endian pixels, or the file; base64 in JSON."""
     def __init__(
         self,
         *,
@@ -601,8 +611,9 @@ class DetectOptions(_message.Message):
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """What comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    others by score; or the clearance. One of "score", "highest", "clearance".
+    """What comes first: the score (before others, the best grasp of each object that has one of 0.5
+    and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    the clearance. One of "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
@@ -1270,7 +1281,7 @@ class Mask(_message.Message):
     MASK_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
-        """As many values as the cloud has rows."""
+        """As many values as the cloud has rows; in JSON also base64 of a byte for each."""
 
     def __init__(
         self,
@@ -1656,7 +1667,7 @@ class DetectGraspsResponse(_message.Message):
     """Name of the weights used."""
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___Grasp]:
-        """Ranked, best first."""
+        """Ranked as options.order says, the best first."""
 
     @_builtins.property
     def counts(self) -> _containers.ScalarMap[_builtins.str, _builtins.int]:
