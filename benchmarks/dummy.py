@@ -56,8 +56,8 @@ class DummyDetector:
 
     def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
         """Draw approach points, the same ones for the same cloud and options."""
-        points = check_cloud(cloud, options.num_approach_points or 1).points
-        count = options.num_approach_points or min(APPROACH_POINTS, len(points))
+        count = options.num_approach_points or APPROACH_POINTS
+        points = check_cloud(cloud, count).points
         random = np.random.default_rng(options.seed)
         drawn = random.choice(len(points), count, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
