@@ -103,6 +103,10 @@ def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) ->
     _, metadata = load_checkpoint(tmp_path / "on" / "tiny.safetensors")
     assert metadata.training["started_from"] == "tiny"
     assert metadata.training["started_from_digest"] == load_checkpoint(start)[1].digest
+    kept = make_trainer(tmp_path / "kept", network, start=start, steps=4, keep=1.0)
+    kept.run(ignore)
+    logit = kept.finish({}, "edgegrasp train data").logit  # all of the old weights is kept
+    np.testing.assert_allclose(logit, first.evaluate().logit, atol=1e-4)
 
 
 def test_a_run_may_start_from_weights_that_were_told_less(
