@@ -152,3 +152,28 @@ def test_an_empty_table_is_a_support_with_nothing_on_it() -> None:
     found = detect(render([table()], camera(0.6, -1.5, 0.7)))
     assert found.support is not None
     assert (found.grasps, found.objects) == ([], [])
+
+
+def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> None:
+    rng = np.random.default_rng(4)
+    contents = [
+        box((*rng.uniform([-0.1, -0.07], [0.1, 0.07]), 0.03), (0.02, 0.045, 0.025), yaw)
+        for yaw in rng.uniform(0, 3, 4)
+    ]
+    T_world_camera = camera(0.3, -1.5, 0.7)
+    cloud = render([table(), *bin_walls(0.36, 0.28, 0.1), *contents], T_world_camera)
+    points = cloud.reshape(-1, 3)[np.isfinite(cloud).all(axis=2).reshape(-1)]
+    in_world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    found = detector().detect(
+        in_world.astype(np.float32),
+        parse_options(
+            {
+                "viewpoint": T_world_camera[:3, 3].tolist(),
+                "support": {"normal": (0, 0, 1), "offset": 0.005},
+                "workspace": {"min": (-0.18, -0.14, 0.0), "max": (0.18, 0.14, 0.2)},
+            }
+        ),
+    )
+    assert found.grasps
+    for grasp in found.grasps:
+        assert min(one.distance(grasp.contact_point[None])[0] for one in contents) < 0.01
