@@ -96,7 +96,8 @@ def _message(name: str, schema: Schema, options: Schema) -> str:
         if field != "kind"
     }
     if name == PLAIN_KIND:  # objects of the other kinds are fields of its message
-        for one in alternatives(options["properties"]["support"])[1:]:
+        kinds = alternatives(options["properties"]["support"])
+        for one in [kind for kind in kinds if name_of(kind) not in ("", PLAIN_KIND)]:
             other = options["$defs"][name_of(one)]
             word = other["properties"]["kind"]["const"]
             text = f'{_first_paragraph(other)} `kind` is "{word}" in JSON, its fields beside it'
@@ -127,7 +128,7 @@ def _null_is_a_value(name: str, options: Schema) -> bool:
     return any(
         {"type": "null"} in field.get("anyOf", ()) and field["default"] is not None
         for field in options["properties"].values()
-        if name in map(name_of, alternatives(field))
+        if name == next(filter(None, map(name_of, alternatives(field))), "")
     )
 
 
@@ -276,7 +277,9 @@ def _python_type(name: str, schema: Schema) -> str:
     nullable = any(one.get("type") == "null" for one in schema.get("anyOf", ()))
     if name in UNIONS:
         return f"Sequence[{UNIONS[name]}]"
-    kinds = list(dict.fromkeys(_one_python_type(one) for one in alternatives(schema)))
+    packed = "contentEncoding"  # text in JSON, where Python has arrays
+    parts = [one for one in alternatives(schema) if packed not in one]
+    kinds = list(dict.fromkeys(map(_one_python_type, parts)))
     return " | ".join([*kinds, "None"] if nullable else kinds)
 
 
@@ -311,8 +314,10 @@ Positions and directions are in the cloud's frame, in metres, within 10,000 km o
 directions are the way the hand *moves* ([pictures](frames.md)). A `Vector` is `[x, y, z]` in JSON,
 a `Quaternion` `[x, y, z, w]`. Options come first in the table, then the objects they are made of.
 Where a JSON object has a `kind`, gRPC has a message with one field for each kind; but a given
-support plane has its fields in `Support` itself, where one to look for is the field `ransac`.
-`"suppression": null` is `disabled: true` in gRPC; any other `null` is a field left out.
+support plane has its fields in `Support` itself, where one to look for is the field `auto` or
+`ransac`.
+`"suppression": null` and `"support": null` are `disabled: true` in gRPC; any other `null` is a
+field left out.
 
 This page is generated from the server's own definition by `make proto`.
 """

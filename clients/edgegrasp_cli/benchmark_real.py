@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from edgegrasp_model.gripper import Gripper
 
 Option = typer.Option
-DECIDED = ("viewpoint", "debug")  # options that the scene or the command decides
+DECIDED = ("viewpoint",)  # options that the scene decides
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
 CAPTION = (
@@ -64,7 +64,7 @@ def benchmark_real(
         client.detect(**loaded[0].request, **fields)  # what is loaded or compiled first takes time
         for scene in loaded:
             start = time.perf_counter()
-            detection = client.detect(**scene.request, **fields, debug=True)
+            detection = client.detect(**scene.request, **fields)
             milliseconds = 1000 * (time.perf_counter() - start)
             model = detection.model
             gripper = _gripper(client, model, grippers, fields)
@@ -89,8 +89,8 @@ def _gripper(
 
 def _plane(detection: Any) -> tuple[Any, float] | None:
     """Normal (3,) and offset of the support plane that was found, camera frame."""
-    plane = None if detection.debug is None else detection.debug.support_plane
-    return None if plane is None else (np.asarray(plane[:3], dtype=np.float64), float(plane[3]))
+    found = detection.support
+    return None if found is None else (np.asarray(found.normal, dtype=np.float64), found.offset)
 
 
 def _write(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from edgegrasp_cli.flags import (
     CONNECTION,
@@ -22,7 +23,7 @@ from edgegrasp_cli.flags import (
 )
 
 if TYPE_CHECKING:
-    from edgegrasp_client import Model
+    from edgegrasp_client import DepthImage, Model
     from edgegrasp_model.detector import ModelCatalogue
 
 Option = typer.Option
@@ -34,12 +35,29 @@ Weights = Annotated[
 Grippers = Annotated[
     list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
 ]
+Intrinsics = Annotated[
+    str | None,
+    Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
+]
 Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
 
 
 @takes_flags(connection=CONNECTION, options=option_flags())
 def detect(
-    file: Annotated[Path, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")],
+    file: Annotated[
+        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+    ] = None,
+    depth: Annotated[
+        Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
+    ] = None,
+    intrinsics: Intrinsics = None,
+    depth_scale: Annotated[
+        float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
+    ] = None,
+    color: Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")] = None,
+    mask: Annotated[
+        Path | None, Option(help="Grasp only where this is not 0: .png or .npy, same pixels.")
+    ] = None,
     server: Server = None,
     timeout: Timeout = 60.0,
     weights: Weights = None,
@@ -53,13 +71,17 @@ def detect(
     connection: dict[str, Any],
     options: dict[str, Any],
 ) -> None:
-    """Find grasps in a point cloud file, by a server or in this process.
+    """Find grasps in a point cloud file or a depth image, by a server or in this process.
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
     fields = _options(options_file, options)
+    images = _depth_images(file, depth, intrinsics, depth_scale)
+    colors = None if color is None else _pixels(color)[..., :3]
+    if mask is not None:
+        fields |= _on_mask(fields, _pixels(mask))
     with open_client(server, timeout, connection, weights, grippers, device) as client:
-        detection = client.detect(file, **fields)
+        detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if as_document:
         print(json.dumps(_json_document(detection)))
     else:
@@ -131,13 +153,17 @@ class OwnDetector:
     def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
         self._load = weights, grippers, device
 
-    def detect(self, cloud: Any = None, *, depth_images: Any = None, **options: Any) -> Any:
+    def detect(
+        self, cloud: Any = None, *, depth_images: Any = None, colors: Any = None, **options: Any
+    ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
         from edgegrasp_client.clouds import depth_image_fields, npy_bytes
         from edgegrasp_model.options import parse_options
         from edgegrasp_service.worker.request_cloud import File, decode_cloud
 
         fields: dict[str, Any] = {}
+        if colors is not None:
+            fields["colors"] = File("npy", npy_bytes(colors))
         if depth_images is not None:
             images = enumerate(depth_images)
             fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
@@ -172,6 +198,41 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     return fields | parse_option_flags(given)
+
+
+def _depth_images(
+    file: Path | None, depth: Path | None, intrinsics: str | None, scale: float | None
+) -> "list[DepthImage] | None":
+    """The image of --depth with its camera; None where a cloud is given."""
+    from edgegrasp_service.worker.http_bodies import value_of_text
+
+    if (file is None) == (depth is None):
+        raise ValueError("give a cloud file, or --depth and --intrinsics")
+    if depth is None:
+        return None
+    if intrinsics is None:
+        raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depth}, in pixels.")
+    camera: Any = value_of_text("intrinsics", intrinsics)
+    image: DepthImage = {"depth": depth, "intrinsics": camera}
+    return [image if scale is None else {**image, "depth_scale": scale}]
+
+
+def _pixels(file: Path) -> NDArray[Any]:
+    """The values of an image file: (H, W), or (H, W, C) of several channels."""
+    from edgegrasp_service.worker.request_cloud import File, decode_array
+
+    return decode_array(str(file), File(file.suffix[1:].lower(), file.read_bytes()), sys.maxsize)
+
+
+def _on_mask(options: Mapping[str, Any], mask: NDArray[Any]) -> dict[str, Any]:
+    """The regions of the options, without what lies where the mask is 0 in every channel."""
+    kept = mask[..., :3].any(axis=2) if mask.ndim == 3 else mask != 0
+    outside = {"kind": "mask", "mask": ~kept}
+    regions = {}
+    for name in ("approach_region", "contact_region"):
+        region = options.get(name) or {}
+        regions[name] = region | {"exclude": [*region.get("exclude", ()), outside]}
+    return regions
 
 
 def _json_document(detection: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ except ModuleNotFoundError:
 # Command: its module, the extra it needs, one-line help. `generate-data` is generate_data().
 COMMANDS = {
     "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
-    "detect": ("detect", "service", "Find grasps in a point cloud file."),
+    "detect": ("detect", "service", "Find grasps in a cloud or a depth image."),
     "models": ("detect", "service", "List the weights that can be used."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
     "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),

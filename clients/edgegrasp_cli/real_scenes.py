@@ -249,19 +249,16 @@ class _Arrays:
 
 def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
     """What a detector gets; and the points (H, W, 3) or (N, 3), NaN where there is no reading."""
-    from edgegrasp_client.clouds import depth_image_fields
-    from edgegrasp_service.worker.request_cloud import fuse_depth_images
+    from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
 
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
-        image: Any = {
-            "depth": depth,
-            "intrinsics": dict(zip(("fx", "fy", "cx", "cy"), values, strict=True)),
-            "T_cloud_camera": np.eye(4),
-        }
-        cloud, _ = fuse_depth_images([depth_image_fields(image, 0)], depth.size)
-        return {"depth_images": [image]}, np.asarray(cloud.points, dtype=np.float32)
+        view = CameraView.model_validate({"intrinsics": values})
+        cloud, _ = fuse_depth_images([depth], [view])
+        return {"depth_images": [{"depth": depth, "intrinsics": values}]}, np.asarray(
+            cloud.points, dtype=np.float32
+        )
     wanted = "(H, W, 3) or (N, 3) float32 metres, or depth and intrinsics"
     points = arrays.get("points", "f", wanted)
     if points.ndim not in (2, 3) or points.shape[-1] != 3:

@@ -85,6 +85,13 @@ def train(
         Path | None,
         Option(help="Weights of a hand network whose scores a network of balls learns from too."),
     ] = None,
+    start_from: Annotated[
+        Path | None,
+        Option(help="Weights to start from, of the same model; use a lower --learning-rate."),
+    ] = None,
+    keep: Annotated[
+        float, Option(help="Share of the weights of --start-from in the result.", min=0.0, max=1.0)
+    ] = 0.0,
     crop_radius: Annotated[
         float | None,
         Option(
@@ -122,6 +129,7 @@ def train(
         views_per_step=views_per_step,
         balls_per_view=balls_per_view,
         learning_rate=learning_rate,
+        keep=keep,
         schedule=schedule,
         rotations=rotations,
         evaluate_every=evaluate_every,
@@ -135,7 +143,9 @@ def train(
     guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
     if crop_radius is not None:
         metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
-    trainer = Trainer(metadata, training_views, validation_views, run, options, device, guide)
+    trainer = Trainer(
+        metadata, training_views, validation_views, run, options, device, guide, start_from
+    )
     print(f"{len(training_views)} training and {len(validation_views)} validation views")
     with Progress() as progress:
         task = progress.add_task("steps", total=steps, completed=trainer.step)

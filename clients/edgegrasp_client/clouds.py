@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, TypedDict, TypeGuard
+from typing import Any, NotRequired, Protocol, TypedDict, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,9 +49,15 @@ class Intrinsics(TypedDict):
 class DepthImage(TypedDict):
     """What a camera saw. Camera frame: x right, y down, z forward."""
 
-    depth: NDArray[Any]  # (H, W) metres as float32 or float64, millimetres as uint16; 0, NaN: none
-    intrinsics: Intrinsics
-    T_cloud_camera: NDArray[Any] | Sequence[Sequence[float]]  # (4, 4) camera to cloud, metres
+    # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
+    # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.
+    depth: NDArray[Any] | str | PathLike[str]
+    # Or fx, fy, cx, cy; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    intrinsics: Intrinsics | Sequence[float] | NDArray[Any]
+    # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
+    T_cloud_camera: NotRequired[NDArray[Any] | Sequence[Sequence[float]]]
+    # Metres that one unit of the depth is worth; left out: 0.001 of whole numbers, 1 of floats.
+    depth_scale: NotRequired[float]
 
 
 Cloud = NDArray[Any] | str | PathLike[str] | PointCloud2
@@ -95,7 +101,8 @@ def cloud_file(cloud: Cloud) -> CloudFile:
     path = Path(cloud)
     file_format = path.suffix[1:].lower()
     if file_format not in FILE_FORMATS:
-        raise invalid("cloud", repr(path.name), f"Give one of: {', '.join(FILE_FORMATS)}.")
+        fix = f"Give one of: {', '.join(FILE_FORMATS)}; a depth image as one of depth_images."
+        raise invalid("cloud", repr(path.name), fix)
     try:
         return CloudFile(file_format, path.read_bytes())
     except OSError as error:
@@ -153,30 +160,56 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
         InvalidRequestError: A field is missing, unknown, or of a wrong type or shape.
     """
     path = f"depth_images.{number}"
-    names = DepthImage.__required_keys__
-    if not isinstance(image, Mapping) or set(image) != names:
+    needed, known = DepthImage.__required_keys__, DepthImage.__annotations__
+    if not isinstance(image, Mapping) or not needed <= set(image) <= set(known):
         found = ", ".join(map(str, image)) if isinstance(image, Mapping) else type(image).__name__
-        raise invalid(path, found[:80], f"Give a mapping with {', '.join(sorted(names))}.")
-    intrinsics = image["intrinsics"]
-    cameras = Intrinsics.__annotations__
-    if not isinstance(intrinsics, Mapping) or set(intrinsics) != set(cameras):
-        value = repr(intrinsics)[:80]
-        raise invalid(f"{path}.intrinsics", value, f"Give a mapping with {', '.join(cameras)}.")
-    pose = np.asarray(image["T_cloud_camera"])
+        fix = "Give a mapping with depth and intrinsics, T_cloud_camera and depth_scale or not."
+        raise invalid(path, found[:80], fix)
+    pose = np.asarray(image.get("T_cloud_camera", np.eye(4)))
     if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
         value = f"shape {pose.shape}, dtype {pose.dtype}"
         raise invalid(f"{path}.T_cloud_camera", value, "Give a 4 x 4 matrix.")
+    scale = {name: image[name] for name in ("depth_scale",) if name in image}
     return {
         "depth": _depth_fields(image["depth"], f"{path}.depth"),
-        "intrinsics": {name: float(intrinsics[name]) for name in cameras},  # type: ignore[literal-required]
+        "intrinsics": _intrinsics_fields(image["intrinsics"], f"{path}.intrinsics"),
         "T_cloud_camera": pose.astype(np.float64).tolist(),
+        **scale,
     }
 
 
+def _intrinsics_fields(intrinsics: object, path: str) -> dict[str, float]:
+    """fx, fy, cx and cy of a mapping, of four numbers or of a matrix (3, 3) or (9,)."""
+    names = tuple(Intrinsics.__annotations__)
+    if isinstance(intrinsics, Mapping) and set(intrinsics) == set(names):
+        intrinsics = [intrinsics[name] for name in names]
+    try:
+        numbers = np.asarray(intrinsics, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    rows: Any = (numbers.reshape(3, 3) if numbers.size == 9 else numbers).tolist()
+    match rows:
+        case [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]] | [float(fx), fy, cx, cy]:
+            return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
+    raise invalid(path, repr(intrinsics)[:80], fix)
+
+
 def _depth_fields(depth: object, path: str) -> dict[str, Any]:
-    fix = f"Give an (H, W) array of {', '.join(DEPTH_ENCODINGS)}."
+    """The fields of edgegrasp.v1.Depth; a .png file is sent as it is."""
+    fix = f"Give an (H, W) array of {', '.join(DEPTH_ENCODINGS)}, or a .png or .npy file of one."
+    if isinstance(depth, str | PathLike):
+        file = Path(depth)
+        try:
+            if file.suffix.lower() == ".png":
+                return {"encoding": "png", "data": file.read_bytes()}
+            depth = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise invalid(path, f"{file} ({error})", fix) from None
     if not isinstance(depth, np.ndarray):
         raise invalid(path, f"a {type(depth).__name__}", fix)
+    if depth.ndim == 3 and depth.shape[2] == 1:
+        depth = depth[..., 0]
     if depth.ndim != 2 or depth.dtype.name not in DEPTH_ENCODINGS:
         raise invalid(path, f"shape {depth.shape}, dtype {depth.dtype}", fix)
     little_endian = depth.dtype.newbyteorder("<")

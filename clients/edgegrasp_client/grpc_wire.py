@@ -169,6 +169,8 @@ def _set(message: Message, name: str, value: object, path: str) -> None:
 
 
 def _extend(container: Any, values: object, path: str, messages: bool) -> None:
+    if isinstance(values, np.ndarray):
+        values = values.tolist()
     if not isinstance(values, Sequence) or isinstance(values, str):
         raise invalid(path, repr(values)[:80], "Give a list.")
     if messages:
@@ -178,11 +180,13 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
     try:
         container.extend(values)
     except (TypeError, ValueError) as error:
-        raise invalid(path, repr(values)[:80], f"{error}.") from None
+        nested = any(isinstance(value, Sequence) for value in values)
+        fix = "Give one list without lists in it, or an array of bool." if nested else f"{error}."
+        raise invalid(path, repr(values)[:80], fix) from None
 
 
 def _known(message: Message) -> str:
-    internal = ("disabled", "ransac")  # JSON writes these in another way
+    internal = ("disabled", "ransac", "auto")  # JSON writes these in another way
     return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
@@ -222,13 +226,16 @@ def _shape(message: Message, value: Any, path: str) -> Filled:
 
 
 def _support(message: Any, value: Any, path: str) -> Filled:
+    if value is None or value == "none":
+        return message, {"disabled": True}
+    value = {"kind": value} if isinstance(value, str) else value
     if not isinstance(value, Mapping):
         raise invalid(path, repr(value)[:80], "Give a mapping with normal and offset.")
     kind = value.get("kind", "plane")
-    if kind == "ransac":
-        return message.ransac, _without_kind(value)
-    if kind != "plane" or "ransac" in value:
-        raise invalid(path, repr(kind)[:80], "Set its kind to one of plane, ransac.")
+    if kind in ("auto", "ransac"):
+        return getattr(message, kind), _without_kind(value)
+    if kind != "plane" or {"auto", "ransac"} & value.keys():
+        raise invalid(path, repr(kind)[:80], "Set its kind to one of auto, plane, ransac, none.")
     return message, _without_kind(value)
 
 

@@ -65,7 +65,7 @@ class RansacPlane(TypedDict):
     """Look for the plane in the cloud: the largest of those near the level."""
 
     kind: Literal["ransac"]
-    # metres from the plane within which points belong to it
+    # metres from the plane within which points belong to it at least
     distance: NotRequired[float]
     # radians between its normal and up; a quarter turn: any plane
     max_tilt: NotRequired[float]
@@ -73,8 +73,14 @@ class RansacPlane(TypedDict):
     min_share: NotRequired[float]
 
 
+class AutoPlane(TypedDict):
+    """Look for the plane that things stand on, and that faces the viewpoint."""
+
+    kind: Literal["auto"]
+
+
 class Workspace(TypedDict):
-    """An axis-aligned box in the cloud's frame; points outside are dropped first."""
+    """An axis-aligned box in the cloud's frame, where grasps may be."""
 
     # lower corner, metres
     min: Vector
@@ -114,7 +120,7 @@ class Mask(TypedDict):
     """Points by one truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"]
-    # as many values as the cloud has rows
+    # as many values as the cloud has rows; in JSON also base64 of a byte for each
     mask: Sequence[bool] | NDArray[Any]
 
 
@@ -217,8 +223,8 @@ class DetectOptions(TypedDict, total=False):
     model: str
     # name of a gripper, or a gripper; None: the one the weights were trained for
     gripper: str | GripperGeometry | None
-    # approach points sampled
-    num_approach_points: int
+    # approach points sampled, spread over the objects; None: as many as their surface needs
+    num_approach_points: int | None
     # candidates scored at most
     num_candidates: int
     # how approach points are sampled
@@ -228,11 +234,16 @@ class DetectOptions(TypedDict, total=False):
     # camera position, metres; orients the normals. Several positions: `view_ids` beside the cloud
     # says which one saw each point
     viewpoint: Vector | Sequence[Vector] | None
-    # direction away from gravity; any length but zero
-    up: Vector
-    # plane the objects rest on; no part of the hand goes below it
-    support: SupportPlane | RansacPlane | None
-    # points outside are dropped
+    # direction away from gravity; any length but zero; None: the support plane's normal, else +z
+    up: Vector | None
+    # plane the objects rest on; no part of the hand goes below it; a bare kind will do; None: none
+    support: Literal["auto", "ransac", "none"] | SupportPlane | RansacPlane | AutoPlane | None
+    # whether grasps are for the things that stand on the support plane only, or for everything; all
+    # the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none
+    objects: Literal["auto", "off"]
+    # longest side of a thing, metres
+    max_object_size: float
+    # where grasps may be; points outside stay as obstacles; None: everywhere
     workspace: Workspace | None
     # where approach points may lie; None: everywhere
     approach_region: Region | None
@@ -248,8 +259,9 @@ class DetectOptions(TypedDict, total=False):
     top_k: int
     # non-maximum suppression; None: none
     suppression: Suppression | None
-    # what comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    # others by score; or the clearance
+    # what comes first: the score (before others, the best grasp of each object that has one of 0.5
+    # and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    # the clearance
     order: Literal["score", "highest", "clearance"]
     # whether to return the processed cloud and every candidate
     debug: bool

@@ -104,7 +104,9 @@ class ScoreRequest(Request):
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as JSON has them: lists instead of arrays, and those left out that are None.
 
-    `suppression` alone has a None of its own: no suppression.
+    Masks stay arrays, which each transport packs: (N,) bool.
+
+    `suppression` and `support` alone have a None of their own: none.
 
     Raises:
         InvalidRequestError: An option has no such name.
@@ -117,7 +119,7 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: _plain(value)
         for name, value in options.items()
-        if value is not None or name == "suppression"
+        if value is not None or name in ("suppression", "support")
     }
 
 
@@ -136,6 +138,8 @@ async def async_enumerate(
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype == bool:
+        return value.ravel()
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):

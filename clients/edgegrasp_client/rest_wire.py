@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import httpx
+import numpy as np
 
 from edgegrasp_client.clouds import (
     cloud_file,
@@ -131,6 +132,8 @@ def _text(name: str, value: object) -> str:
 
 
 def _base64(value: object) -> str:
+    if isinstance(value, np.ndarray):  # a mask
+        value = value.tobytes()
     if isinstance(value, bytes):
         return base64.b64encode(value).decode("ascii")
     raise TypeError(f"a {type(value).__name__} is no JSON value")

@@ -1,8 +1,8 @@
 """What a server answers, as typed values, and how they are read from either transport."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,29 @@ class Grasp:
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
     collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
+    object: int | None = None  # number of the object that the contact is on; None: of none
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSupport:
+    """The plane that things stand on: the points x with normal . x = offset; cloud frame."""
+
+    normal: Float32  # (3,) unit, away from the table
+    offset: float  # metres
+    residual: float | None  # metres, median distance of its points; None: none of it is seen
+    share: float  # of the seen surface that lies in it
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedObject:
+    """A thing that grasps are for; cloud frame, metres."""
+
+    number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
+    points: int  # voxels of the processed cloud that are seen of it
+    center: Float32  # (3,) of the smallest upright box around them
+    half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
+    quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
+    best_score: float | None  # of the grasps returned; None: there is none on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +74,9 @@ class Detection:
     seconds: dict[str, float]  # spent in each stage, and their `total`
     model: str  # name of the weights used
     warnings: list[str]
+    up: Float32  # (3,) unit, away from gravity, as it was used
+    support: FoundSupport | None = None  # given or found
+    objects: list[DetectedObject] = field(default_factory=list)  # the largest first
     debug: DebugInfo | None = None  # where `debug` is asked for
 
 
@@ -105,15 +131,28 @@ class StreamAnswer:
         return self.detection
 
 
+# The stages of the server, as it goes through them: gRPC carries counts and seconds in no order.
+_STAGES = (
+    *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
+    *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
+    *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
+    *("suppressed", "returned", "description", "network", "ranking", "total"),
+)
+
+
+Record = TypeVar("Record", Model, FoundSupport, DetectedObject)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
 
 def detection_from(answer: Any, read: Read) -> Detection:
     """The answer to a request for grasps."""
-    debug = read(answer, "debug")
+    debug, support = read(answer, "debug"), read(answer, "support")
     return Detection(
         grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
+        up=_array(read(answer, "up")),
+        support=None if support is None else _record(FoundSupport, support, read),
+        objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
         debug=None if debug is None else _debug(debug, read),
         **_common(answer, read),
     )
@@ -129,18 +168,34 @@ def scoring_from(answer: Any, read: Read) -> Scoring:
 
 def models_from(answer: Any, read: Read) -> list[Model]:
     """The answer to a listing."""
-    names = [field.name for field in fields(Model)]
-    models = read(answer, "models")
-    return [Model(**{name: read(model, name) for name in names}) for model in models]
+    return [_record(Model, model, read) for model in read(answer, "models")]
+
+
+def _record(kind: type[Record], answer: Any, read: Read) -> Record:
+    """An object whose fields are read as they are, lists of numbers as arrays."""
+    plain = (str, int, float, type(None))
+    values: dict[str, Any] = {one.name: read(answer, one.name) for one in fields(kind)}
+    for name, value in values.items():
+        values[name] = value if isinstance(value, plain) else _array(value)
+    return kind(**values)
+
+
+def _array(numbers: Any) -> Float32:
+    return np.array(numbers, dtype=np.float32)
 
 
 def _common(answer: Any, read: Read) -> dict[str, Any]:
     return {
-        "counts": dict(read(answer, "counts")),
-        "seconds": dict(read(answer, "seconds")),
+        "counts": _in_order(read(answer, "counts")),
+        "seconds": _in_order(read(answer, "seconds")),
         "model": read(answer, "model"),
         "warnings": list(read(answer, "warnings")),
     }
+
+
+def _in_order(stages: Mapping[str, Any]) -> dict[str, Any]:
+    """By stage; stages of a newer server come last."""
+    return {name: stages[name] for name in (*_STAGES, *sorted(stages)) if name in stages}
 
 
 def _evaluation(answer: Any, read: Read) -> Evaluation:
@@ -162,6 +217,7 @@ def _grasp(answer: Any, read: Read) -> Grasp:
         approach_direction=floats("approach_direction", 3),
         collision_free=read(answer, "collision_free"),
         clearance=read(answer, "clearance"),
+        object=read(answer, "object"),
     )
 
 

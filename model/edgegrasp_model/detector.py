@@ -313,7 +313,7 @@ class GraspDetector:
         radius = self.metadata.network.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
             radius = max(radius, gripper.max_opening / 2)
-        prepared = Prepared(options, gripper, radius)
+        prepared = Prepared(options, gripper, radius, warnings=list(sent.warnings))
         if gripper.name != self.gripper.name:
             prepared.warnings.append(
                 f"the weights were trained for the gripper {self.gripper.name!r}: for "

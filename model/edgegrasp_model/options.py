@@ -4,6 +4,7 @@ The gRPC message, the client's types, the command line's flags and the table in 
 are made from these models (`make proto`).
 """
 
+import base64
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
@@ -17,6 +18,7 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    PlainSerializer,
     StrictBool,
     Tag,
     ValidationError,
@@ -151,12 +153,38 @@ class Indices(Strict):
     )
 
 
+def _byte_for_each(value: object) -> bytes:
+    """Truth values, however they are sent, as one byte for each: 0 or 1."""
+    if isinstance(value, (list, tuple)):
+        # As objects: an array of text would give every element the room of the longest.
+        values: list[Any] = np.array(value, dtype=object).ravel().tolist()
+        if set(map(type, values)) <= {bool}:
+            return bytes(values)
+    elif isinstance(value, np.ndarray) and value.dtype == bool:
+        return value.tobytes()
+    elif isinstance(value, (str, bytes)):
+        sent = base64.b64decode(value, validate=True) if isinstance(value, str) else value
+        return np.frombuffer(sent, np.uint8).astype(bool).tobytes()
+    raise ValueError("must be true and false, one for each row, or base64 of a byte for each")
+
+
 class Mask(Strict):
     """Points by one truth value for each row of the cloud as it was sent."""
 
     kind: Literal["mask"] = "mask"
-    mask: tuple[StrictBool, ...] = Field(
-        max_length=MAX_ROWS, description="as many values as the cloud has rows"
+    mask: Annotated[
+        bytes,
+        Field(max_length=MAX_ROWS),
+        PlainSerializer(lambda mask: list(map(bool, mask)), list[bool]),
+        BeforeValidator(
+            _byte_for_each,
+            json_schema_input_type=Annotated[
+                str, Field(json_schema_extra={"contentEncoding": "base64"})
+            ]
+            | Annotated[list[bool], Field(max_length=MAX_ROWS)],
+        ),
+    ] = Field(
+        description="as many values as the cloud has rows; in JSON also base64 of a byte for each"
     )
 
 
@@ -443,6 +471,15 @@ def _gripper_form(value: object) -> str:
     return "name" if isinstance(value, str) else "inline"
 
 
+SupportKind = Literal["auto", "ransac", "none"]
+SupportRequest = Annotated[
+    Annotated[SupportPlane, Tag("plane")]
+    | Annotated[RansacPlane, Tag("ransac")]
+    | Annotated[AutoPlane, Tag("auto")],
+    Discriminator(_support_kind),
+]
+
+
 class DetectOptions(Strict):
     """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
@@ -492,14 +529,10 @@ class DetectOptions(Strict):
         "normal, else +z",
     )
     support: Annotated[
-        Annotated[
-            Annotated[SupportPlane, Tag("plane")]
-            | Annotated[RansacPlane, Tag("ransac")]
-            | Annotated[AutoPlane, Tag("auto")],
-            Discriminator(_support_kind),
-        ]
-        | None,
-        BeforeValidator(_kind_as_object),
+        SupportRequest | None,
+        BeforeValidator(
+            _kind_as_object, json_schema_input_type=SupportKind | SupportRequest | None
+        ),
     ] = Field(
         default=AutoPlane(),
         description="plane the objects rest on; no part of the hand goes below it; a bare kind "
@@ -540,8 +573,9 @@ class DetectOptions(Strict):
     )
     order: Literal["score", "highest", "clearance"] = Field(
         default="score",
-        description="what comes first: the score; the highest TCP along up among scores of 0.9 "
-        "and more, then the others by score; or the clearance",
+        description="what comes first: the score (before others, the best grasp of each object "
+        "that has one of 0.5 and more); the highest TCP along up among scores of 0.9 and more, "
+        "then the others by score; or the clearance",
     )
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"

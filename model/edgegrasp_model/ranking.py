@@ -38,7 +38,7 @@ def select(
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    The best good grasp of each object is among them before a second one of any.
+    By score, the best good grasp of each object comes before a second one of any.
 
     Args:
         scene: The scene.
@@ -62,13 +62,12 @@ def select(
     outcome[order[~good]] = CODE[Outcome.LOW_SCORE]
     order, dropped = order[good], order[:0]
     counts["above_min_score"] = len(order)
-    place = np.empty(len(score), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    order = objects_first(order, score, scene.object_of_point[sample.candidates.contact_index])
+    if options.order == "score":
+        number = scene.object_of_point[sample.candidates.contact_index]
+        order = objects_first(order, score, number)
     if options.suppression is not None:
         order, dropped = non_max_suppression(T_cloud_tcp, order, options.suppression, options.top_k)
     order = order[: options.top_k]
-    order = order[np.argsort(place[order])]
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
     return order, outcome

@@ -15,6 +15,7 @@ from edgegrasp_model.networks.config import (
     NetworkConfig,
 )
 from edgegrasp_model.networks.edgegrasp import EdgeGraspNet
+from edgegrasp_model.networks.hand import HandNet
 from edgegrasp_model.networks.vn_edgegrasp import VNEdgeGraspNet
 
 CROP_RADIUS = 0.04  # metres; half the gripper's opening, as in the paper
@@ -50,6 +51,42 @@ def prepare_to_train(network: nn.Module) -> None:
             for module in network.modules():
                 if isinstance(module, nn.Linear):
                     module.weight.mul_(GAIN)
+
+
+def start_from(network: nn.Module, start: nn.Module) -> int:
+    """Give a network the weights of a trained one; a hand network may describe hands further.
+
+    What the trained one was not told counts for nothing at first: both score alike.
+
+    Args:
+        network: To train; gets the weights.
+        start: Takes lengths in metres.
+
+    Returns:
+        How many numbers of the hand description `start` reads; 0 for networks of balls.
+
+    Raises:
+        ValueError: The networks differ in more than that.
+    """
+    weights, known = in_units(start).state_dict(), 0
+    if isinstance(network, HandNet) and isinstance(start, HandNet):
+        known = start.config.description_size
+        further = network.config.description_size - known
+        for name in ("mean", "std"):
+            weights[name] = torch.cat((weights[name], network.get_buffer(name)[known:].cpu()))
+        first = weights["classifier.0.weight"]
+        nothing = first.new_zeros(len(first), max(further, 0))
+        weights["classifier.0.weight"] = torch.cat(
+            (first[:, :known], nothing, first[:, known:]), dim=1
+        )
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise ValueError(
+            f"start_from: the layers are not those of the network to train ({error}). "
+            "Give weights of the same model."
+        ) from error
+    return known
 
 
 def in_metres(network: nn.Module) -> nn.Module:

@@ -33,7 +33,7 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
-from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train
+from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train, start_from
 from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import load_view
 
@@ -63,6 +63,7 @@ class TrainingOptions:
     rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
     schedule: Schedule = "plateau"  # of the learning rate
     mixed_precision: bool = False  # matrix products in bfloat16, for a GPU
+    keep: float = 0.0  # share of the weights started from in the result
     seed: int = 0
 
 
@@ -78,6 +79,7 @@ class Trainer:
         options: TrainingOptions,
         device: torch.device | str = "cpu",
         teacher: Teacher | None = None,
+        start: Path | None = None,
     ) -> None:
         """Set up, and resume from the folder's last state if there is one.
 
@@ -89,9 +91,11 @@ class Trainer:
             options: The recipe.
             device: Where the network runs.
             teacher: Scores further candidates to learn from.
+            start: Weights to start from; None: random ones.
 
         Raises:
-            ValueError: The network is one of hands, which no teacher can teach.
+            InvalidCheckpoint: The weights to start from cannot be read.
+            ValueError: They do not fit, or the network is one of hands, which no teacher can teach.
         """
         if teacher is not None and metadata.network.architecture == "hand":
             raise ValueError(f"teacher: {metadata.name} learns from labels alone. Name none.")
@@ -105,6 +109,12 @@ class Trainer:
         generator = torch.Generator().manual_seed(options.seed)
         self.network = build_network(metadata.network, generator).to(device)
         prepare_to_train(self.network)
+        self.start = start
+        self.started_from: CheckpointMetadata | None = None
+        known = 0
+        if start is not None:
+            trained, self.started_from = load_checkpoint(start)
+            known = start_from(self.network, trained)
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
@@ -115,7 +125,7 @@ class Trainer:
         if (folder / STATE_FILE).is_file():
             self._resume()
         else:
-            self._standardise()
+            self._standardise(known)
 
     @property
     def finished(self) -> bool:
@@ -167,6 +177,8 @@ class Trainer:
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
         self.average.load_state_dict(in_units(best).state_dict())
+        if self.start is not None and self.options.keep > 0.0:
+            self._mix_in(self.start)
         evaluation = self.evaluate()
         training = provenance | {
             "training_views": len(self.train_paths),
@@ -180,11 +192,27 @@ class Trainer:
         if self.teacher is not None:
             taught = self.teacher.metadata
             training |= {"teacher": taught.name, "teacher_digest": taught.digest}
+        if self.started_from is not None:
+            started = self.started_from
+            training |= {"started_from": started.name, "started_from_digest": started.digest}
+            training |= {"kept_of_it": self.options.keep}
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         self._save_average(metadata)
         card = self.folder / f"{self.metadata.name}.md"
         write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
         return evaluation
+
+    def _mix_in(self, start: Path) -> None:
+        """Move the result toward the weights it started from, so that less is forgotten.
+
+        The mean of both keeps most of what either can do (Wortsman et al., Robust fine-tuning of
+        zero-shot models, CVPR 2022).
+        """
+        first = deepcopy(self.average)
+        start_from(first, load_checkpoint(start, self.device)[0])
+        with torch.no_grad():
+            for new, old in zip(self.average.parameters(), first.parameters(), strict=True):
+                new.lerp_(old, self.options.keep)
 
     def _train_step(self) -> float:
         self.network.train()
@@ -265,13 +293,15 @@ class Trainer:
         network = self.metadata.network
         return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
 
-    def _standardise(self) -> None:
-        """Fit the mean and spread of the hand descriptions to the training views."""
+    def _standardise(self, known: int) -> None:
+        """Fit mean and spread of the hand descriptions to the training views, but the first few."""
         if not isinstance(self.network, HandNet):
             return
         seen = [self._tried(path, True).seen for path in self.train_paths]
         values = np.concatenate([hands.description for hands in seen if hands is not None])
         mean, std = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
+        # Weights that were trained with other statistics keep them.
+        mean[:known], std[:known] = self.network.mean[:known].cpu(), self.network.std[:known].cpu()
         self.network.set_statistics(torch.from_numpy(mean), torch.from_numpy(std))
         self.average.load_state_dict(self.network.state_dict())
 

@@ -79,9 +79,11 @@ class LabelledView:
 
     def cut_off(self) -> NDArray[np.bool_]:
         """Which points (N,) lie where a side of the workspace cuts things off."""
-        if self.at_side is None:
-            return near_workspace_side(self.points, WORKSPACE, UP, self.points)
-        return self.at_side
+        if self.at_side is not None:
+            return self.at_side
+        if len(self.points) == 0:
+            return np.zeros(0, dtype=bool)
+        return near_workspace_side(self.points, WORKSPACE, UP, self.points)
 
     def tried(self) -> NDArray[np.int64]:
         """Rows of the candidates that have a label."""

@@ -92,17 +92,7 @@ def current_call() -> Call:
 MAX_WAITING = 4096  # records; more than that, and new ones are dropped
 STOP_SECONDS = 1.0
 PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
-
-LOGGED = [
-    "request_id",
-    "transport",
-    "method",
-    "code",
-    "peer",
-    "token",
-    "bytes_in",
-    "bytes_out",
-]  # of a Call
+LOGGED = ("request_id", "transport", "method", "code", "peer", "token", "bytes_in", "bytes_out")
 
 requests = logging.getLogger("edgegrasp_service.requests")
 

@@ -46,8 +46,6 @@ class Settings(BaseModel):
     )
     max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
     max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
-    max_approach_points: Count = Field(256, le=256, description="most that a request may ask for")
-    max_candidates: Count = Field(16_000, le=16_000, description="most that a request may ask for")
     workers: int = Field(0, ge=0, le=1024, description="processes that detect; 0: one a core")
     max_worker_bytes: int = Field(
         3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may take for its request"

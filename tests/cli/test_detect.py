@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trustme
+from PIL import Image
 
 from edgegrasp_cli.flags import option_flags
 from edgegrasp_model.options import DetectOptions
@@ -78,6 +79,46 @@ def test_table(file: str, dummy_server, run) -> None:
     assert "Warning: The dummy detector made these grasps up." in output
 
 
+@pytest.fixture
+def camera_files(tmp_path: Path) -> list[str]:
+    """Flags of a depth image, 0.6 m everywhere, of its colours and of a mask."""
+    depth, mask = np.full((24, 32), 6000, np.uint16), np.zeros((24, 32), np.uint8)
+    mask[4:12, 16:30] = 255
+    for name, pixels in (("depth", depth), ("mask", mask), ("color", mask[..., None].repeat(4, 2))):
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    flags = [f"--{name}={tmp_path / name}.png" for name in ("depth", "mask", "color")]
+    return [*flags, "--intrinsics", "300,300,15.5,11.5", "--depth-scale", "0.0001"]
+
+
+def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, run) -> None:
+    flags = (*camera_files, "--json", "--num-approach-points", "4", "--debug", "--seed", "3")
+    document = json.loads(run("detect", *flags))
+    assert document["counts"]["points"] == 24 * 32
+    assert document["counts"]["in_approach_region"] < document["counts"]["kept"]
+    debug = document["debug"]
+    for name in ("approach_index", "contact_index"):
+        x, y, z = np.asarray(debug["points"])[debug[name]].T
+        assert np.allclose(z, 0.6, atol=1e-3)
+        column, row = 300 * x / z + 15.5, 300 * y / z + 11.5
+        assert ((column > 14) & (column < 31) & (row > 2) & (row < 13)).all()
+    for address in (dummy_server.grpc_address, dummy_server.http_url):
+        assert json.loads(run("detect", *flags, "--server", address))["counts"]["points"] == 768
+
+
+def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
+    depth, mask, *_ = camera_files
+    for flags, sentence in (
+        ((depth,), "--intrinsics: got nothing. Give fx,fy,cx,cy"),
+        ((), "give a cloud file, or --depth and --intrinsics"),
+        ((file, *camera_files), "give a cloud file, or --depth and --intrinsics"),
+        ((depth, "--intrinsics", "300,300,640,360"), "cx: got 640, outside of an image of 32 x 24"),
+        ((depth, "--intrinsics", "300"), "depth_images.0.intrinsics: got 300"),
+        ((depth.removeprefix("--depth="),), "a depth image as `depth` with `intrinsics`"),
+        ((file, mask), "768 values for a cloud of 500 rows"),
+    ):
+        assert sentence in refused("detect", *flags)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -95,7 +136,7 @@ def test_bad_options(options: list[str], sentence: str, file: str, dummy_server,
     ("name", "content", "flags", "sentence"),
     [
         ("absent.npy", None, (), "No such file"),
-        ("cloud.las", b"0 0 0", (), "Send one of: npy, npz, ply, pcd, xyz."),
+        ("cloud.las", b"0 0 0", (), "Send one of: npy, npz, ply, pcd, xyz; a depth image as"),
         ("cloud.npy", b"foreign", (), "cloud: got 7 bytes that are no whole .npy file"),
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],

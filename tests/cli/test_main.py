@@ -76,12 +76,12 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
         response = grasp_pb2.DetectGraspsResponse(model=model, seconds={"total": seconds})
         return response.SerializeToString()
 
-    def replay(path: Path, settings: object) -> SimpleNamespace:
+    def replay(path: Path, settings: object) -> tuple[SimpleNamespace, ...]:
         answer = SimpleNamespace(
             body=body(path.stem, 2.0), error=None, facts=SimpleNamespace(grasps=7)
         )
         job = SimpleNamespace(transport=transport, method="DetectGrasps")
-        return SimpleNamespace(job=job, recorded=body("plus", 1.0), answer=answer)
+        return job, SimpleNamespace(body=body("plus", 1.0)), answer
 
     recording = ModuleType("edgegrasp_service.recording")
     recording.replay = replay  # type: ignore[attr-defined]

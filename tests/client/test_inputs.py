@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from edgegrasp_client import InvalidRequestError
 from edgegrasp_client.results import Detection
@@ -75,9 +76,24 @@ def test_depth_images(client) -> None:
     assert one.counts["points"] == 600
     millimetres = np.round(depth_image()["depth"] * 1000).astype(np.uint16)
     assert client.detect(depth_images=[depth_image(depth=millimetres)]).grasps
+    nested = [[60.0, 0, 14.5], [0, 60.0, 9.5], [0, 0, 1]]
+    for camera in ((60.0, 60.0, 14.5, 9.5), np.array(nested), np.ravel(nested)):
+        found = client.detect(depth_images=[{"depth": millimetres, "intrinsics": camera}])
+        assert contacts(found) == contacts(client.detect(depth_images=[depth_image(
+            depth=millimetres)]))  # fmt: skip
     views = [depth_image(), depth_image(T_cloud_camera=np.eye(4).tolist())]
     ids = np.arange(1200)
     assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
+
+
+def test_files_of_depths(client, tmp_path) -> None:
+    tenths = np.round(depth_image()["depth"] * 10000).astype(np.uint16)
+    Image.fromarray(tenths).save(tmp_path / "depth.png")
+    np.save(tmp_path / "depth.npy", tenths[..., None])
+    expected = contacts(client.detect(depth_images=[depth_image(depth=tenths / 10000)]))
+    for file in (str(tmp_path / "depth.png"), tmp_path / "depth.npy"):
+        image = depth_image(depth=file, depth_scale=0.0001)
+        np.testing.assert_allclose(contacts(client.detect(depth_images=[image])), expected)
 
 
 def test_edges_are_scored_in_their_order(either_client, cloud) -> None:
@@ -126,7 +142,7 @@ def test_debug(client, cloud) -> None:
 
 
 def test_options_too_long_for_an_address(client, cloud) -> None:
-    mask = np.ones(500, bool)
+    mask = np.ones((20, 25), bool)
     indices = np.arange(499)
     options: dict[str, Any] = {
         "approach_region": {"include": [{"kind": "mask", "mask": mask}]},

@@ -13,6 +13,10 @@ IMAGE = {"depth": np.full((4, 4), 0.3, np.float32), "intrinsics": CAMERA}
 NEGATIVE = {"contact_region": {"include": [{"kind": "indices", "indices": [0, -1]}]}}
 
 
+def mask(values: Any) -> dict[str, Any]:
+    return {"contact_region": {"include": [{"kind": "mask", "mask": values}]}}
+
+
 def image(**changes: Any) -> dict[str, Any]:
     return {"depth_images": [IMAGE | {"T_cloud_camera": np.eye(4)} | changes]}
 
@@ -32,6 +36,8 @@ def image(**changes: Any) -> dict[str, Any]:
         ({"support": {"kind": "cylinder"}}, "options.support"),
         ({"approach_region": {"include": [{"kind": "cube"}]}}, "options.approach_region.include.0"),
         ({"approach_region": [{"kind": "mask", "mask": [True]}]}, "options.approach_region"),
+        (mask(np.ones((3, 4), np.uint8)), "options.contact_region.include.0.mask"),
+        (mask([[True], [False, True]]), "options.contact_region.include.0.mask"),
         (NEGATIVE, "options.contact_region.include.0.indices.1"),
         ({"approach_direction": {"preset": "up"}}, "options.approach_direction.preset"),
         ({"collision": "dodge"}, "options.collision"),
@@ -69,7 +75,16 @@ def test_options(options: dict[str, Any], field: str, client, cloud) -> None:
         (image(depth=[[1.0]]), "depth_images.0.depth", ""),
         (image(depth=np.zeros((3, 4), int)), "depth_images.0.depth", ""),
         (image(depth=np.zeros(4)), "depth_images.0.depth", ""),
+        ({"cloud": "depth.png"}, "cloud", "'depth.png'"),
+        ({"cloud": np.zeros((48, 64, 1), np.float32)}, "cloud", "shape (48, 64, 1)"),
+        ({"cloud": np.zeros((48, 64), np.uint16)}, "cloud", "shape (48, 64)"),
+        (image(depth="absent.png"), "depth_images.0.depth", "absent.png"),
+        (image(depth="depth.tif"), "depth_images.0.depth", "depth.tif"),
         (image(intrinsics={"fx": 1.0}), "depth_images.0.intrinsics", ""),
+        (image(intrinsics=(60.0, 60.0, 2.0)), "depth_images.0.intrinsics", "(60.0, 60.0, 2.0)"),
+        (image(intrinsics=np.diag([60.0, 60.0, 2.0])), "depth_images.0.intrinsics", "array"),
+        (image(intrinsics=(60.0, 60.0, 4.0, 2.0)), "depth_images.0.intrinsics.cx", "4, outside"),
+        (image(depth_scale=1000.0), "depth_images.0.depth_scale", "1000"),
         (image(T_cloud_camera=1), "depth_images.0.T_cloud_camera", ""),
         (image(depth=np.full((30, 30), 0.3)) | {"view_ids": np.arange(900)}, "view_ids", ""),
         ({"cloud": SOME, "normals": np.zeros((40, 2))}, "normals", ""),

@@ -1,5 +1,6 @@
 """Whatever comes in, a decoder gives arrays or a 4xx, within memory that the bytes explain."""
 
+import io
 import json
 from functools import partial
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from benchmarks.dummy import DummyCatalogue
 from hypothesis import strategies as st
+from PIL import Image
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
@@ -56,6 +58,17 @@ def decode(size: int, **fields: Any) -> None:
 def test_files(file_format: str, data: st.DataObject) -> None:
     content = data.draw(files(file_format))
     decode(len(content), cloud=File(file_format, content))
+
+
+PNG = io.BytesIO()
+Image.fromarray(np.arange(400, 800, dtype=np.uint16).reshape(20, 20)).save(PNG, "png")
+
+
+@given(mutated([PNG.getvalue()]))
+def test_images(content: bytes) -> None:
+    depth = File("png", content)
+    decode(len(content), depth_images=[{"depth": depth, "intrinsics": [30.0, 30.0, 9.5, 9.5]}])
+    decode(len(content), points=POINTS.tobytes(), colors=depth)
 
 
 @given(LISTS, st.sampled_from(sorted(PER_POINT)))

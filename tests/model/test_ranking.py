@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import Suppression
-from edgegrasp_model.ranking import non_max_suppression, rotation_distance
+from edgegrasp_model.ranking import non_max_suppression, objects_first, rotation_distance
 
 from .scenes import SEED
 
@@ -31,3 +31,10 @@ def test_near_duplicates_fall_to_the_better_one() -> None:
     none = Suppression(translation=0.0, rotation=0.0)
     kept, dropped = non_max_suppression(T_cloud_tcp, order, none, 10)
     assert (kept.tolist(), dropped.tolist()) == ([1, 0, 2, 3], [])
+
+
+def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
+    score = np.array([0.9, 0.8, 0.7, 0.6, 0.4, 0.3])
+    number = np.array([2, 2, 1, 2, 3, 1])
+    order = objects_first(np.arange(6), score, number)
+    assert order.tolist() == [0, 2, 1, 3, 4, 5]  # what is on 3 is not good

@@ -1,7 +1,10 @@
+import base64
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
@@ -54,7 +57,7 @@ def test_rows_hold_a_voxel_by_half_of_its_points_however_they_are_named(seed: in
     chosen = np.random.default_rng(seed).random(40) < 0.5
     cloud = rows(seed=seed, segment_ids=np.where(chosen, 7, -2))
     regions = [
-        Region(include=(Mask(mask=tuple(chosen.tolist())),)),
+        Region(include=(Mask(mask=chosen),)),
         Region(include=(Indices(indices=tuple(np.flatnonzero(chosen).tolist())),)),
         Region(include=(Segments(ids=(7,)),)),
     ]
@@ -77,6 +80,17 @@ def test_a_region_is_what_is_included_and_not_excluded() -> None:
         (Region(), np.ones_like(in_low)),
     ):
         np.testing.assert_array_equal(inside(region, cloud)[0], expected)
+
+
+def test_masks_in_every_form() -> None:
+    chosen = np.random.default_rng(0).random((4, 6)) < 0.5
+    packed = base64.b64encode(chosen * np.uint8(255)).decode()
+    flat = tuple(chosen.ravel().tolist())
+    masks = [Mask(mask=form) for form in (chosen, chosen.tolist(), flat, packed, chosen.tobytes())]
+    assert all(mask == masks[0] for mask in masks)
+    for wrong in ([0, 1], [[True], [True, False]], ["x" * 9], "no base64", None, chosen * 1.0):
+        with pytest.raises(ValidationError):
+            Mask(mask=wrong)
 
 
 def test_rows_are_those_of_the_cloud_as_sent_when_points_were_dropped() -> None:

@@ -68,13 +68,15 @@ def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> N
     turn, shift = Rotation.random(rng=rng), rng.uniform(-0.5, 0.5, 3)
     moved = (turn.apply(cloud.reshape(-1, 3).astype(np.float64)) + shift).reshape(cloud.shape)
     here, there = detect(cloud), detect(moved, viewpoint=shift.tolist())
-    assert here.support is not None and there.support is not None
+    assert here.support is not None
+    assert there.support is not None
     assert there.support.normal @ turn.apply(here.support.normal) > 1 - 1e-5
     np.testing.assert_allclose(there.up, turn.apply(here.up), atol=1e-3)
     assert len(there.objects) == len(here.objects)
     for one, other in zip(here.objects, there.objects, strict=True):
         np.testing.assert_allclose(turn.apply(one.center) + shift, other.center, atol=0.004)
-    assert here.grasps and there.grasps
+    assert here.grasps
+    assert there.grasps
     best = here.grasps[0]
     contact = turn.apply(best.contact_point) + shift
     apart = [np.linalg.norm(grasp.contact_point - contact) for grasp in there.grasps]
@@ -111,7 +113,8 @@ def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
         CloudInput(in_world.astype(np.float32)[np.isfinite(in_world).all(axis=1)]),
         DetectOptions.model_validate(asked),
     )
-    assert found.grasps and found.debug is not None
+    assert found.grasps
+    assert found.debug is not None
     assert all(grasp.contact_point[0] < 0.051 for grasp in found.grasps)
     assert found.debug.points[:, 0].max() > 0.1  # the other box is still an obstacle
     assert len(found.objects) == 1
@@ -149,3 +152,28 @@ def test_an_empty_table_is_a_support_with_nothing_on_it() -> None:
     found = detect(render([table()], camera(0.6, -1.5, 0.7)))
     assert found.support is not None
     assert (found.grasps, found.objects) == ([], [])
+
+
+def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> None:
+    rng = np.random.default_rng(4)
+    contents = [
+        box((*rng.uniform([-0.1, -0.07], [0.1, 0.07]), 0.03), (0.02, 0.045, 0.025), yaw)
+        for yaw in rng.uniform(0, 3, 4)
+    ]
+    T_world_camera = camera(0.3, -1.5, 0.7)
+    cloud = render([table(), *bin_walls(0.36, 0.28, 0.1), *contents], T_world_camera)
+    points = cloud.reshape(-1, 3)[np.isfinite(cloud).all(axis=2).reshape(-1)]
+    in_world = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    found = detector().detect(
+        in_world.astype(np.float32),
+        parse_options(
+            {
+                "viewpoint": T_world_camera[:3, 3].tolist(),
+                "support": {"normal": (0, 0, 1), "offset": 0.005},
+                "workspace": {"min": (-0.18, -0.14, 0.0), "max": (0.18, 0.14, 0.2)},
+            }
+        ),
+    )
+    assert found.grasps
+    for grasp in found.grasps:
+        assert min(one.distance(grasp.contact_point[None])[0] for one in contents) < 0.01

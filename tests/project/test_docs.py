@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import numpy as np
+
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_client import conversions
 from edgegrasp_service.settings import Settings
@@ -27,6 +29,21 @@ def test_variables_that_the_pages_name_exist() -> None:
     for page in (*DOCS.glob("*.md"), *beside):
         named = set(re.findall(r"\bEDGEGRASP_[A-Z_]+", page.read_text()))
         assert named <= {*known, "EDGEGRASP_CONFIG", TOKEN_VARIABLE, "EDGEGRASP_"}, page.name
+
+
+def test_the_requests_of_cameras_can_be_made(dummy_server) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "cameras.md").read_text(), flags=re.DOTALL)
+    depth = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
+    given = {"depth": depth, "intrinsics": (60.0, 60.0, 15.5, 11.5), "depth_scale": 0.001}
+    given |= {"mask": depth > 550, "points": depth[..., None] * np.full(3, 0.001)}
+    requests = [block for block in blocks if "GraspClient(" in block]
+    assert len(requests) >= 4
+    for block in blocks:
+        code = compile(block.replace("127.0.0.1:50051", dummy_server.grpc_address), block, "exec")
+        if block in requests:
+            names = {"T_base_camera": np.eye(4), **given}
+            exec(code, names)
+            assert names["detection"].grasps
 
 
 def test_the_example_of_conversions_names_what_there_is() -> None:

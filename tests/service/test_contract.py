@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+from PIL import Image
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
+from edgegrasp_client.clouds import npy_bytes
 from edgegrasp_service.front.http import DOCUMENT
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
@@ -39,6 +41,8 @@ def grasps_of(answer: Any) -> list[dict[str, Any]]:
         for name, value in fields.items():
             if name.startswith("T_"):
                 fields[name] = [list(value[row : row + 4]) for row in range(0, 16, 4)]
+            elif name == "object":
+                fields[name] = value if grasp.HasField(name) else None
             elif not isinstance(value, float | bool):
                 fields[name] = list(value)
         found.append(fields)
@@ -82,6 +86,39 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
     expected = grasps_of(answers[0])
     assert len(expected) == 7
     assert all(grasps_of(answer) == expected for answer in answers)
+
+
+def png_of(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "png")
+    return stream.getvalue()
+
+
+def test_a_form_of_camera_files(http) -> None:
+    depth = np.random.default_rng(0).integers(4000, 6000, (24, 32)).astype(np.uint16)
+    camera = [60.0, 50.0, 15.5, 11.5]
+    nested = [[60.0, 0, 15.5], [0, 50.0, 11.5], [0, 0, 1]]
+    image = {"depth": (depth / 10000).tolist(), "intrinsics": camera}
+    expected = http.post("/v1/grasps", json={"depth_images": [image]}).json()
+    labels = (depth > 5000).astype(np.uint8)
+    png = {"depth": ("depth.png", png_of(depth)), "segment_ids": ("labels.png", png_of(labels))}
+    npy = {"depth": ("depth.npy", npy_bytes(depth))}
+    for files, text in ((png, "60,50,15.5,11.5"), (npy, json.dumps(nested))):
+        parts = {"intrinsics": text, "depth_scale": "0.0001"}
+        answer = http.post("/v1/grasps", files=files, data=parts)
+        assert answer.status_code == 200, answer.text
+        np.testing.assert_allclose(
+            [grasp["contact_point"] for grasp in answer.json()["grasps"]],
+            [grasp["contact_point"] for grasp in expected["grasps"]],
+            atol=1e-6,
+        )
+    for parts, field in (
+        ({}, "depth_images.0.intrinsics"),
+        ({"intrinsics": "60,50"}, "depth_images.0.intrinsics"),
+        ({"intrinsics": "60,50,15.5,11.5", "depth_images": "[]"}, "depth_images"),
+    ):
+        problem = check(http.post("/v1/grasps", files=png, data=parts), "Problem")
+        assert problem["field"] == field
 
 
 def check(answer: httpx.Response, name: str) -> Any:

@@ -27,11 +27,13 @@ def distance_to_box(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.maximum(outside, 0.0), axis=1) + np.minimum(outside.max(axis=1), 0.0)
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 1.0, 4.0])
-def test_a_box_appears_where_it_is(world: World, azimuth: float) -> None:
-    eye = np.array([0.15 + 0.5 * np.cos(azimuth), 0.15 + 0.5 * np.sin(azimuth), 0.6])
+@pytest.mark.parametrize(("aside", "azimuth"), [(0.5, 0.0), (0.5, 1.0), (0.5, 4.0), (0.0, 0.0)])
+def test_a_box_appears_where_it_is(world: World, aside: float, azimuth: float) -> None:
+    target = np.array([0.15, 0.15, 0.1])
+    away = [aside * np.cos(azimuth), aside * np.sin(azimuth), 0.5]  # or straight above
+    eye = target + np.array(away)
     world.add_box(2 * HALF, CENTRE, friction=0.5)
-    T_world_camera = look_at(eye, np.array([0.15, 0.15, 0.1]))
+    T_world_camera = look_at(eye, target)
     points = points_of(world.render_depth(T_world_camera, CAMERA), T_world_camera, CAMERA)
     assert len(points) > 1000
     assert np.abs(distance_to_box(points)).max() < 1e-4

@@ -84,11 +84,14 @@ def make_trainer(views: list[Path]) -> MakeTrainer:
         name: str = "tiny",
         train: list[Path] | None = None,
         teacher: Teacher | None = None,
+        start: Path | None = None,
         **options: object,
     ) -> Trainer:
         metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
         own, validation = split_by_scene(views, 0.25, seed=0)
         chosen = replace(FAST, **options)
-        return Trainer(metadata, train or own, validation, folder, chosen, teacher=teacher)
+        return Trainer(
+            metadata, train or own, validation, folder, chosen, teacher=teacher, start=start
+        )
 
     return make

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,27 +9,29 @@ from edgegrasp_training.generation import GenerationOptions, generate, missing_s
 from edgegrasp_training.shapes import made_object
 from edgegrasp_training.views import find_views, load_view
 
-SMALL = GenerationOptions(scenes=2, views_per_scene=1, grasps_per_view=12, seed=5)
+SMALL = GenerationOptions(scenes=4, views_per_scene=1, grasps_per_view=8, seed=5)
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data")
     results = list(generate(folder, None, SMALL))
-    assert sorted(index for index, _, _ in results) == [0, 1]
+    assert sorted(index for index, _, _ in results) == [0, 1, 2, 3]
     assert sum(tried for _, tried, _ in results) > 0
     return folder
 
 
-def test_views_hold_tried_grasps_of_both_kinds_of_scene(data: Path) -> None:
+def test_views_hold_tried_grasps_of_every_kind_of_scene(data: Path) -> None:
     paths = find_views([data])
-    assert [path.name.split("_")[0] for path in paths] == ["packed", "pile"]
+    assert [path.name.split("_")[0] for path in paths] == ["bin", "packed", "pile", "table"]
     held = []
     for path in paths:
         view = load_view(path)
-        assert 0 < len(view.tried()) <= 12
+        assert 0 < len(view.tried()) <= 8
         assert view.T_world_hand is not None
         assert (view.T_world_hand[:, 2, 3] > 0.05).all()
+        assert view.support is not None
+        assert view.object_of_point.max() >= 0
         held += view.success.tolist()
     assert 0 < np.mean(held) < 1
 
@@ -38,15 +41,16 @@ def test_nothing_is_made_twice_and_a_lost_view_is_made_again_the_same(data: Path
     lost = find_views([data])[0]
     before = lost.read_bytes()
     lost.unlink()
-    assert missing_scenes(data, SMALL) == [0]
-    assert [index for index, _, _ in generate(data, None, SMALL)] == [0]
+    assert missing_scenes(data, SMALL) == [2]
+    assert [index for index, _, _ in generate(data, None, SMALL)] == [2]
     assert lost.read_bytes() == before
 
 
 def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
-    list(generate(tmp_path, None, SMALL, workers=2))
-    for path in find_views([data]):
-        again = load_view(tmp_path / path.name)
+    list(generate(tmp_path, None, replace(SMALL, scenes=2), workers=2))
+    assert len(find_views([tmp_path])) == 2
+    for path in find_views([tmp_path]):
+        again = load_view(data / path.name)
         np.testing.assert_array_equal(again.success, load_view(path).success)
         np.testing.assert_array_equal(again.points, load_view(path).points)
 

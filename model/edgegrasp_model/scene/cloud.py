@@ -39,6 +39,7 @@ class CloudInput:
     colors: object | None = None  # like points; checked, and not used by any network so far
     segment_ids: object | None = None  # (N,) or (H, W) integers
     view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
+    warnings: tuple[str, ...] = ()  # what was doubtful when it was read, for the answer
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class CheckedCloud:
     segment_ids: NDArray[np.int64] | None = None  # (N,)
     view_ids: NDArray[np.int64] | None = None  # (N,)
     image_size: tuple[int, int] | None = None  # (H, W) where it is organised
+    warnings: tuple[str, ...] = ()
 
     def take(self, kept: NDArray[np.bool_] | Int64) -> "CheckedCloud":
         """Some of the points, by truth values (N,) or places; rows are counted as before."""
@@ -64,6 +66,7 @@ class CheckedCloud:
             None if self.segment_ids is None else self.segment_ids[place],
             None if self.view_ids is None else self.view_ids[place],
             self.image_size,
+            self.warnings,
         )
 
     def at_border(self) -> NDArray[np.bool_] | None:
@@ -119,6 +122,7 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         _integers("segment_ids", sent.segment_ids, size, row),
         _integers("view_ids", sent.view_ids, size, row),
         size_of_image,
+        sent.warnings,
     )
 
 
@@ -233,10 +237,11 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
         raise InvalidRequest("cloud", f"a {kind}", "Send an array of shape (N, 3) in metres.")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        fix = "Send shape (N, 3) or (H, W, 3): x, y, z; a depth image as one of depth_images."
+        raise InvalidRequest("cloud", f"shape {cloud.shape}", fix)
     if cloud.dtype not in (np.float32, np.float64):
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise InvalidRequest("cloud", f"shape {cloud.shape}", "Send shape (N, 3): x, y, z a row.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
     finite = _finite(cloud)

@@ -103,7 +103,7 @@ def _in_rows(shape: Rows, cloud: CheckedCloud) -> Bools:
         case Indices():
             return np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))
         case Mask():
-            return np.asarray(shape.mask, dtype=bool)[cloud.row]
+            return np.frombuffer(shape.mask, dtype=bool)[cloud.row]
         case Segments():
             assert cloud.segment_ids is not None
             return np.isin(cloud.segment_ids, shape.ids)

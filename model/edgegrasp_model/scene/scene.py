@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
@@ -46,6 +47,7 @@ MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 CELL = 0.05  # metres
+WALL = 0.015  # metres inside a side of the workspace where a wall at it is seen
 ON = 10_000  # points of the support, at least, that tell its outline
 
 
@@ -255,6 +257,7 @@ def _numbers(
     if sent.segment_ids is not None or by_rows or options.objects == "off":
         return np.where(inside, _given_numbers(sent), -1)
     sure = None if options.workspace is None else inside
+    inside = inside & ~beside_what_is_beyond(view.plan, sent.points, inside, options.workspace)
     number = np.where(inside, find_things(view, options.max_object_size, sure), -1)
     if (number >= 0).any() or not inside.any():
         return number
@@ -263,6 +266,32 @@ def _numbers(
         "by the image, or not on the plane): all that is over it is taken for things."
     )
     return np.where(inside, 0, -1)
+
+
+def beside_what_is_beyond(
+    plan: Float64, points: Float32, inside: Bools, box: Workspace | None
+) -> Bools:
+    """Which points are at a side of the workspace, beside something that goes on beyond it.
+
+    The walls of a bin whose inside is the workspace are seen partly in it.
+
+    Args:
+        plan: (M, 2) along the support, metres.
+        points: (M, 3) the same, cloud frame, metres.
+        inside: (M,) in the workspace.
+        box: The workspace.
+
+    Returns:
+        (M,)
+    """
+    beside = np.zeros(len(points), dtype=bool)
+    if box is None or inside.all():
+        return beside
+    low, high = np.asarray(box.min) + WALL, np.asarray(box.max) - WALL
+    at_side = np.flatnonzero(inside & ((points < low) | (points > high)).any(axis=1))
+    apart, _ = cKDTree(plan[~inside]).query(plan[at_side], distance_upper_bound=WALL)
+    beside[at_side] = np.isfinite(apart)
+    return beside
 
 
 def near_things(plan: Float64, number: Int64) -> Bools:

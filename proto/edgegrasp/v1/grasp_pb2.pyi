@@ -459,6 +459,9 @@ class DepthImage(_message.Message):
     DEPTH_FIELD_NUMBER: _builtins.int
     INTRINSICS_FIELD_NUMBER: _builtins.int
     T_CLOUD_CAMERA_FIELD_NUMBER: _builtins.int
+    DEPTH_SCALE_FIELD_NUMBER: _builtins.int
+    depth_scale: _builtins.float
+    """Metres that one unit of the depth is worth. Absent: 0.001 of whole numbers, 1 of floats."""
     @_builtins.property
     def depth(self) -> Global___Depth:
         """Distance along z at each pixel."""
@@ -467,7 +470,9 @@ class DepthImage(_message.Message):
     def intrinsics(self) -> Global___Intrinsics: ...
     @_builtins.property
     def T_cloud_camera(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
-        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres."""
+        """16 numbers, 4 x 4 row-major: maps camera coordinates to cloud coordinates, metres. None: the
+        cloud's frame is the camera's.
+        """
 
     def __init__(
         self,
@@ -475,12 +480,15 @@ class DepthImage(_message.Message):
         depth: Global___Depth | None = ...,
         intrinsics: Global___Intrinsics | None = ...,
         T_cloud_camera: _abc.Iterable[_builtins.float] | None = ...,
+        depth_scale: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_depth_scale", b"_depth_scale", "depth", b"depth", "depth_scale", b"depth_scale", "intrinsics", b"intrinsics"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_camera", b"T_cloud_camera", "depth", b"depth", "intrinsics", b"intrinsics"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_camera", b"T_cloud_camera", "_depth_scale", b"_depth_scale", "depth", b"depth", "depth_scale", b"depth_scale", "intrinsics", b"intrinsics"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__depth_scale: _TypeAlias = _typing.Literal["depth_scale"]  # noqa: Y015
+    _WhichOneofArgType__depth_scale: _TypeAlias = _typing.Literal["_depth_scale", b"_depth_scale"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__depth_scale) -> _WhichOneofReturnType__depth_scale | None: ...
 
 Global___DepthImage: _TypeAlias = DepthImage  # noqa: Y015
 
@@ -497,9 +505,11 @@ class Depth(_message.Message):
     height: _builtins.int
     width: _builtins.int
     encoding: _builtins.str
-    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres."""
+    """As in sensor_msgs/Image: "32FC1" or "64FC1", metres; "16UC1", millimetres. Or "png": the file
+    of a 16-bit greyscale image, millimetres, which knows its height and width.
+    """
     data: _builtins.bytes
-    """Packed little-endian pixels; base64 in JSON."""
+    """Packed little-endian pixels, or the file; base64 in JSON."""
     def __init__(
         self,
         *,
@@ -567,6 +577,8 @@ class DetectOptions(_message.Message):
     VIEWPOINT_FIELD_NUMBER: _builtins.int
     UP_FIELD_NUMBER: _builtins.int
     SUPPORT_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
+    MAX_OBJECT_SIZE_FIELD_NUMBER: _builtins.int
     WORKSPACE_FIELD_NUMBER: _builtins.int
     APPROACH_REGION_FIELD_NUMBER: _builtins.int
     CONTACT_REGION_FIELD_NUMBER: _builtins.int
@@ -580,20 +592,28 @@ class DetectOptions(_message.Message):
     model: _builtins.str
     """Weights to use; empty: the server's default."""
     num_approach_points: _builtins.int
-    """Approach points sampled."""
+    """Approach points sampled, spread over the objects; absent: as many as their surface needs."""
     num_candidates: _builtins.int
     """Candidates scored at most."""
     sampling: _builtins.str
     """How approach points are sampled. One of "farthest", "uniform"."""
     seed: _builtins.int
     """Seed of every random choice."""
+    objects: _builtins.str
+    """Whether grasps are for the things that stand on the support plane only, or for everything; all
+    the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none. One
+    of "auto", "off".
+    """
+    max_object_size: _builtins.float
+    """Longest side of a thing, metres."""
     min_score: _builtins.float
     """Lowest score returned."""
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
-    """What comes first: the score; the highest TCP along up among scores of 0.9 and more, then the
-    others by score; or the clearance. One of "score", "highest", "clearance".
+    """What comes first: the score (before others, the best grasp of each object that has one of 0.5
+    and more); the highest TCP along up among scores of 0.9 and more, then the others by score; or
+    the clearance. One of "score", "highest", "clearance".
     """
     debug: _builtins.bool
     """Whether to return the processed cloud and every candidate."""
@@ -609,15 +629,17 @@ class DetectOptions(_message.Message):
 
     @_builtins.property
     def up(self) -> Global___Vector:
-        """Direction away from gravity; any length but zero."""
+        """Direction away from gravity; any length but zero; absent: the support plane's normal, else +z."""
 
     @_builtins.property
     def support(self) -> Global___Support:
-        """Plane the objects rest on; no part of the hand goes below it."""
+        """Plane the objects rest on; no part of the hand goes below it; a bare kind will do; disabled:
+        none.
+        """
 
     @_builtins.property
     def workspace(self) -> Global___Workspace:
-        """Points outside are dropped."""
+        """Where grasps may be; points outside stay as obstacles; absent: everywhere."""
 
     @_builtins.property
     def approach_region(self) -> Global___Region:
@@ -651,6 +673,8 @@ class DetectOptions(_message.Message):
         viewpoint: _abc.Iterable[Global___Vector] | None = ...,
         up: Global___Vector | None = ...,
         support: Global___Support | None = ...,
+        objects: _builtins.str | None = ...,
+        max_object_size: _builtins.float | None = ...,
         workspace: Global___Workspace | None = ...,
         approach_region: Global___Region | None = ...,
         contact_region: Global___Region | None = ...,
@@ -662,12 +686,14 @@ class DetectOptions(_message.Message):
         order: _builtins.str | None = ...,
         debug: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
+    _WhichOneofReturnType__max_object_size: _TypeAlias = _typing.Literal["max_object_size"]  # noqa: Y015
+    _WhichOneofArgType__max_object_size: _TypeAlias = _typing.Literal["_max_object_size", b"_max_object_size"]  # noqa: Y015
     _WhichOneofReturnType__min_score: _TypeAlias = _typing.Literal["min_score"]  # noqa: Y015
     _WhichOneofArgType__min_score: _TypeAlias = _typing.Literal["_min_score", b"_min_score"]  # noqa: Y015
     _WhichOneofReturnType__model: _TypeAlias = _typing.Literal["model"]  # noqa: Y015
@@ -676,6 +702,8 @@ class DetectOptions(_message.Message):
     _WhichOneofArgType__num_approach_points: _TypeAlias = _typing.Literal["_num_approach_points", b"_num_approach_points"]  # noqa: Y015
     _WhichOneofReturnType__num_candidates: _TypeAlias = _typing.Literal["num_candidates"]  # noqa: Y015
     _WhichOneofArgType__num_candidates: _TypeAlias = _typing.Literal["_num_candidates", b"_num_candidates"]  # noqa: Y015
+    _WhichOneofReturnType__objects: _TypeAlias = _typing.Literal["objects"]  # noqa: Y015
+    _WhichOneofArgType__objects: _TypeAlias = _typing.Literal["_objects", b"_objects"]  # noqa: Y015
     _WhichOneofReturnType__order: _TypeAlias = _typing.Literal["order"]  # noqa: Y015
     _WhichOneofArgType__order: _TypeAlias = _typing.Literal["_order", b"_order"]  # noqa: Y015
     _WhichOneofReturnType__sampling: _TypeAlias = _typing.Literal["sampling"]  # noqa: Y015
@@ -687,6 +715,8 @@ class DetectOptions(_message.Message):
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__debug) -> _WhichOneofReturnType__debug | None: ...
     @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__max_object_size) -> _WhichOneofReturnType__max_object_size | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__min_score) -> _WhichOneofReturnType__min_score | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__model) -> _WhichOneofReturnType__model | None: ...
@@ -694,6 +724,8 @@ class DetectOptions(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__num_approach_points) -> _WhichOneofReturnType__num_approach_points | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__num_candidates) -> _WhichOneofReturnType__num_candidates | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__objects) -> _WhichOneofReturnType__objects | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__order) -> _WhichOneofReturnType__order | None: ...
     @_typing.overload
@@ -790,12 +822,16 @@ class Support(_message.Message):
     OFFSET_FIELD_NUMBER: _builtins.int
     MAX_DEPTH_ERROR_FIELD_NUMBER: _builtins.int
     RANSAC_FIELD_NUMBER: _builtins.int
+    AUTO_FIELD_NUMBER: _builtins.int
+    DISABLED_FIELD_NUMBER: _builtins.int
     offset: _builtins.float
     """Normal . x of its points, metres."""
     max_depth_error: _builtins.float
     """Share by which a camera's depths may be wrong: each view is scaled about its viewpoint by up to
     this until the plane that it sees lies in place; 0: not at all.
     """
+    disabled: _builtins.bool
+    """True: null in JSON."""
     @_builtins.property
     def normal(self) -> Global___Vector:
         """Unit normal, away from the table."""
@@ -806,6 +842,12 @@ class Support(_message.Message):
         JSON, its fields beside it.
         """
 
+    @_builtins.property
+    def auto(self) -> Global___AutoPlane:
+        """Look for the plane that things stand on, and that faces the viewpoint. `kind` is "auto" in
+        JSON, its fields beside it.
+        """
+
     def __init__(
         self,
         *,
@@ -813,10 +855,12 @@ class Support(_message.Message):
         offset: _builtins.float | None = ...,
         max_depth_error: _builtins.float | None = ...,
         ransac: Global___RansacPlane | None = ...,
+        auto: Global___AutoPlane | None = ...,
+        disabled: _builtins.bool = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "auto", b"auto", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error", "_offset", b"_offset", "auto", b"auto", "disabled", b"disabled", "max_depth_error", b"max_depth_error", "normal", b"normal", "offset", b"offset", "ransac", b"ransac"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__max_depth_error: _TypeAlias = _typing.Literal["max_depth_error"]  # noqa: Y015
     _WhichOneofArgType__max_depth_error: _TypeAlias = _typing.Literal["_max_depth_error", b"_max_depth_error"]  # noqa: Y015
@@ -839,7 +883,7 @@ class RansacPlane(_message.Message):
     MAX_TILT_FIELD_NUMBER: _builtins.int
     MIN_SHARE_FIELD_NUMBER: _builtins.int
     distance: _builtins.float
-    """Metres from the plane within which points belong to it."""
+    """Metres from the plane within which points belong to it at least."""
     max_tilt: _builtins.float
     """Radians between its normal and up; a quarter turn: any plane."""
     min_share: _builtins.float
@@ -871,8 +915,25 @@ class RansacPlane(_message.Message):
 Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
 
 @_typing.final
+class AutoPlane(_message.Message):
+    """Look for the plane that things stand on, and that faces the viewpoint."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___AutoPlane: _TypeAlias = AutoPlane  # noqa: Y015
+
+@_typing.final
 class Workspace(_message.Message):
-    """An axis-aligned box in the cloud's frame; points outside are dropped first."""
+    """An axis-aligned box in the cloud's frame, where grasps may be."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1220,7 +1281,7 @@ class Mask(_message.Message):
     MASK_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def mask(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
-        """As many values as the cloud has rows."""
+        """As many values as the cloud has rows; in JSON also base64 of a byte for each."""
 
     def __init__(
         self,
@@ -1599,11 +1660,14 @@ class DetectGraspsResponse(_message.Message):
     MODEL_FIELD_NUMBER: _builtins.int
     WARNINGS_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
+    SUPPORT_FIELD_NUMBER: _builtins.int
+    UP_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Name of the weights used."""
     @_builtins.property
     def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___Grasp]:
-        """Ranked, best first."""
+        """Ranked as options.order says, the best first."""
 
     @_builtins.property
     def counts(self) -> _containers.ScalarMap[_builtins.str, _builtins.int]:
@@ -1621,6 +1685,18 @@ class DetectGraspsResponse(_message.Message):
     def debug(self) -> Global___DebugInfo:
         """Set where options.debug is."""
 
+    @_builtins.property
+    def support(self) -> Global___FoundSupport:
+        """The plane that things stand on, given or found; absent (null in JSON): none."""
+
+    @_builtins.property
+    def up(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """3 floats: unit, away from gravity, as it was used; cloud frame."""
+
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedObject]:
+        """The things that grasps are for, the largest first."""
+
     def __init__(
         self,
         *,
@@ -1630,14 +1706,105 @@ class DetectGraspsResponse(_message.Message):
         model: _builtins.str = ...,
         warnings: _abc.Iterable[_builtins.str] | None = ...,
         debug: Global___DebugInfo | None = ...,
+        support: Global___FoundSupport | None = ...,
+        up: _abc.Iterable[_builtins.float] | None = ...,
+        objects: _abc.Iterable[Global___DetectedObject] | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug", "support", b"support"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "model", b"model", "seconds", b"seconds", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "model", b"model", "objects", b"objects", "seconds", b"seconds", "support", b"support", "up", b"up", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___DetectGraspsResponse: _TypeAlias = DetectGraspsResponse  # noqa: Y015
+
+@_typing.final
+class FoundSupport(_message.Message):
+    """The plane that things stand on: the points x with normal . x = offset; cloud frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NORMAL_FIELD_NUMBER: _builtins.int
+    OFFSET_FIELD_NUMBER: _builtins.int
+    RESIDUAL_FIELD_NUMBER: _builtins.int
+    SHARE_FIELD_NUMBER: _builtins.int
+    offset: _builtins.float
+    """Metres."""
+    residual: _builtins.float
+    """Metres, median distance of its points; absent (null in JSON): none of it is seen."""
+    share: _builtins.float
+    """Share of the seen surface that lies in it."""
+    @_builtins.property
+    def normal(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """3 floats: unit, away from the table."""
+
+    def __init__(
+        self,
+        *,
+        normal: _abc.Iterable[_builtins.float] | None = ...,
+        offset: _builtins.float = ...,
+        residual: _builtins.float | None = ...,
+        share: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_residual", b"_residual", "residual", b"residual"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_residual", b"_residual", "normal", b"normal", "offset", b"offset", "residual", b"residual", "share", b"share"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__residual: _TypeAlias = _typing.Literal["residual"]  # noqa: Y015
+    _WhichOneofArgType__residual: _TypeAlias = _typing.Literal["_residual", b"_residual"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__residual) -> _WhichOneofReturnType__residual | None: ...
+
+Global___FoundSupport: _TypeAlias = FoundSupport  # noqa: Y015
+
+@_typing.final
+class DetectedObject(_message.Message):
+    """A thing that grasps are for; cloud frame, metres."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: _builtins.int
+    POINTS_FIELD_NUMBER: _builtins.int
+    CENTER_FIELD_NUMBER: _builtins.int
+    HALF_EXTENTS_FIELD_NUMBER: _builtins.int
+    QUATERNION_FIELD_NUMBER: _builtins.int
+    BEST_SCORE_FIELD_NUMBER: _builtins.int
+    number: _builtins.int
+    """As in Grasp.object; the segment, where segment_ids were sent."""
+    points: _builtins.int
+    """Voxels of the processed cloud that are seen of it."""
+    best_score: _builtins.float
+    """Best of the scores of the grasps returned; absent (null in JSON): there is none on it."""
+    @_builtins.property
+    def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """3 floats: the middle of the smallest upright box around them."""
+
+    @_builtins.property
+    def half_extents(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """3 floats: half its lengths along its own axes, the last of which is up."""
+
+    @_builtins.property
+    def quaternion(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """4 floats x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)."""
+
+    def __init__(
+        self,
+        *,
+        number: _builtins.int = ...,
+        points: _builtins.int = ...,
+        center: _abc.Iterable[_builtins.float] | None = ...,
+        half_extents: _abc.Iterable[_builtins.float] | None = ...,
+        quaternion: _abc.Iterable[_builtins.float] | None = ...,
+        best_score: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "best_score", b"best_score"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "best_score", b"best_score", "center", b"center", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__best_score: _TypeAlias = _typing.Literal["best_score"]  # noqa: Y015
+    _WhichOneofArgType__best_score: _TypeAlias = _typing.Literal["_best_score", b"_best_score"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__best_score) -> _WhichOneofReturnType__best_score | None: ...
+
+Global___DetectedObject: _TypeAlias = DetectedObject  # noqa: Y015
 
 @_typing.final
 class Grasp(_message.Message):
@@ -1654,6 +1821,7 @@ class Grasp(_message.Message):
     APPROACH_DIRECTION_FIELD_NUMBER: _builtins.int
     COLLISION_FREE_FIELD_NUMBER: _builtins.int
     CLEARANCE_FIELD_NUMBER: _builtins.int
+    OBJECT_FIELD_NUMBER: _builtins.int
     score: _builtins.float
     """Probability that the grasp holds, in [0, 1]."""
     width: _builtins.float
@@ -1662,6 +1830,8 @@ class Grasp(_message.Message):
     """Whether the open hand meets nothing at the grasp and on its ways."""
     clearance: _builtins.float
     """Metres from the open hand at the grasp to the nearest thing; 0 or less: within it."""
+    object: _builtins.int
+    """Number of the object that the contact point is on; absent (null in JSON): of none."""
     @_builtins.property
     def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """16 floats, 4 x 4 row-major. Hand frame: z out of the palm, y the closing direction."""
@@ -1694,12 +1864,15 @@ class Grasp(_message.Message):
         approach_direction: _abc.Iterable[_builtins.float] | None = ...,
         collision_free: _builtins.bool = ...,
         clearance: _builtins.float = ...,
+        object: _builtins.int | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_object", b"_object", "object", b"object"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "score", b"score", "width", b"width"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__object: _TypeAlias = _typing.Literal["object"]  # noqa: Y015
+    _WhichOneofArgType__object: _TypeAlias = _typing.Literal["_object", b"_object"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__object) -> _WhichOneofReturnType__object | None: ...
 
 Global___Grasp: _TypeAlias = Grasp  # noqa: Y015
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_model.options import MAX_CANDIDATES, DetectOptions, parse_options
+from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
+from edgegrasp_service.errors import DeadlineExceeded, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages
 from edgegrasp_service.worker.job import Answer, Facts, Job
@@ -77,7 +77,7 @@ class _Work:
         self._job = job
         self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
-        self._settings = settings
+        self._max_points = settings.max_points
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
@@ -113,15 +113,11 @@ class _Work:
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
-        settings = self._settings
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
-        for name in ("approach_points", "candidates"):
-            most = getattr(settings, f"max_{name}")
-            _limit(f"options.num_{name}", getattr(options, f"num_{name}"), most)
         detector = self._catalogue.get(options.model)
-        given = {} if self._job.method == "DetectGrasps" else _given(fields, settings)
-        cloud, options = decode_cloud(fields, options, settings.max_points)
+        given = {} if self._job.method == "DetectGrasps" else _given(fields, self._max_points)
+        cloud, options = decode_cloud(fields, options, self._max_points)
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
@@ -138,7 +134,7 @@ class _Work:
             self.facts.seconds[name] = time.monotonic() - start
 
 
-def _given(fields: Mapping[str, Any], settings: Settings) -> dict[str, NDArray[Any]]:
+def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, NDArray[Any]]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
@@ -147,18 +143,10 @@ def _given(fields: Mapping[str, Any], settings: Settings) -> dict[str, NDArray[A
         raise InvalidRequest("hand_poses", "poses beside edges", "Send one of the two.")
     name, given = names[0], fields[names[0]]
     if not isinstance(given, np.ndarray):
-        given = decode_array(name, given, settings.max_points)
-    rows = given.shape[0] if given.ndim else 0
-    if rows <= MAX_CANDIDATES:  # more than that no server takes, and the detector says so
-        _limit(name, rows, settings.max_candidates)
+        given = decode_array(name, given, max_points)
     if name == "hand_poses" and given.dtype.kind in "iu":
         given = given.astype(np.float64)
     return {name: given}
-
-
-def _limit(field: str, asked: int, most: int) -> None:
-    if asked > most:
-        raise PayloadTooLarge(field, str(asked), f"This server takes at most {most}.")
 
 
 def _out_of_memory(error: Exception) -> bool:

@@ -1,4 +1,4 @@
-"""Read point cloud files from memory: .npy, .npz, .ply, .pcd and .xyz.
+"""Read point cloud files from memory: .npy, .npz, .ply, .pcd and .xyz; and .png images.
 
 The bytes are a stranger's. Nothing is unpickled, and no count in a header is trusted before it is
 compared with the bytes at hand: a short file cannot make a worker allocate a large array.
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
+from PIL import Image
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.scene.cloud import CloudInput
@@ -62,8 +63,8 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
         UnsupportedMediaType: No such format.
     """
     if file_format not in _READERS:
-        known = ", ".join(FILE_FORMATS)
-        raise UnsupportedMediaType("format", repr(file_format), f"Send one of: {known}.")
+        fix = f"Send one of: {', '.join(FILE_FORMATS)}; a depth image as `depth` with `intrinsics`."
+        raise UnsupportedMediaType("format", repr(file_format), fix)
     with _reading("cloud", file_format, len(data), FIXES[file_format]):
         return _READERS[file_format](data, max_points)
 
@@ -133,11 +134,11 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if "points" not in members and len(members) == 1:
             members = {"points": next(iter(members.values()))}
-        foreign = sorted(members.keys() - CloudInput.__dataclass_fields__.keys())
+        foreign = sorted(members.keys() - (CloudInput.__dataclass_fields__.keys() - {"warnings"}))
         if "points" not in members or foreign:
             raise ValueError(f"with {', '.join(foreign[:5]) or 'no array points'}")
         contents = {name: _unzipped(archive, info, max_points) for name, info in members.items()}
-    arrays = {
+    arrays: dict[str, Any] = {
         name: read_npy(content, max_points, "cloud" if name == "points" else name)
         for name, content in contents.items()
     }
@@ -152,6 +153,33 @@ def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) 
     with archive.open(info) as member:
         # Without a size, read() unpacks everything, even where that is more than promised.
         return member.read(info.file_size)
+
+
+# .png
+
+
+def read_png(data: bytes, max_points: int, field: str) -> Array:
+    """Read an image.
+
+    Args:
+        data: The file's bytes.
+        max_points: Most pixels accepted.
+        field: What the file is in the request.
+
+    Returns:
+        (H, W) bool, uint8 or uint16, or (H, W, C) uint8 of C channels.
+
+    Raises:
+        InvalidRequest: The file is truncated, or no PNG.
+        PayloadTooLarge: More than `max_points` pixels.
+    """
+    fix = "Send a whole PNG file, of 16-bit greyscale for depths."
+    with _reading(field, "png", len(data), fix), warnings.catch_warnings():
+        warnings.simplefilter("error")  # that the image is huge
+        image = Image.open(io.BytesIO(data), formats=["PNG"])
+        if image.width * image.height > max_points:
+            raise too_many(image.width * image.height, max_points, field)
+        return np.array(image)
 
 
 # Records of numbers, in binary or as text: the points of PLY and PCD files and of PointCloud2

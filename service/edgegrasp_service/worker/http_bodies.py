@@ -24,12 +24,13 @@ from edgegrasp_model.results import Detection, Grasp, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.worker.formats import FILE_FORMATS
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File
+from edgegrasp_service.worker.request_cloud import CAMERA, GIVEN, PER_POINT, File
 
 JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
 FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
+MAX_CAMERA_TEXT = 1000  # bytes of a part like 615,615,320,240; a longer one is JSON
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
@@ -69,7 +70,8 @@ def read_request(job: Job) -> dict[str, Any]:
             raise InvalidRequest("body", brief(fields), "Send a JSON object.")
         _refuse_unknown(fields, known, "field")
     else:
-        fields = _fields_of_form(job.body, named.get("boundary", ""), known)
+        boundary = named.get("boundary", "")
+        fields = _fields_of_form(job.body, boundary, (*known, *CAMERA))
     if not isinstance(fields.setdefault("options", {}), dict):
         raise InvalidRequest("options", brief(fields["options"]), "Send a JSON object.")
     return fields
@@ -149,11 +151,12 @@ def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
     for name, text in items:
         if name in options:
             raise InvalidRequest(f"options.{name}", "two values", "Send it once.")
-        options[name] = _value(name, text)
+        options[name] = value_of_text(name, text)
     return options
 
 
-def _value(name: str, text: str) -> object:
+def value_of_text(name: str, text: str) -> object:
+    """One value as `options_from_query` reads it; of an option, or of a part of a form."""
     field = DetectOptions.model_fields.get(name)
     if field is not None and field.annotation is str:
         return text  # weights may be named 7 or null
@@ -175,7 +178,7 @@ def _value(name: str, text: str) -> object:
 
 
 def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """Files as File, other parts as the JSON that they hold."""
+    """Files as File, other parts as the JSON that they hold; one camera's as `depth_images`."""
     fields: dict[str, Any] = {}
     for name, file_format, data in _parts(body, boundary, len(known) + 1):
         _refuse_unknown([name], known, "part")
@@ -184,11 +187,16 @@ def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[
         if name == "cloud" and file_format is None:
             raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
         # curl sends `-F options=@file;type=application/json` as a file too.
-        if name == "cloud" or (file_format == "npy" and name != "options"):
+        if name == "cloud" or (file_format in ("npy", "png") and name != "options"):
             fields[name] = File(file_format or "", data)
+        elif name in CAMERA and len(data) < MAX_CAMERA_TEXT:
+            fields[name] = value_of_text(name, data.decode("utf-8", "replace"))
         else:
             fields[name] = read_json(name, data)
-    return fields
+    image = {name: fields.pop(name) for name in CAMERA if name in fields}
+    if image and "depth_images" in fields:
+        raise InvalidRequest("depth_images", f"images beside {next(iter(image))}", "Send one.")
+    return fields | ({"depth_images": [image]} if image else {})
 
 
 def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | None, bytes]]:

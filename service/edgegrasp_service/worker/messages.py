@@ -119,9 +119,10 @@ def _cloud(message: Any) -> dict[str, Any]:
 
 
 def _depth_image(message: grasp_pb2.DepthImage, row: int) -> dict[str, Any]:
-    pose = _matrix(message.T_cloud_camera, f"depth_images.{row}.T_cloud_camera")
-    message.ClearField("T_cloud_camera")
-    return _plain_fields(message) | {"T_cloud_camera": pose}
+    fields = _plain_fields(message)
+    if pose := fields.pop("T_cloud_camera"):
+        fields["T_cloud_camera"] = _matrix(pose, f"depth_images.{row}.T_cloud_camera")
+    return fields
 
 
 def _matrix(numbers: Any, field: str) -> list[list[float]]:
@@ -141,6 +142,8 @@ def _plain_fields(message: Message) -> dict[str, Any]:
 
 def _field(message: Message, field: Any) -> Any:
     value = getattr(message, field.name)
+    if field.type == field.TYPE_BOOL and field.is_repeated:
+        return np.array(value, dtype=bool)  # a mask: millions, packed
     if field.is_repeated:
         return list(value) if field.message_type is None else [_plain(part) for part in value]
     return _plain(value)
@@ -172,10 +175,14 @@ def _tagged(message: Message) -> dict[str, Any]:
     return {} if which is None else {"kind": which} | _plain_fields(getattr(message, which))
 
 
-def _support(message: grasp_pb2.Support) -> dict[str, Any]:
+def _support(message: grasp_pb2.Support) -> dict[str, Any] | None:
     fields = _plain_fields(message)
-    ransac = fields.pop("ransac", None)
-    return fields if ransac is None else {"kind": "ransac"} | fields | ransac
+    if fields.pop("disabled"):
+        return None
+    kinds = {kind: fields.pop(kind) for kind in ("ransac", "auto") if kind in fields}
+    for kind, more in kinds.items():
+        fields |= {"kind": kind} | more
+    return fields
 
 
 def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     Field,
@@ -24,21 +23,21 @@ from pydantic import (
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import (
-    FARTHEST,
     MAX_VIEWS,
     DetectOptions,
-    Finite,
     Integer,
     Strict,
     invalid_options,
     numeric,
 )
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_model.scene.depth import CameraView, Position, fuse_depth_images
 from edgegrasp_service.worker.formats import (
     PCL_FIELDS,
     cloud_of_records,
     read_file,
     read_npy,
+    read_png,
     too_many,
 )
 
@@ -91,7 +90,7 @@ def decode_cloud(
         if fields.get("view_ids") is not None:
             fix = "Leave it out: it follows from depth_images."
             raise InvalidRequest("view_ids", "an array beside depth_images", fix)
-        cloud, cameras = fuse_depth_images(fields[source], max_points)
+        cloud, cameras = read_depth_images(fields[source], max_points)
         viewpoint = cameras[0] if len(cameras) == 1 else tuple(cameras)
         options = options.model_copy(update={"viewpoint": viewpoint})
     elif source == "point_cloud2":
@@ -144,18 +143,19 @@ def decode_points(points: object, max_points: int) -> Array:
 
 
 def decode_array(field: str, value: object, max_points: int) -> Array:
-    """Read an array: packed numbers, an .npy file or lists.
+    """Read an array: packed numbers, an .npy or .png file, or lists.
 
     Returns:
         Of bytes (N, 3) float32 or (N,) int32, as PACKED says; of lists int64 where all numbers
         are whole, else float64; of a file whatever is in it.
 
     Raises:
-        InvalidRequest: A broken number, no .npy file, or lists that are no array of numbers.
+        InvalidRequest: A broken number, no such file, or lists that are no array of numbers.
         PayloadTooLarge: More than `max_points` rows in a file.
     """
     if isinstance(value, File):
-        return read_npy(value.data, max_points, field)
+        read = read_png if value.format == "png" else read_npy
+        return read(value.data, max_points, field)
     if isinstance(value, bytes):
         width, kind = PACKED[field]
         if len(value) % (4 * width):
@@ -206,21 +206,6 @@ def _from_base64(value: object) -> object:
 
 Bytes = Annotated[bytes, BeforeValidator(_from_base64, json_schema_input_type=str)]
 Size = Annotated[int, Field(ge=0, lt=2**31), numeric]
-Pixels = Annotated[int, Field(ge=1, le=65536), numeric]
-FocalLength = Annotated[float, Field(gt=0.0, le=FARTHEST), numeric]
-PoseRow = tuple[Finite, Finite, Finite, Finite]
-
-
-def _rigid(pose: tuple[PoseRow, ...]) -> tuple[PoseRow, ...]:
-    matrix = np.array(pose)
-    rotation = matrix[:3, :3]
-    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
-    return pose
-
-
-Pose = Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(_rigid)]
 
 
 class PointField(Strict):
@@ -247,31 +232,23 @@ class PointCloud2(Strict):
 class Depth(Strict):
     """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
 
-    height: Pixels
-    width: Pixels
-    encoding: Literal["32FC1", "64FC1", "16UC1"] = Field(
-        description="32FC1 or 64FC1, metres; 16UC1, millimetres"
+    height: Size = Field(default=0, description="pixels; not needed of a PNG, like the width")
+    width: Size = 0
+    encoding: Literal["32FC1", "64FC1", "16UC1", "png"] = Field(
+        description="32FC1 or 64FC1, metres; 16UC1 or a 16-bit PNG file, millimetres"
     )
-    data: Bytes = Field(description="packed little-endian pixels, as base64 in JSON")
+    data: Bytes = Field(description="packed little-endian pixels or the file, as base64 in JSON")
 
 
-class Intrinsics(Strict):
-    """A pinhole camera without distortion; the centre of the top left pixel is (0, 0)."""
-
-    fx: FocalLength = Field(description="pixels")
-    fy: FocalLength = Field(description="pixels")
-    cx: Finite = Field(description="pixels")
-    cy: Finite = Field(description="pixels")
-
-
-class DepthImage(Strict):
+class DepthImage(CameraView):
     """What a camera saw. Camera frame: x right, y down, z forward."""
 
     depth: SkipValidation[list[list[float]] | Depth] = Field(
         description="rows of metres, or an object as Depth"
     )
-    intrinsics: Intrinsics
-    T_cloud_camera: Pose = Field(description="maps camera coordinates to cloud coordinates, metres")
+
+
+CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one image
 
 
 def _parse(schema: type[Schema], fields: object, name: str) -> Schema:
@@ -349,22 +326,15 @@ def _record(layout: PointCloud2) -> np.dtype[Any]:
 
 # Depth images
 
-DEPTH_ENCODINGS = {"32FC1": ("<f4", 1.0), "64FC1": ("<f8", 1.0), "16UC1": ("<u2", 0.001)}  # metres
+DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
 
 
-def fuse_depth_images(
-    images: object, max_points: int
-) -> tuple[CloudInput, list[tuple[float, float, float]]]:
-    """Turn views into one cloud.
+def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
+    """Read views, and fuse them; as `edgegrasp_model.scene.depth` says.
 
     Args:
-        images: A list of DepthImage, as plain values.
+        images: A list of DepthImage, as plain values; their `depth` may also be a File.
         max_points: Most pixels accepted, of all images together.
-
-    Returns:
-        A cloud whose rows are the pixels, one image after the other, with NaN where a pixel has no
-        reading: (H, W, 3) for one image, (1, N, 3) and the view of each for several. And the
-        position of each camera, metres.
 
     Raises:
         InvalidRequest: A field is missing, unknown or wrong.
@@ -374,54 +344,28 @@ def fuse_depth_images(
         count = f"{len(images)} images" if isinstance(images, list) else brief(images)
         raise InvalidRequest("depth_images", count, f"Send a list of 1 to {MAX_VIEWS} images.")
     views = [_parse(DepthImage, image, f"depth_images.{row}") for row, image in enumerate(images)]
-    depths: list[NDArray[np.float64]] = []
+    depths: list[Array] = []
     for row, view in enumerate(views):
-        depths.append(_depth(view.depth, f"depth_images.{row}.depth"))
+        depths.append(_depth(view.depth, max_points, f"depth_images.{row}.depth"))
         pixels = sum(depth.size for depth in depths)
         if pixels > max_points:
             raise too_many(pixels, max_points, "depth_images")
-    clouds = [_points_of_pixels(depth, view) for depth, view in zip(depths, views, strict=True)]
-    cameras = [
-        (x, y, z) for (*_, x), (*_, y), (*_, z), _ in (view.T_cloud_camera for view in views)
-    ]
-    if len(views) == 1:
-        return CloudInput(clouds[0]), cameras
-    points = np.concatenate([cloud.reshape(1, -1, 3) for cloud in clouds], axis=1)
-    view_ids = np.repeat(np.arange(len(clouds)), [depth.size for depth in depths])
-    return CloudInput(points, view_ids=view_ids), cameras
+    return fuse_depth_images(depths, views)
 
 
-def _depth(depth: object, field: str) -> NDArray[np.float64]:
-    """(H, W) metres, NaN where there is no reading."""
+def _depth(depth: object, max_points: int, field: str) -> Array:
+    if isinstance(depth, File):
+        return decode_array(field, depth, max_points)
     if isinstance(depth, list):
-        array: Array = _numbers(field, [depth], holes=True)[0]
-        if array.ndim != 2 or 0 in array.shape:
-            raise InvalidRequest(field, f"shape {array.shape}", "Send rows of one length.")
-        metres = array.astype(np.float64)
-    else:
-        image = _parse(Depth, depth, field)
-        dtype, unit = DEPTH_ENCODINGS[image.encoding]
-        expected = image.height * image.width * np.dtype(dtype).itemsize
-        if len(image.data) != expected:
-            value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
-            raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
-        pixels = np.frombuffer(image.data, dtype).reshape(image.height, image.width)
-        metres = pixels.astype(np.float64) * unit
-    if (metres < 0).any():
-        worst = float(np.nanmin(metres))
-        raise InvalidRequest(field, f"{worst:g} m", "Send 0 or NaN where there is no reading.")
-    metres[~(np.isfinite(metres) & (metres > 0))] = np.nan
-    return metres
-
-
-def _points_of_pixels(depth: NDArray[np.float64], view: DepthImage) -> NDArray[np.float32]:
-    """(H, W, 3) in the cloud's frame."""
-    row, column = np.indices(depth.shape)
-    camera = view.intrinsics
-    pose = np.array(view.T_cloud_camera)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused as a point
-        x = (column - camera.cx) / camera.fx * depth
-        y = (row - camera.cy) / camera.fy * depth
-        points = np.stack([x, y, depth], axis=-1) @ pose[:3, :3].T + pose[:3, 3]
-        in_cloud: NDArray[np.float32] = points.astype(np.float32)
-    return in_cloud
+        rows: Array = _numbers(field, [depth], holes=True)[0]
+        return rows.astype(np.float64)
+    image = _parse(Depth, depth, field)
+    if image.encoding == "png":
+        return read_png(image.data, max_points, f"{field}.data")
+    dtype = np.dtype(DEPTH_ENCODINGS[image.encoding])
+    expected = image.height * image.width * dtype.itemsize
+    if len(image.data) != expected:
+        value = f"{len(image.data)} bytes where height, width and encoding ask for {expected}"
+        raise InvalidRequest(f"{field}.data", value, "Send the whole image.")
+    pixels = np.frombuffer(image.data, dtype)
+    return pixels.reshape(image.height, image.width)

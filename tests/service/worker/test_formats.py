@@ -2,15 +2,17 @@ import io
 import struct
 import tracemalloc
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_service.errors import PayloadTooLarge
-from edgegrasp_service.worker.formats import read_file
+from edgegrasp_service.worker.formats import read_file, read_png
 from edgegrasp_service.worker.request_cloud import decode_points
 
 POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
@@ -171,6 +173,45 @@ def test_compressed_pcd_with_sizes_that_lie() -> None:
 NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
 COLORS = np.random.default_rng(3).integers(0, 256, (40, 3)).astype(np.uint8)
 IDS = np.arange(40, dtype=np.int32) % 5
+
+
+def png(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "png")
+    return stream.getvalue()
+
+
+IMAGES = {
+    "depths": np.arange(60, dtype=np.uint16).reshape(6, 10) * 1001,
+    "mask": np.eye(6, 10, dtype=bool),
+    "grey": np.arange(60, dtype=np.uint8).reshape(6, 10),
+    "colours": np.arange(180, dtype=np.uint8).reshape(6, 10, 3),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_png_images(name: str) -> None:
+    whole = png(IMAGES[name])
+    pixels = read_png(whole, MANY, name)
+    np.testing.assert_array_equal(pixels, IMAGES[name])
+    assert pixels.dtype == IMAGES[name].dtype
+    for cut in range(0, len(whole) - 24, 7):  # checksums follow the pixels
+        with pytest.raises(InvalidRequest) as caught:
+            read_png(whole[:cut], MANY, name)
+        assert caught.value.field == name
+    with pytest.raises(PayloadTooLarge):
+        read_png(whole, 59, name)
+
+
+def test_a_png_of_huge_size_is_not_unpacked() -> None:
+    small = bytearray(png(IMAGES["depths"]))
+    small[16:24] = struct.pack(">II", 60_000, 60_000)
+    small[29:33] = struct.pack(">I", zlib.crc32(small[12:29]))
+    tracemalloc.start()
+    with pytest.raises((InvalidRequest, PayloadTooLarge)):
+        read_png(bytes(small), MANY, "depth")
+    assert tracemalloc.get_traced_memory()[1] < MIB
+    tracemalloc.stop()
 
 
 def test_what_stands_beside_points_in_an_npz_file() -> None:

@@ -1,4 +1,5 @@
 import base64
+import io
 import tracemalloc
 from typing import Any
 
@@ -6,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
@@ -13,10 +15,11 @@ from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.errors import PayloadTooLarge
 from edgegrasp_service.worker.request_cloud import (
     POINT_TYPES,
+    File,
     decode_array,
     decode_cloud,
     decode_points,
-    fuse_depth_images,
+    read_depth_images,
     read_point_cloud2,
 )
 
@@ -50,7 +53,7 @@ def image(depth: np.ndarray, T_cloud_camera: np.ndarray, encoding: str = "64FC1"
 
 def test_points_project_back_onto_their_pixels() -> None:
     depth, T_cloud_camera = depth_of(), pose(1)
-    cloud, cameras = fuse_depth_images([image(depth, T_cloud_camera)], MANY)
+    cloud, cameras = read_depth_images([image(depth, T_cloud_camera)], MANY)
     assert cloud.points.shape == (24, 32, 3)
     homogeneous = np.concatenate([cloud.points, np.ones((24, 32, 1))], axis=-1)
     x, y, z = np.moveaxis((homogeneous @ np.linalg.inv(T_cloud_camera).T)[..., :3], -1, 0)
@@ -67,20 +70,20 @@ def test_points_project_back_onto_their_pixels() -> None:
 @pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
 def test_encodings_say_the_same(encoding: str) -> None:
     millimetres = np.round(depth_of() * 1000)
-    expected, _ = fuse_depth_images([image(millimetres / 1000, pose(2))], MANY)
+    expected, _ = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
     sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
-    packed, _ = fuse_depth_images([sent], MANY)
+    packed, _ = read_depth_images([sent], MANY)
     np.testing.assert_allclose(packed.points, expected.points, atol=1e-6)
     sent["depth"]["data"] = base64.b64encode(sent["depth"]["data"]).decode()
-    in_json, _ = fuse_depth_images([sent], MANY)
+    in_json, _ = read_depth_images([sent], MANY)
     np.testing.assert_array_equal(in_json.points, packed.points)
     rows = (millimetres / 1000).tolist()
     rows[1][2] = None
-    listed, _ = fuse_depth_images([sent | {"depth": rows}], MANY)
+    listed, _ = read_depth_images([sent | {"depth": rows}], MANY)
     assert np.isnan(listed.points[1, 2]).all()
     np.testing.assert_allclose(listed.points[2:], expected.points[2:], atol=1e-6)
     with pytest.raises(PayloadTooLarge) as caught:
-        fuse_depth_images([sent] * 3, 2 * 24 * 32)  # the pixels of all images
+        read_depth_images([sent] * 3, 2 * 24 * 32)  # the pixels of all images
     assert caught.value.field == "depth_images"
 
 
@@ -88,10 +91,71 @@ def test_encodings_say_the_same(encoding: str) -> None:
 def test_pixels_without_a_reading_are_holes(nothing: float) -> None:
     depth = depth_of()
     depth[5, 7] = nothing
-    cloud, _ = fuse_depth_images([image(depth, pose(4))], MANY)
+    cloud, _ = read_depth_images([image(depth, pose(4))], MANY)
     checked = check_cloud(cloud)
     assert len(checked.points) == 24 * 32 - 1
     assert 5 * 32 + 7 not in checked.row
+
+
+@pytest.mark.parametrize(
+    ("pixels", "encoding", "scale"),
+    [(np.uint16, "png", 0.001), (np.uint16, "npy", 0.0001), (np.float32, "npy", None)],
+)
+def test_files_of_depths(pixels: type, encoding: str, scale: float | None) -> None:
+    stream, depth = io.BytesIO(), depth_of().round(3)
+    values = (depth / (scale or 1.0)).round(6).astype(pixels)
+    if encoding == "png":
+        Image.fromarray(values).save(stream, "png")
+    else:
+        np.save(stream, values[..., None])  # one channel, as some libraries have it
+    sent = image(depth, pose(3)) | {"depth_scale": scale}
+    expected, _ = read_depth_images([image(depth, pose(3))], MANY)
+    packed = {"encoding": encoding, "data": stream.getvalue()}
+    depths = [File(encoding, stream.getvalue()), *([packed] if encoding == "png" else [])]
+    for file in depths:
+        cloud, _ = read_depth_images([sent | {"depth": file}], MANY)
+        np.testing.assert_allclose(cloud.points, expected.points, atol=1e-6)
+
+
+def test_intrinsics_in_every_form_and_a_camera_at_the_origin() -> None:
+    named = image(depth_of(), np.eye(4))
+    expected, _ = read_depth_images([named], MANY)
+    for form in ([FX, FY, CX, CY], [[FX, 0, CX], [0, FY, CY], [0, 0, 1]],
+                 [FX, 0.0, CX, 0.0, FY, CY, 0.0, 0.0, 1.0]):  # fmt: skip
+        sent = {"depth": named["depth"], "intrinsics": form}
+        cloud, cameras = read_depth_images([sent], MANY)
+        np.testing.assert_array_equal(cloud.points, expected.points)
+        assert cameras == [(0.0, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "field", "value"),
+    [
+        ([FX, FY, 320, 240], ".cx", "320, outside of an image of 32 x 24 pixels"),
+        ([FX, FY, CX, 24.0], ".cy", "24, outside"),
+        ([1.0, FY, CX, CY], ".fx", "1 for an image of 32 x 24 pixels"),
+        ([FX, 600.0, CX, CY], ".fy", "600 for"),
+        ([FX, 20.0, CX, CY], "", "fx 60 and fy 20"),
+        ([FX, FY, CX], "", "[60.0, 50.0, 15.5]"),
+        ([[FX, 0, 0], [0, FY, 0], [CX, CY, 1]], "", "[[60.0, 0, 0]"),
+    ],
+)
+def test_intrinsics_that_cannot_be_those_of_the_image(
+    intrinsics: list, field: str, value: str
+) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_depth_images([image(depth_of(), pose(0)) | {"intrinsics": intrinsics}], MANY)
+    assert caught.value.field == f"depth_images.0.intrinsics{field}"
+    assert value in caught.value.value
+
+
+def test_doubtful_intrinsics_are_questioned() -> None:
+    good, doubtful = image(depth_of(), pose(0)), image(depth_of(), pose(1))
+    assert read_depth_images([good], MANY)[0].warnings == ()
+    doubtful["intrinsics"] |= {"cx": 8.0}
+    for images in ([doubtful], [good, doubtful]):
+        (warning,) = read_depth_images(images, MANY)[0].warnings
+        assert f"depth_images.{len(images) - 1}.intrinsics: cx 8 lies far from the" in warning
 
 
 def test_views_are_fused() -> None:
@@ -106,7 +170,7 @@ def test_views_are_fused() -> None:
     checked = check_cloud(cloud)
     np.testing.assert_array_equal(checked.segment_ids, np.arange(1, 3 * 24 * 32))
     for view, single in enumerate(images):
-        alone, _ = fuse_depth_images([single], MANY)
+        alone, _ = read_depth_images([single], MANY)
         seen = checked.points[checked.view_ids == view]
         np.testing.assert_array_equal(seen, check_cloud(alone).points)
 
@@ -116,7 +180,7 @@ def test_views_are_fused() -> None:
     [
         ([], "depth_images", "0 images"),
         ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
-        ([{}], "depth_images.0.depth", "nothing"),
+        ([{}], "depth_images.0.intrinsics", "nothing"),
         ([image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "rgb8",
           "data": b"abc"}}], "depth_images.0.depth.encoding", "'rgb8'"),
         ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
@@ -126,7 +190,7 @@ def test_views_are_fused() -> None:
 )  # fmt: skip
 def test_bad_images(images: object, field: str, value: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        fuse_depth_images(images, MANY)
+        read_depth_images(images, MANY)
     assert caught.value.field == field
     assert value in caught.value.value
 

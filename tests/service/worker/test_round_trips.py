@@ -124,7 +124,7 @@ def drawn(schema: dict[str, Any]) -> st.SearchStrategy[Any]:
         case "integer":
             return st.integers(schema["minimum"], schema.get("maximum", 2**63 - 1))
         case "number":
-            return numbers(schema["minimum"], schema["maximum"])
+            return numbers(schema.get("minimum", 0.01), schema["maximum"])
     return names
 
 
@@ -133,6 +133,7 @@ OPTIONS = {
 } | {
     "gripper": st.none() | st.sampled_from(["panda", "robotiq-2f-85", "7"]) | gripper,
     "viewpoint": st.none() | vector | st.lists(vector, min_size=1, max_size=4),
+    "num_approach_points": st.none() | st.integers(1, 256),
     "up": direction,
     "support": st.none() | plane | ransac,
     "workspace": st.none() | corners(),

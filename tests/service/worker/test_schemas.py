@@ -9,6 +9,7 @@ import pytest
 import edgegrasp_client as client
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model import results
+from edgegrasp_model.scene import depth
 from edgegrasp_service.errors import STATUS
 from edgegrasp_service.front.http import DOCUMENT
 from edgegrasp_service.worker import request_cloud
@@ -22,7 +23,8 @@ def fields(message: str) -> list[str]:
 
 @pytest.mark.parametrize("name", ["PointCloud2", "PointField", "DepthImage", "Intrinsics", "Depth"])
 def test_clouds(name: str) -> None:
-    assert fields(name) == list(getattr(request_cloud, name).model_fields)
+    where = depth if name == "Intrinsics" else request_cloud
+    assert set(fields(name)) == set(getattr(where, name).model_fields)
     if name != "Depth":
         assert fields(name) == list(getattr(client, name).__annotations__)
 
@@ -34,7 +36,7 @@ def test_requests() -> None:
     for kind, names in (("Detect", detect), ("Score", score)):
         body, form = (SCHEMAS[f"{kind}{what}"]["properties"] for what in ("Request", "Form"))
         assert set(body) == set(names) - {"encoded"}
-        assert set(form) == set(names) - {"encoded", "points"} | {"cloud"}
+        assert set(form) == set(names) - {"encoded", "points"} | {"cloud", *request_cloud.CAMERA}
     assert list(SCHEMAS["DetectOptions"]["properties"]) == fields("DetectOptions")
     for method, names in ((client.GraspClient.detect, detect), (client.GraspClient.score, score)):
         ours = set(inspect.signature(method).parameters) - {"self", "timeout"}
@@ -67,7 +69,7 @@ def statuses(path: dict[str, Any]) -> list[str]:
 def test_answers(message: str, name: str) -> None:
     kinds = [getattr(client, name)] + ([getattr(results, name)] if name != "Model" else [])
     for kind in kinds:
-        assert [field.name for field in dataclasses.fields(kind)] == fields(message)
+        assert {field.name for field in dataclasses.fields(kind)} == set(fields(message))
     assert (
         set(SCHEMAS[name]["properties"]) == set(SCHEMAS[name]["required"]) == set(fields(message))
     )

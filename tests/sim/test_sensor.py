@@ -1,0 +1,93 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.sensor import SENSORS, STRUCTURED_LIGHT, TIME_OF_FLIGHT, random_sensor
+
+CAMERA = Intrinsics()
+FAULTLESS = replace(
+    STRUCTURED_LIGHT, baseline=0.0, window=1, fattening=0.0, noise_floor=0.0, noise_growth=0.0,
+    warp=0.0, disparity_step=0.0, grazing=180.0, missing=0.0,
+)  # fmt: skip
+
+
+def wall(depth: float) -> np.ndarray:
+    return np.full((240, 320), depth)
+
+
+def box_before_wall() -> np.ndarray:
+    depth = wall(1.0)
+    depth[80:160, 120:200] = 0.8
+    return depth
+
+
+def seen(sensor, depth: np.ndarray, seed: int = 0) -> np.ndarray:
+    return sensor.apply(depth, CAMERA, np.random.default_rng(seed))
+
+
+def test_a_camera_without_faults_sees_what_is_there_and_nothing_beyond_its_range() -> None:
+    depth = box_before_wall()
+    depth[:, 300:] = CAMERA.far
+    image = seen(FAULTLESS, depth)
+    assert np.isnan(image[:, 300:]).all()
+    np.testing.assert_allclose(image[:, :300], depth[:, :300], atol=1e-6)
+
+
+@pytest.mark.parametrize("pixels", [1, 4])
+def test_noise_grows_with_the_square_of_the_depth(pixels: int) -> None:
+    noisy = replace(FAULTLESS, noise_growth=0.002, noise_pixels=pixels)
+    spread = [seen(noisy, wall(depth)).std() for depth in (0.5, 1.0, 1.5)]
+    assert spread == pytest.approx([0.0005, 0.002, 0.0045], rel=0.15)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_what_the_projector_does_not_light_is_missing_on_its_other_side(side: float) -> None:
+    missing = np.isnan(seen(replace(FAULTLESS, baseline=side * 0.075), box_before_wall()))
+    beside = [slice(100, 120), slice(200, 220)]  # to the left of the box, and to the right
+    shadow, lit = beside if side > 0 else reversed(beside)
+    width = 0.075 * CAMERA.focal_length * (1 / 0.8 - 1)  # pixels
+    assert missing[90:150, shadow].sum(axis=1) == pytest.approx(np.full(60, width), abs=2)
+    assert not missing[90:150, lit].any()
+    assert not missing[:70].any()
+
+
+def test_slanted_surfaces_and_patches_are_missing() -> None:
+    column = np.arange(-20, 20) / CAMERA.focal_length
+    for degrees, share in ((85.0, 1.0), (40.0, 0.0)):
+        slanted = np.tile(1.0 / (1.0 - column * np.tan(np.radians(degrees))), (40, 1))
+        image = seen(replace(FAULTLESS, grazing=70.0), slanted)
+        assert np.isnan(image[1:-1, 1:-1]).mean() == pytest.approx(share, abs=0.01)
+    patches = np.isnan(seen(replace(FAULTLESS, missing=0.05), wall(1.0)))
+    assert patches.mean() == pytest.approx(0.05, rel=0.4)
+    assert patches[:, 1:][patches[:, :-1]].mean() > 0.7  # the next pixel is missing too
+
+
+def test_at_edges_pixels_fly_or_belong_to_the_front() -> None:
+    depth = box_before_wall()
+    flying = seen(replace(FAULTLESS, flying=TIME_OF_FLIGHT.flying), depth)
+    between = (flying > 0.801) & (flying < 0.999)
+    assert 100 < between.sum() < 2 * 4 * 80
+    assert not between[82:158, 122:198].any()
+    fat = seen(replace(FAULTLESS, window=5, fattening=0.5), depth)
+    assert (fat < 0.801).sum() > 80 * 80 + 100
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_the_same_seed_gives_the_same_image(kind: str) -> None:
+    depth = box_before_wall()
+    image = seen(SENSORS[kind], depth)
+    np.testing.assert_array_equal(image, seen(SENSORS[kind], depth))
+    assert not np.array_equal(image, seen(SENSORS[kind], depth, seed=1), equal_nan=True)
+    assert np.nanmedian(np.abs(image - depth)) < 0.005
+
+
+def test_random_cameras_are_of_every_kind_and_depend_on_the_seed_alone() -> None:
+    drawn = [random_sensor(np.random.default_rng(seed)) for seed in range(40)]
+    assert drawn == [random_sensor(np.random.default_rng(seed)) for seed in range(40)]
+    assert {(sensor.baseline == 0, sensor.window > 1) for sensor in drawn} == {
+        (True, False),
+        (False, True),
+    }
+    assert min(sensor.baseline for sensor in drawn) < 0 < max(sensor.baseline for sensor in drawn)

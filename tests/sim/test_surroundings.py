@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+
+from edgegrasp_sim.camera import ViewRange, look_at
+from edgegrasp_sim.engine import ASSETS
+from edgegrasp_sim.hand import FINGERTIP, FailureCause
+from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
+from edgegrasp_sim.surroundings import (
+    MIDDLE,
+    OPEN_TABLE,
+    TABLE_HEIGHT,
+    Box,
+    Surroundings,
+    random_bin,
+    random_table,
+)
+
+ABOVE = look_at(np.array([MIDDLE, MIDDLE, 0.9]), np.array([MIDDLE, MIDDLE, 0.1]))  # T_world_camera
+
+
+def seen_from_above(simulation: ClutterSimulation) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return simulation.observe_from([ABOVE], rng, noise_std=0.0, table="around").cloud
+
+
+@pytest.mark.parametrize("kind", [SceneKind.BIN, SceneKind.TABLE])
+def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: SceneKind) -> None:
+    assert simulation.reset(kind, np.random.default_rng(3), 6) >= 3
+    low, high = np.asarray(simulation.surroundings.workspace)
+    middles = np.array([item.position for item in simulation.placements])
+    low[2] = TABLE_HEIGHT  # the workspace begins a little higher
+    assert ((middles > low) & (middles < high)).all()
+    simulation.world.step(80)
+    after = np.array([item.position for item in simulation.placements])
+    np.testing.assert_allclose(after, middles, atol=0.005)
+
+
+def test_a_bin_has_a_floor_and_walls_around_it() -> None:
+    heights = set()
+    for seed in range(8):
+        around = random_bin(np.random.default_rng(seed))
+        low, high = np.asarray(around.workspace)
+        walls = [box for box in around.boxes if box.obstacle]
+        assert len(walls) == 4
+        for wall in walls:
+            x, y, z = np.abs(np.asarray(wall.centre) - (MIDDLE, MIDDLE, TABLE_HEIGHT))
+            inner = x - wall.size[0] / 2, y - wall.size[1] / 2
+            half = (high - low)[:2] / 2
+            assert inner[0] == pytest.approx(half[0]) or inner[1] == pytest.approx(half[1])
+            assert z == pytest.approx(wall.size[2] / 2)
+        heights.add(walls[0].size[2])
+    assert len(heights) == 8
+
+
+def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it() -> None:
+    carton = Box((0.1, 0.2, 0.15), (MIDDLE, MIDDLE, TABLE_HEIGHT + 0.075), yaw=0.3)
+    around = Surroundings((*OPEN_TABLE.boxes, carton), OPEN_TABLE.workspace, OPEN_TABLE.bounds)
+    T_world_hand = np.diag([1.0, -1.0, -1.0, 1.0])
+    T_world_hand[:3, 3] = (MIDDLE, MIDDLE, 0.17 + FINGERTIP)  # 3 cm deep in it
+    cube = ObjectPlacement(ASSETS / "cube_small.urdf", 1.0, (0.03, 0.03, 0.075), (0, 0, 0, 1))
+    with ClutterSimulation() as simulation:
+        simulation.reset_from_poses([cube], around)
+        before = seen_from_above(simulation)
+        result = simulation.execute_grasp(T_world_hand)
+        assert result.cause is FailureCause.APPROACH_COLLISION
+        np.testing.assert_allclose(seen_from_above(simulation), before, atol=0.001)
+        assert before[:, 2].max() == pytest.approx(TABLE_HEIGHT + 0.15, abs=1e-3)
+
+
+def test_a_table_has_an_edge_a_floor_below_and_larger_things(simulation) -> None:
+    edges = 0
+    for seed in range(4):
+        around = random_table(np.random.default_rng(seed))
+        assert 1 <= sum(box.obstacle for box in around.boxes) <= 3
+        simulation.reset_from_poses([], around)
+        height = seen_from_above(simulation)[:, 2]
+        assert (np.abs(height - TABLE_HEIGHT) < 0.002).mean() > 0.1
+        edges += bool((height < TABLE_HEIGHT - 0.3).any())
+    assert edges > 0
+
+
+def test_a_planner_is_told_the_inside_of_a_bin_and_sees_more(simulation) -> None:
+    simulation.reset(SceneKind.BIN, np.random.default_rng(0), 2)
+    views = ViewRange((0.8, 0.9), (0.0, 0.5), (0.0, 2 * np.pi), (MIDDLE, MIDDLE, 0.1))
+    rngs = np.random.default_rng(1), np.random.default_rng(2)
+    seen = simulation.observe(*rngs, views=views, table="around")
+    low, high = seen.workspace
+    assert low[2] == pytest.approx(TABLE_HEIGHT + 0.005)
+    walls = [box for box in simulation.surroundings.boxes if box.obstacle]
+    inside = min(abs(MIDDLE - box.centre[1]) - box.size[1] / 2 for box in walls[1::2])
+    assert [low[1], high[1]] == pytest.approx([MIDDLE - inside, MIDDLE + inside])
+    assert (seen.cloud.min(axis=0)[:2] < low[:2]).all()
+    assert (seen.cloud.max(axis=0)[:2] > high[:2]).all()
