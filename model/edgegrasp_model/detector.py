@@ -26,7 +26,7 @@ from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_model.networks.hand import HandBatch, hand_batch, score_best_closely
+from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import (
     debug_info,
@@ -59,6 +59,8 @@ NO_APPROACH_POINT = (
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
+FEW_POINTS = 24  # of each hand, that tell which hands are worth a closer look
+CLOSELY = 128  # hands that get one, and all that are returned
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
@@ -167,7 +169,7 @@ class GraspDetector:
         """
         prepared = self.prepare(cloud, options or DetectOptions())
         with prepared.timed("network"):
-            logits = self.run(prepared.batch) if prepared.batch is not None else np.empty(0)
+            logits = self.run(prepared)
         return self.finish(prepared, logits)
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
@@ -191,18 +193,32 @@ class GraspDetector:
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
-    def run(self, batch: Batch, *, all_closely: bool = False) -> Float32:
+    def run(self, prepared: Prepared) -> Float32:
         """Second stage: the network's logits (E,).
 
-        A hand network looks at all hands quickly and at the best closely, unless all are to be.
+        Of many hands, those that may be returned are scored by all their points, the others by a
+        few.
         """
-        batch = batch.to(self.device)
+        batch, scene, sample = prepared.batch, prepared.scene, prepared.sample
+        if batch is None or scene is None or sample is None:
+            return np.empty(0, dtype=np.float32)
+        if not isinstance(batch, HandBatch) or len(sample.candidates) <= CLOSELY:
+            return self._logits(batch)
+        logits = self._logits(batch.with_few_points(FEW_POINTS))
+        closely = np.zeros(len(logits), dtype=bool)
+        rows = np.argsort(-logits, kind="stable")[:CLOSELY]
+        while len(rows):
+            logits[rows] = self._logits(batch.take(rows))
+            closely[rows] = True
+            score, gripper, options = self._probability(logits), prepared.gripper, prepared.options
+            rows, _ = select(scene, sample, score, gripper, options, {})
+            rows = rows[~closely[rows]]
+        return logits
+
+    def _logits(self, batch: Batch) -> Float32:
         with torch.inference_mode():
-            if isinstance(batch, HandBatch) and not all_closely:
-                logits = score_best_closely(self.network, batch)
-            else:
-                logits = self.network(batch)
-        return np.asarray(logits.float().cpu().numpy())
+            logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
+        return logits
 
     def finish(self, prepared: Prepared, logits: NDArray[np.floating]) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
@@ -276,7 +292,7 @@ class GraspDetector:
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
             scorer = Scorer(
-                lambda batch: self._probability(self.run(batch, all_closely=True)),
+                lambda batch: self._probability(self._logits(batch)),
                 prepared.crop_radius,
                 self.metadata.network,
             )

@@ -136,9 +136,10 @@ def _look(
     seen = _Seen(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
     boxes = gripper.boxes(gripper.max_opening).astype(np.float32)
     first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
-    lengths = gripper.pad_half_width, gripper.max_opening / 2, gripper.palm_z
-    lengths = (*lengths, gripper.tip_z, gripper.max_tip_z)
-    hand = _Hand(boxes[:first], boxes[first:last], *(np.float32(length) for length in lengths))
+    across = gripper.pad_half_width, gripper.max_opening / 2
+    along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z
+    lengths = (np.float32(length) for length in (*across, *along))
+    hand = _Hand(boxes[:first], boxes[first:last], *lengths)
     cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
     _look_from_each(view.bounds, view.row, view.columns, normals, mirrored, side, cut, hand, seen)
     return seen

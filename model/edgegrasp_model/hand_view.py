@@ -153,9 +153,8 @@ def points_around_fingers(
         (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
         zeros behind the last; and their number (E,).
     """
-    low = -gripper.pad_half_width - BESIDE, -gripper.max_opening / 2 - OUTSIDE
-    low = (*low, gripper.palm_z - BEHIND)
-    high = -low[0], -low[1], gripper.tip_z + BEYOND
+    x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
+    low, high = (-x, -y, gripper.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND)
     points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
     count = np.zeros(view.num_candidates, dtype=np.int64)
     _around_fingers(

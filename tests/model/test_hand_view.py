@@ -18,7 +18,7 @@ from edgegrasp_model.hand_description import (
 from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import HAND, NetworkConfig
-from edgegrasp_model.networks.hand import CLOSELY, FEW_POINTS, HandBatch, score_best_closely
+from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.unseen import BEHIND, DEEP, FAR, DepthMap, unseen, unseen_space
@@ -176,20 +176,6 @@ def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> Non
     for rows in (slice(1), slice(3), slice(20, 37), slice(None, None, 2)):
         parts = batch.description[rows], batch.points[rows], batch.point_count[rows]
         assert torch.equal(scores(HandBatch(*parts), HAND), together[rows])
-
-
-def test_the_best_of_many_hands_are_scored_by_all_their_points() -> None:
-    batch = look(*scene(0))
-    every = HandBatch.concatenate([batch, *(look(*scene(seed)) for seed in range(1, 8))])
-    assert len(every.point_count) > CLOSELY
-    network = build_network(HAND).eval()
-    with torch.inference_mode():
-        whole, quick = network(every), network(every.with_few_points(FEW_POINTS))
-        found = score_best_closely(network, every)
-        assert torch.equal(score_best_closely(network, batch), network(batch))
-    best = torch.zeros(len(quick), dtype=torch.bool)
-    best[quick.topk(CLOSELY).indices] = True
-    assert torch.equal(found, torch.where(best, whole, quick))
 
 
 def test_few_points_are_at_even_distances_and_all_where_there_are_no_more() -> None:

@@ -105,9 +105,9 @@ class Detector(DummyDetector):
         stage("prepare")
         return super().prepare(*given, **named)
 
-    def run(self, batch: Any) -> Any:
+    def run(self, prepared: Any) -> Any:
         stage("run")
-        return super().run(batch)
+        return super().run(prepared)
 
     def finish(self, *given: Any) -> Any:
         stage("finish")

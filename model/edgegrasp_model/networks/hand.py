@@ -39,8 +39,6 @@ Float32 = NDArray[np.float32]
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
 CHUNK = 4096  # points at a time, so that the work stays in cache
-FEW_POINTS = 24  # of each hand, that tell which hands are worth a closer look
-CLOSELY = 160  # hands that get one; the best 50 of 600 are always among them
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class HandBatch:
             torch.from_numpy(count),
         )
 
-    def take(self, rows: Tensor) -> "HandBatch":
+    def take(self, rows: NDArray[np.int64]) -> "HandBatch":
         """Some of the hands."""
         return HandBatch(self.description[rows], self.points[rows], self.point_count[rows])
 
@@ -146,16 +144,6 @@ def hand_batch(
         network.hand_points,
         view,
     )
-
-
-def score_best_closely(network: nn.Module, batch: HandBatch) -> Tensor:
-    """Logits (E,) of all hands: of the best by all their points, of the others by a few."""
-    if len(batch.point_count) <= CLOSELY or batch.points.shape[1] <= FEW_POINTS:
-        return network(batch)
-    logits: Tensor = network(batch.with_few_points(FEW_POINTS))
-    best = logits.argsort(descending=True, stable=True)[:CLOSELY]
-    logits[best] = network(batch.take(best))
-    return logits
 
 
 class HandNet(nn.Module):
