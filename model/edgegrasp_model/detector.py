@@ -59,8 +59,6 @@ NO_APPROACH_POINT = (
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
-FEW_POINTS = 24  # of each hand, that tell which hands are worth a closer look
-CLOSELY = 128  # hands that get one, and all that are returned
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
 
 
@@ -169,7 +167,7 @@ class GraspDetector:
         """
         prepared = self.prepare(cloud, options or DetectOptions())
         with prepared.timed("network"):
-            logits = self.run(prepared)
+            logits = self.run(prepared.batch) if prepared.batch is not None else np.empty(0)
         return self.finish(prepared, logits)
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
@@ -193,29 +191,8 @@ class GraspDetector:
             prepared.batch = self._batch(scene, sample, gripper)
         return prepared
 
-    def run(self, prepared: Prepared) -> Float32:
-        """Second stage: the network's logits (E,).
-
-        Of many hands, those that may be returned are scored by all their points, the others by a
-        few.
-        """
-        batch, scene, sample = prepared.batch, prepared.scene, prepared.sample
-        if batch is None or scene is None or sample is None:
-            return np.empty(0, dtype=np.float32)
-        if not isinstance(batch, HandBatch) or len(sample.candidates) <= CLOSELY:
-            return self._logits(batch)
-        logits = self._logits(batch.with_few_points(FEW_POINTS))
-        closely = np.zeros(len(logits), dtype=bool)
-        rows = np.argsort(-logits, kind="stable")[:CLOSELY]
-        while len(rows):
-            logits[rows] = self._logits(batch.take(rows))
-            closely[rows] = True
-            score, gripper, options = self._probability(logits), prepared.gripper, prepared.options
-            rows, _ = select(scene, sample, score, gripper, options, {})
-            rows = rows[~closely[rows]]
-        return logits
-
-    def _logits(self, batch: Batch) -> Float32:
+    def run(self, batch: Batch) -> Float32:
+        """Second stage: the network's logits.  # (E,)."""
         with torch.inference_mode():
             logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
         return logits
@@ -292,7 +269,7 @@ class GraspDetector:
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
             scorer = Scorer(
-                lambda batch: self._probability(self._logits(batch)),
+                lambda batch: self._probability(self.run(batch)),
                 prepared.crop_radius,
                 self.metadata.network,
             )

@@ -95,6 +95,25 @@ def distance_behind(
     return behind
 
 
+def distinct_hands(T_cloud_tcp: Float32, first: Bools, near: float, angle: float) -> Bools:
+    """Which hands are near no other one that was kept before them.
+
+    Args:
+        T_cloud_tcp: (E, 4, 4).
+        first: (E,) which of them go before the others.
+        near: Metres between two TCPs,
+        angle: and radians between two hands within which they are near. A hand turned by 180
+            degrees about its approach is the same.
+    """
+    order = np.argsort(~first, kind="stable")
+    kept = np.zeros(len(order), dtype=np.bool_)
+    turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
+    place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
+    limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
+    _keep_distinct(order, place, turn, limits, kept)
+    return kept
+
+
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
     """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
@@ -294,6 +313,27 @@ def _until_met(
                     if above & (z > low[2]):
                         nearest = min(nearest, z - front)
         way[e] = nearest
+
+
+@compiled("contract")
+def _keep_distinct(
+    order: Int64, place: Float32, turn: Float32, limits: Float32, kept: Bools
+) -> None:
+    rows, found = np.empty(len(order), np.int64), 0
+    xs, ys, zs = np.empty((3, len(order)), np.float32)
+    for row in order:
+        px, py, pz = place[row]
+        kept[row] = True
+        for k in range(found):
+            x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
+            if x * x + y * y + z * z < limits[0]:
+                along = (turn[row] * turn[rows[k]]).sum(axis=0)  # cosines of matching axes
+                if along[2] + abs(along[0] + along[1]) > limits[1]:
+                    kept[row] = False
+                    break
+        if kept[row]:
+            xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
+            found += 1
 
 
 @compiled("contract")

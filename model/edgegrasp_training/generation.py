@@ -340,7 +340,7 @@ def label(
     else:
         prepared = guide.prepare(observation.cloud, request)
         selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
-        score = guide.run(prepared)
+        score = None if prepared.batch is None else guide.run(prepared.batch)
     if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return _empty(observation)
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.detector import CLOSELY, GraspDetector, ModelCatalogue, choose_device
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.networks.checkpoint import save_checkpoint
-from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Outcome
 
@@ -39,23 +38,6 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
     first = detect(seed=0)
     assert same(first, detect(seed=0))
     assert not same(first, detect(seed=1))
-
-
-def test_what_is_returned_is_scored_by_all_points_of_its_hand() -> None:
-    ours, options = detector(), DetectOptions.model_validate(ASKED)
-    prepared = ours.prepare(CLOUD, options)
-    assert isinstance(prepared.batch, HandBatch)
-    assert len(prepared.batch.points) > CLOSELY
-    with torch.inference_mode():
-        every = ours.network(prepared.batch).numpy()
-    logits = ours.run(prepared)
-    closely = logits == every
-    assert CLOSELY <= closely.sum() < len(every)
-    assert closely[logits.argmax()]
-    returned = {grasp.score for grasp in ours.finish(prepared, logits).grasps}
-    temperature = ours.metadata.temperature
-    exact = 1.0 / (1.0 + np.exp(-logits[closely].astype(np.float64) / temperature))
-    assert returned <= set(np.float32(exact).tolist())
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:

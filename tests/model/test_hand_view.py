@@ -178,16 +178,6 @@ def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> Non
         assert torch.equal(scores(HandBatch(*parts), HAND), together[rows])
 
 
-def test_few_points_are_at_even_distances_and_all_where_there_are_no_more() -> None:
-    points = torch.arange(40.0)[None, :, None].expand(3, 40, 6).contiguous()
-    batch = HandBatch(torch.zeros(3, 1), points, torch.tensor([40, 9, 4]))
-    few = batch.with_few_points(8)
-    assert few.point_count.tolist() == [8, 8, 4]
-    assert few.points[0, :, 0].tolist() == [2, 7, 12, 17, 22, 27, 32, 37]
-    assert few.points[1, :, 0].tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
-    assert few.points[2, :4, 0].tolist() == [0, 1, 2, 3]
-
-
 def test_the_description_is_standardised_within() -> None:
     batch = look(*scene(5))
     plain = scores(batch)

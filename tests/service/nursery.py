@@ -105,9 +105,9 @@ class Detector(DummyDetector):
         stage("prepare")
         return super().prepare(*given, **named)
 
-    def run(self, prepared: Any) -> Any:
+    def run(self, batch: Any) -> Any:
         stage("run")
-        return super().run(prepared)
+        return super().run(batch)
 
     def finish(self, *given: Any) -> Any:
         stage("finish")

@@ -38,7 +38,7 @@ Float32 = NDArray[np.float32]
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
-CHUNK = 4096  # points at a time, so that the work stays in cache
+CHUNK = 32  # hands at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)
@@ -107,19 +107,6 @@ class HandBatch:
             torch.from_numpy(count),
         )
 
-    def take(self, rows: NDArray[np.int64]) -> "HandBatch":
-        """Some of the hands."""
-        return HandBatch(self.description[rows], self.points[rows], self.point_count[rows])
-
-    def with_few_points(self, limit: int) -> "HandBatch":
-        """The same hands, each with at most `limit` of its points, at even distances."""
-        count = self.point_count[:, None]
-        there = count.clamp(min=limit) * (2 * torch.arange(limit, device=count.device) + 1)
-        row = (there // (2 * limit))[:, :, None].expand(-1, -1, self.points.shape[2])
-        return HandBatch(
-            self.description, self.points.gather(1, row), self.point_count.clamp(max=limit)
-        )
-
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
         return HandBatch(
@@ -176,10 +163,10 @@ class HandNet(nn.Module):
         """
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
-        encoder, hands = PackedMlp(self.point_encoder), max(CHUNK // batch.points.shape[1], 1)
+        encoder = PackedMlp(self.point_encoder)
         chunks = [
             _around(encoder, points, count)
-            for points, count in in_chunks(hands, batch.points, batch.point_count)
+            for points, count in in_chunks(CHUNK, batch.points, batch.point_count)
         ]
         around = torch.cat(chunks)[: len(description)]  # (E, 2 C)
         seen = torch.cat((description, around), dim=1)

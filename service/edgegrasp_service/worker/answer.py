@@ -96,7 +96,7 @@ class _Work:
             prepared = detector.prepare(cloud, options)
             self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
-            logits = detector.run(prepared)
+            logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
         prepared.seconds["network"] = self.facts.seconds["network"]
         with self._stage("finish"):
             detection: Detection = detector.finish(prepared, logits)

@@ -23,7 +23,7 @@ class FailingCatalogue(DummyCatalogue):
     def get(self, name: str = "") -> Any:
         detector = super().get(name)
 
-        def run(prepared: object) -> Any:
+        def run(batch: object) -> Any:
             raise self.error
 
         detector.run = run  # type: ignore[method-assign]
