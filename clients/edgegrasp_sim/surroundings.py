@@ -35,9 +35,9 @@ TABLE_THICKNESS = 0.04  # metres, seen at its edge; it is filled down to the flo
 TABLE_OVER_FLOOR = (0.4, 0.8)  # metres
 LARGE_THINGS = (1, 3)  # on a table
 LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
-CARTON = ((0.10, 0.40), (0.10, 0.30), (0.05, 0.40))  # metres
-PANEL = ((0.30, 0.55), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
-KERB = ((0.20, 0.40), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
+CARTON = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))  # metres; no hand would grasp a longer thing
+PANEL = ((0.42, 0.60), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
+KERB = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
 
 
 @dataclass(frozen=True, slots=True)
