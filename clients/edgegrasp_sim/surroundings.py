@@ -158,7 +158,7 @@ def _large_thing(rng: np.random.Generator) -> Box:
     """Something too large to grasp that stands beside the objects, turned any way."""
     kind = (CARTON, CARTON, PANEL, KERB)[int(rng.integers(4))]
     length, width, height = (float(rng.uniform(*extent)) for extent in kind)
-    yaw, around = rng.uniform(0.0, 2 * np.pi, size=2)
+    yaw, around = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, np.pi)
     away = np.array([np.cos(around), np.sin(around)])
     along = np.array([np.cos(yaw), np.sin(yaw)])
     across = np.array([-along[1], along[0]])

@@ -12,6 +12,7 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 CELL = 0.015  # metres; things further apart than this are two
+FINE_CELL = 0.006  # metres, where coarser ones leave nothing but furniture
 TOP = 0.5  # metres over the plane from which height no longer tells things apart
 MIN_POINTS = 15  # fewer are no thing
 SUPPORT_CELL = 0.02  # metres
@@ -58,7 +59,9 @@ def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.flo
     return np.stack([x, np.cross(normal, x)])
 
 
-def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> Int64:
+def find_things(
+    view: PlaneView, max_size: float, sure: Bools | None = None, cell: float = CELL
+) -> Int64:
     """The things that stand on a plane: clusters above it that are no furniture.
 
     A thing lies over the seen part of the plane, is not longer than `max_size` and is not cut
@@ -69,6 +72,7 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
         view: M points.
         max_size: Longest side of a thing, metres.
         sure: (M,) where the caller says that things are; what lies there is one.
+        cell: Metres between points that still hang together.
 
     Returns:
         (M,) number of each point's thing, from 0; -1: of none.
@@ -76,7 +80,7 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
     number = np.full(len(view.height), -1, dtype=np.int64)
     found = 0
     outline = support_outline(view.on)
-    for mine in clusters(view.plan, view.height):
+    for mine in clusters(view.plan, view.height, cell):
         if np.percentile(view.height[mine] / view.margin[mine], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[mine], view.height[mine])
@@ -94,12 +98,12 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
     return number
 
 
-def clusters(plan: Float64, height: NDArray[np.floating]) -> list[Int64]:
-    """Rows of points (M, 2), (M,) that hang together, the largest cluster first."""
+def clusters(plan: Float64, height: NDArray[np.floating], size: float = CELL) -> list[Int64]:
+    """Rows of points (M, 2), (M,) that hang together by cells of a size, the most first."""
     if len(plan) == 0:
         return []
     place = np.column_stack([plan, np.minimum(height, TOP)])
-    cell = np.floor((place - place.min(axis=0)) / CELL).astype(np.int64)
+    cell = np.floor((place - place.min(axis=0)) / size).astype(np.int64)
     shape = cell.max(axis=0) + 1
     key = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
     held = np.zeros(int(shape.prod()), dtype=bool)
