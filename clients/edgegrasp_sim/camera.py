@@ -19,6 +19,8 @@ Float64 = NDArray[np.float64]
 
 
 TRUNCATION = 4  # voxels; a point farther from a surface has no signed distance
+CAMERA = Intrinsics()
+FARTHEST = 0.999  # of the camera's range, from which there is nothing
 _NEAR = 0.98  # of the truncation, within which a distance counts as one to a surface
 TableView = Literal["known", "ransac", "seen", "around", "auto"]
 _ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
@@ -42,6 +44,7 @@ class Observation:
             the sides of the workspace either), or with all that is around it (`around`). `auto`:
             the same, and nothing is to be used but the cloud and the cameras.
         failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
+        pixels: (N,) the pixel of each point, row-major; None: several images, or cut off.
     """
 
     cloud: NDArray[np.float32]
@@ -51,6 +54,16 @@ class Observation:
     view_ids: NDArray[np.int32]
     table: TableView = "known"
     failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
+    pixels: NDArray[np.int64] | None = None
+
+    @property
+    def image(self) -> NDArray[np.float32]:
+        """The cloud as the camera's image, (H, W, 3) with NaN holes; (N, 3) where it is none."""
+        if self.pixels is None:
+            return self.cloud
+        image = np.full((CAMERA.height * CAMERA.width, 3), np.nan, dtype=np.float32)
+        image[self.pixels] = self.cloud
+        return image.reshape(CAMERA.height, CAMERA.width, 3)
 
     @property
     def camera_position(self) -> NDArray[np.float32]:
@@ -126,7 +139,7 @@ def points_of(
     depth: NDArray[np.float64], T_world_camera: Matrix, camera: Intrinsics
 ) -> NDArray[np.float64]:
     """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
-    row, column = np.nonzero(depth < 0.999 * camera.far)
+    row, column = np.nonzero(depth < FARTHEST * camera.far)
     z = depth[row, column]
     # The renderer samples a pixel at its lower left corner.
     x = (column - camera.centre_x) * z / camera.focal_length

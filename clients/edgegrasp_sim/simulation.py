@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_sim.camera import (
+    CAMERA,
     EVALUATION_VIEWS,
+    FARTHEST,
     Observation,
     TableView,
     ViewRange,
@@ -18,7 +20,7 @@ from edgegrasp_sim.camera import (
     resample_surfaces,
     seen_box,
 )
-from edgegrasp_sim.engine import Intrinsics, World
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
@@ -43,7 +45,6 @@ from edgegrasp_sim.surroundings import (
 )
 
 NOISE_STD = 0.001  # metres
-CAMERA = Intrinsics()
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
@@ -279,6 +280,7 @@ class ClutterSimulation:
             points = points + rng_noise.normal(0.0, std, size=points.shape)
             points = points if box is None else crop(points, box)
             clouds.append(points.astype(np.float32))
+        whole = box is None and voxel == 0 and len(clouds) == 1
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
@@ -287,6 +289,7 @@ class ClutterSimulation:
             camera_positions=positions,
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
             table=table,
+            pixels=np.flatnonzero(depth < FARTHEST * CAMERA.far) if whole else None,
         )
 
     def save_state(self) -> int:

@@ -35,9 +35,9 @@ TABLE_THICKNESS = 0.04  # metres, seen at its edge; it is filled down to the flo
 TABLE_OVER_FLOOR = (0.4, 0.8)  # metres
 LARGE_THINGS = (1, 3)  # on a table
 LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
-CARTON = ((0.10, 0.40), (0.10, 0.30), (0.05, 0.40))  # metres
-PANEL = ((0.30, 0.55), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
-KERB = ((0.20, 0.40), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
+CARTON = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))  # metres; no hand would grasp a longer thing
+PANEL = ((0.42, 0.60), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
+KERB = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ def _large_thing(rng: np.random.Generator) -> Box:
     """Something too large to grasp that stands beside the objects, turned any way."""
     kind = (CARTON, CARTON, PANEL, KERB)[int(rng.integers(4))]
     length, width, height = (float(rng.uniform(*extent)) for extent in kind)
-    yaw, around = rng.uniform(0.0, 2 * np.pi, size=2)
+    yaw, around = rng.uniform(0.0, 2 * np.pi), rng.uniform(0.0, np.pi)
     away = np.array([np.cos(around), np.sin(around)])
     along = np.array([np.cos(yaw), np.sin(yaw)])
     across = np.array([-along[1], along[0]])

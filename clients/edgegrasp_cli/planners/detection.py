@@ -75,7 +75,7 @@ class ServerPlanner:
         try:
             client = self._connected()
             detection: Detection = client.detect(
-                observation.cloud, view_ids=view_ids(observation), **options
+                observation.image, view_ids=view_ids(observation), **options
             )
         except (ServerUnavailableError, DeadlineError) as error:
             self.close()
@@ -143,7 +143,7 @@ class InProcessPlanner:
         from edgegrasp_model.scene.cloud import CloudInput
 
         options = parse_options(request_options(observation, seed, self._rules, self._options))
-        cloud = CloudInput(observation.cloud, view_ids=view_ids(observation))
+        cloud = CloudInput(observation.image, view_ids=view_ids(observation))
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # sums then do not depend on how many there are elsewhere
         try:

@@ -33,7 +33,7 @@ from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
 from edgegrasp_model.scene.support import Seen, Support, find_support, measured
-from edgegrasp_model.scene.things import PlaneView, find_things
+from edgegrasp_model.scene.things import CELL, FINE_CELL, PlaneView, find_things
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -46,7 +46,7 @@ SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may 
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
-CELL = 0.05  # metres
+PLAN_CELL = 0.05  # metres
 WALL = 0.015  # metres inside a side of the workspace where a wall at it is seen
 ON = 10_000  # points of the support, at least, that tell its outline
 
@@ -258,9 +258,10 @@ def _numbers(
         return np.where(inside, _given_numbers(sent), -1)
     sure = None if options.workspace is None else inside
     inside = inside & ~beside_what_is_beyond(view.plan, sent.points, inside, options.workspace)
-    number = np.where(inside, find_things(view, options.max_object_size, sure), -1)
-    if (number >= 0).any() or not inside.any():
-        return number
+    for cell in (CELL, FINE_CELL):  # things that touch furniture may be told from it more finely
+        number = np.where(inside, find_things(view, options.max_object_size, sure, cell), -1)
+        if (number >= 0).any() or not inside.any():
+            return number
     warnings.append(
         "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
         "by the image, or not on the plane): all that is over it is taken for things."
@@ -298,11 +299,11 @@ def near_things(plan: Float64, number: Int64) -> Bools:
     """Which points (M,), with places (M, 2) along the support, a hand at any thing could meet."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
-    x, y = (((axis - axis.min()) / CELL).astype(np.int64) for axis in plan.T)
+    x, y = (((axis - axis.min()) / PLAN_CELL).astype(np.int64) for axis in plan.T)
     held = np.zeros((x.max() + 1, y.max() + 1), dtype=bool)
     held[x[number >= 0], y[number >= 0]] = True
     square = np.ones((3, 3), dtype=bool)
-    near = ndimage.binary_dilation(held, square, iterations=math.ceil(REACH / CELL))
+    near = ndimage.binary_dilation(held, square, iterations=math.ceil(REACH / PLAN_CELL))
     return np.asarray(near[x, y])
 
 

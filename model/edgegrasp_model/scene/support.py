@@ -281,7 +281,7 @@ def _most_stood_on(
     """The plane of greatest worth; None where none is a support at all."""
     sample = seen.take(np.arange(0, len(seen.points), max(len(seen.points) // VIEW, 1)))
     best, worth, second = None, 0.0, 0.0
-    for plane in planes:
+    for plane in (_refined(sample, plane) for plane in planes):
         this = _worth(sample, plane, max_size, least=worth * ALIKE)
         if this > worth:
             best, worth, second = plane, this, worth
@@ -293,6 +293,18 @@ def _most_stood_on(
             "support or a workspace."
         )
     return best
+
+
+def _refined(seen: Seen, plane: _Plane) -> _Plane:
+    """A plane fitted again to more points than it was found by."""
+    thick, weight = thickness(seen.distance()), np.ones(len(seen.points))
+    for within in (1.0, 0.7, 0.5):
+        near = np.abs(plane.heights(seen.points)) < within * thick
+        if near.sum() < NEIGHBORS:
+            break
+        fitted = _fitted(seen.points[near].astype(np.float64), weight[near], plane.normal)
+        plane = plane._replace(normal=fitted.normal, offset=fitted.offset)
+    return plane
 
 
 def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:

@@ -13,6 +13,7 @@ Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 CELL = 0.015  # metres; things further apart than this are two
+FINE_CELL = 0.006  # metres, where coarser ones leave nothing but furniture
 TOP = 0.5  # metres over the plane from which height no longer tells things apart
 MIN_POINTS = 15  # fewer are no thing
 MEASURED = 2000  # points that tell a thing's size and place, at most
@@ -60,7 +61,9 @@ def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.flo
     return np.stack([x, np.cross(normal, x)])
 
 
-def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> Int64:
+def find_things(
+    view: PlaneView, max_size: float, sure: Bools | None = None, cell: float = CELL
+) -> Int64:
     """The things that stand on a plane: clusters above it that are no furniture.
 
     A thing lies over the seen part of the plane, is not longer than `max_size` and is not cut
@@ -71,6 +74,7 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
         view: M points.
         max_size: Longest side of a thing, metres.
         sure: (M,) where the caller says that things are; what lies there is one.
+        cell: Metres between points that still hang together.
 
     Returns:
         (M,) number of each point's thing, from 0; -1: of none.
@@ -78,7 +82,7 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
     number = np.full(len(view.height), -1, dtype=np.int64)
     found = 0
     outline = support_outline(view.on)
-    for mine in clusters(view.plan, view.height):
+    for mine in clusters(view.plan, view.height, cell):
         some = mine[:: len(mine) // MEASURED + 1]
         if np.percentile(view.height[some] / view.margin[some], 98) < STANDS_OUT:
             continue
@@ -97,12 +101,12 @@ def find_things(view: PlaneView, max_size: float, sure: Bools | None = None) -> 
     return number
 
 
-def clusters(plan: Float64, height: NDArray[np.floating]) -> list[Int64]:
-    """Rows of points (M, 2), (M,) that hang together, the largest cluster first."""
+def clusters(plan: Float64, height: NDArray[np.floating], size: float = CELL) -> list[Int64]:
+    """Rows of points (M, 2), (M,) that hang together by cells of a size, the most first."""
     if len(plan) == 0:
         return []
     axes = *plan.T, np.minimum(height, TOP)
-    cell = [((axis - axis.min()) / CELL).astype(np.int64) for axis in axes]
+    cell = [((axis - axis.min()) / size).astype(np.int64) for axis in axes]
     shape = [int(axis.max()) + 1 for axis in cell]
     key = (cell[0] * shape[1] + cell[1]) * shape[2] + cell[2]
     held = np.zeros(math.prod(shape), dtype=bool)
