@@ -69,6 +69,28 @@ def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: flo
     return way
 
 
+def extents_between(
+    points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
+) -> Float32:
+    """From where to where hands have something between their pads.
+
+    Args:
+        points: (N, 3) of the cloud.
+        rows: (P,) of points to look at, group after group.
+        first: (E,) places in `rows` where the group of each hand begins.
+        last: (E,) and ends.
+        T_cloud_hand: (E, 4, 4).
+        pads: (2, 2) least and greatest x and z of the pads, hand frame.
+
+    Returns:
+        (E, 2) least and greatest y of those points; infinite, and less than nothing, of none.
+    """
+    turn, shift = _to_hand(T_cloud_hand)
+    extent = np.empty((len(turn), 2), dtype=np.float32)
+    _between_pads(columns_of(points[rows]), first, last, turn, shift, pads, extent)
+    return extent
+
+
 def distance_behind(
     surface: Float32,
     turn: NDArray[np.floating],
@@ -313,6 +335,28 @@ def _until_met(
                     if above & (z > low[2]):
                         nearest = min(nearest, z - front)
         way[e] = nearest
+
+
+@compiled("contract")
+def _between_pads(
+    columns: Float32,
+    first: Int64,
+    last: Int64,
+    turn: Float32,
+    shift: Float32,
+    pads: Float32,
+    extent: Float32,
+) -> None:
+    low, high = pads
+    for e in range(len(turn)):
+        xs, ys, zs = columns[:, first[e] : last[e]]
+        least, most = np.float32(np.inf), np.float32(-np.inf)
+        for i in range(len(xs)):
+            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            between = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
+            least = min(least, y if between else np.float32(np.inf))
+            most = max(most, y if between else np.float32(-np.inf))
+        extent[e, 0], extent[e, 1] = least, most
 
 
 @compiled("contract")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import extents_between
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -60,6 +61,11 @@ class BallCrop(NamedTuple):
     ball_rows: NDArray[np.int64]  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: NDArray[np.int64]  # (P,) ascending, 0..A-1
     radius: float  # metres
+
+    def bounds(self, ball: Int64) -> tuple[Int64, Int64]:
+        """Places in `ball_rows` where the points of balls (M,) begin, and where they end."""
+        ends = np.searchsorted(self.ball_of_point, np.arange(ball.max(initial=-1) + 2))
+        return ends[ball], ends[ball + 1]
 
 
 def crop_balls(
@@ -281,21 +287,11 @@ def centred_grasps(
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
     wide = np.flatnonzero(np.abs(outward) > min_contact_offset(gripper))
-    ball = crop.ball_of_point[candidates.pair[wide]]
-    first = np.searchsorted(crop.ball_of_point, np.arange(ball.max(initial=-1) + 2))
-    low, high = np.full((2, len(wide)), np.nan, dtype=np.float32)
-    for number in np.unique(ball):
-        here = np.flatnonzero(ball == number)
-        near = points[crop.ball_rows[first[number] : first[number + 1]]]  # (P, 3)
-        turn, shift = axes[wide[here]], origin[wide[here]]
-        x, y, z = (
-            near @ turn[:, :, axis].T - np.einsum("kd,kd->k", shift, turn[:, :, axis])
-            for axis in range(3)
-        )  # (P, K) each, hand frame
-        between = np.abs(x) < gripper.pad_half_width + BESIDE_PADS
-        between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
-        low[here] = np.where(between, y, np.inf).min(axis=0)
-        high[here] = np.where(between, y, -np.inf).max(axis=0)
+    first, last = crop.bounds(crop.ball_of_point[candidates.pair[wide]])
+    half = gripper.pad_half_width + BESIDE_PADS
+    pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
+    hands = candidates.T_cloud_hand[wide]
+    low, high = extents_between(points, crop.ball_rows, first, last, hands, pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)
