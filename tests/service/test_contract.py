@@ -41,6 +41,8 @@ def grasps_of(answer: Any) -> list[dict[str, Any]]:
         for name, value in fields.items():
             if name.startswith("T_"):
                 fields[name] = [list(value[row : row + 4]) for row in range(0, 16, 4)]
+            elif name == "object":
+                fields[name] = value if grasp.HasField(name) else None
             elif not isinstance(value, float | bool):
                 fields[name] = list(value)
         found.append(fields)
