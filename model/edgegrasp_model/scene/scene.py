@@ -161,7 +161,7 @@ def build_scene(
         return None
     cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
     in_cloud = frame.points_in_cloud(middles)
-    number = voxels.commonest(selected.number + 1, int(selected.number.max()) + 2)[kept] - 1
+    number = voxels.commonest(selected.number)[kept]
 
     def allowed(region: Region | None) -> Bools:
         if region is None:
@@ -380,7 +380,7 @@ def _normals(
     if viewpoints is not None:
         seen_from = frame.points(viewpoints).astype(np.float32)
         if len(viewpoints) > 1 and sent.view_ids is not None:
-            seen_from = seen_from[voxels.commonest(sent.view_ids, len(viewpoints))[kept]]
+            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
     normals = orient_normals(points, estimate_normals(points), seen_from)
     if sent.normals is None:
         return normals

@@ -240,6 +240,8 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
         for _ in range(REFINEMENTS):
             near = np.abs(plane.heights(points[left])) < thick[left]
             mine = left[near & (normals[left] @ plane.normal > ROUGHLY_SAME_WAY)]
+            if len(mine) < NEIGHBORS:  # on round things a plane slips off
+                break
             plane = _fitted(points[mine], weight[mine], plane.normal)
         planes.append(plane)
         gone = np.abs(plane.heights(points[left])) < 1.5 * thick[left]
