@@ -198,7 +198,7 @@ def judge(
 
 def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> NDArray[np.bool_]:
     """Which open hands (E,) hold a measured point deeper than NOISE: of all, none cleaned away."""
-    from edgegrasp_model.kernels import any_point_in_boxes
+    from edgegrasp_model.hand_kernels import any_point_in_boxes
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
     hands = np.reshape([grasp.T_cloud_hand for grasp in grasps], (-1, 4, 4)).astype(np.float32)

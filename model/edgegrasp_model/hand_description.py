@@ -20,12 +20,13 @@ from edgegrasp_model.hand_view import (
     mirror_sides,
     reach_of,
 )
-from edgegrasp_model.kernels import runs_along
-from edgegrasp_model.options import Boxes, SupportPlane
+from edgegrasp_model.kernels import compiled
+from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_model.unseen import DepthMap, unseen_space
 
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
 
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
@@ -34,53 +35,6 @@ UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are 
 GAP = 0.007  # metres without a point in which what is between the fingers ends
 HAND_DESCRIPTION_SIZE = 71
 HEIGHTS = slice(58, 61)  # of them: heights over the support plane
-
-
-class _Points(NamedTuple):
-    """Seen points, P of them, ordered by hand."""
-
-    hand: NDArray[np.int64]  # (P,) ascending
-    row: NDArray[np.int64]  # (P,) row of the cloud
-    x: Float32  # (P,) metres, in the hand frame
-    y: Float32
-    z: Float32
-    num_hands: int
-
-    def where(self, mask: NDArray[np.bool_]) -> "_Points":
-        """Those for which something holds."""
-        kept = np.flatnonzero(mask)
-        x, y, z = self.x[kept], self.y[kept], self.z[kept]
-        return _Points(self.hand[kept], self.row[kept], x, y, z, self.num_hands)
-
-
-class _Region:
-    """Statistics, per hand, of the seen points that lie in one region."""
-
-    def __init__(self, points: _Points, mask: NDArray[np.bool_]) -> None:
-        self._mask = mask
-        hand = points.hand[mask]
-        self.count = np.bincount(hand, minlength=points.num_hands)
-        self._hand = hand
-        self._starts = np.cumsum(self.count) - self.count
-        self._present = self.count > 0
-
-    def log_count(self) -> Float32:
-        return np.log1p(self.count).astype(np.float32)
-
-    def mean(self, values: Float32, default: float = 0.0) -> Float32:
-        sums = np.bincount(self._hand, values[self._mask], minlength=len(self.count))
-        means = sums / np.maximum(self.count, 1)
-        return np.where(self._present, means, default).astype(np.float32)
-
-    def highest(self, values: Float32, default: float = 0.0) -> Float32:
-        result = np.full(len(self.count), default, dtype=np.float32)
-        if self._present.any():
-            starts = self._starts[self._present]
-            result[self._present] = np.maximum.reduceat(values[self._mask], starts)
-        return result
-
-    def lowest(self, values: Float32, default: float = 0.0) -> Float32:
-        return -self.highest(-values, -default)
 
 
 def describe_hands(
@@ -115,20 +69,18 @@ def describe_hands(
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
-    x, y, z = view.columns
-    seen = _Points(view.candidate, view.row, x * side[view.candidate], y, z, view.num_candidates)
-    wide = _around_pads(seen, gripper)
-    between = wide.where(np.abs(wide.x) < gripper.pad_half_width)
-    first_met, runs = runs_along(between.hand, between.y, between.num_hands, GAP)
+    mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
+    mirrored[:, :, 0] *= side[:, None]
+    seen = _look(view, cloud.normals, mirrored, side, at_side, gripper)
     depth = None
     if viewpoint is not None and len(cloud.points):
         depth = DepthMap.of_cloud(cloud.points, viewpoint, up)
-    unseen = unseen_space(depth, candidates.T_cloud_hand, first_met, gripper)
+    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, gripper)
     columns = [
-        *_hits(seen, gripper),
-        *_between_fingers(wide, cloud.normals, candidates.T_cloud_hand, side, gripper),
-        _cut_off(seen, at_side, gripper),
-        *_directions(candidates.T_cloud_hand, viewpoint, up, side),
+        *seen.hits.T,
+        *seen.between.T,
+        seen.cut_off,
+        *_directions(candidates.T_cloud_hand, mirrored, viewpoint, up),
         *unseen.parts,
         *_stance(cloud, candidates, gripper, up, support),
         # Older networks read no further: what is new goes here, at the end.
@@ -136,7 +88,7 @@ def describe_hands(
         *unseen.depths,
         *unseen.beyond,
         unseen.free,
-        *runs.T,
+        *seen.runs.T,
     ]
     return np.stack(columns, axis=1).astype(np.float32)
 
@@ -148,112 +100,61 @@ def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
     return unknown
 
 
-def _cut_off(seen: _Points, at_side: NDArray[np.bool_] | None, gripper: Gripper) -> Float32:
-    """Points between the fingers where a side of the workspace cuts things off."""
-    if at_side is None or not at_side.any():
-        return np.zeros(seen.num_hands, dtype=np.float32)
-    inside = (
-        (np.abs(seen.x) < gripper.pad_half_width + NEAR)
-        & (np.abs(seen.y) < gripper.max_opening / 2)
-        & (seen.z > gripper.palm_z)
-        & (seen.z < gripper.tip_z + NEAR)
-    )
-    return _Region(seen, inside & at_side[seen.row]).log_count()
+class _Seen(NamedTuple):
+    """What E hands see of the cloud. A count n is given as the logarithm of 1 + n."""
+
+    hits: Float32  # (E, 7) as `_count_hits` orders them
+    between: Float32  # (E, 29) as `_measure_between` orders them
+    cut_off: Float32  # (E,) between the fingers, where a side of the workspace cuts things off
+    first_met: Float32  # (E, 2) greatest and least y between the fingers; 0 where nothing is
+    runs: Float32  # (E, 3) as `_runs_along` orders them
+
+
+class _Hand(NamedTuple):
+    """The open gripper as the loops read it; metres."""
+
+    boxes: Float32  # (B, 2, 3) of the hand
+    fingers: Float32  # (F, 2, 3) of the finger on the side of positive y
+    half: np.float32  # width of a pad
+    inner: np.float32  # y of that finger's inner face
+    palm: np.float32  # z
+    tip: np.float32
+    end: np.float32  # z of the fingertips at their most forward
+
+
+def _look(
+    view: HandView,
+    normals: Float32,
+    mirrored: Float32,
+    side: Float32,
+    at_side: NDArray[np.bool_] | None,
+    gripper: Gripper,
+) -> _Seen:
+    """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1."""
+    count = view.num_candidates
+    shapes = (count, 7), (count, 29), (count,), (count, 2), (count, 3)
+    seen = _Seen(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
+    boxes = gripper.boxes(gripper.max_opening).astype(np.float32)
+    first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
+    across = gripper.pad_half_width, gripper.max_opening / 2
+    along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z
+    lengths = (np.float32(length) for length in (*across, *along))
+    hand = _Hand(boxes[:first], boxes[first:last], *lengths)
+    cut = np.zeros(len(normals), dtype=bool) if at_side is None else at_side
+    _look_from_each(view.bounds, view.row, view.columns, normals, mirrored, side, cut, hand, seen)
+    return seen
 
 
 def _directions(
-    T_cloud_hand: Float32, viewpoint: Float32 | None, up: Float32, side: Float32
+    T_cloud_hand: Float32, mirrored: Float32, viewpoint: Float32 | None, up: Float32
 ) -> list[Float32]:
-    """Where the camera and up are, in hand frames; a camera that is not known is nowhere."""
-    mirrored = T_cloud_hand[:, :3, :3].copy()
-    mirrored[:, :, 0] *= side[:, None]
+    """Where the camera and up are, on axes (E, 3, 3); a camera that is not known is nowhere."""
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if viewpoint is not None:
         toward = viewpoint - T_cloud_hand[:, :3, 3]
         toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     ups = np.broadcast_to(up / np.linalg.norm(up), toward.shape)
     return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
-
-
-def _hits(seen: _Points, gripper: Gripper) -> list[Float32]:
-    """Points inside the open hand, near its fingers, on its way in and beyond its tips."""
-    hand, fingers = gripper.hand_boxes, gripper.finger_boxes
-    inner = gripper.max_opening / 2
-    on_way = _in_any(hand, seen.x, seen.y, seen.z, behind=np.inf)
-    # Few points lie in the fingers' plane: the rest need not be compared with their boxes.
-    low, high = min(box[0][0] for box in fingers), max(box[1][0] for box in fingers)
-    level = (seen.x > low - NEAR) & (seen.x < high + NEAR)
-    near = seen.where(level)
-    x, y, z = near.x, near.y, near.z
-    right, left = (x, y - inner, z), (x, -y - inner, z)  # from each finger's inner face
-    in_line = (np.abs(x) < gripper.pad_half_width) & (np.abs(y) < inner)
-    on_way[level] |= _in_any(fingers, *right, behind=APPROACH_LENGTH)
-    on_way[level] |= _in_any(fingers, *left, behind=APPROACH_LENGTH)
-    regions = [
-        _Region(near, _in_any(fingers, *right)),
-        _Region(near, _in_any(fingers, *left)),
-        _Region(seen, _in_any(hand, seen.x, seen.y, seen.z)),
-        _Region(near, _in_any(fingers, *right, around=NEAR)),
-        _Region(near, _in_any(fingers, *left, around=NEAR)),
-        _Region(seen, on_way),
-        _Region(near, in_line & (z >= gripper.tip_z)),
-    ]
-    return [region.log_count() for region in regions]
-
-
-def _in_any(
-    boxes: Boxes, x: Float32, y: Float32, z: Float32, around: float = 0.0, behind: float = 0.0
-) -> NDArray[np.bool_]:
-    """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
-    inside = np.zeros(len(x), dtype=bool)
-    for low, high in boxes:
-        inside |= (
-            (x > low[0] - around)
-            & (x < high[0] + around)
-            & (y > low[1] - around)
-            & (y < high[1] + around)
-            & (z > low[2] - behind)
-            & (z < high[2] + around)
-        )
-    return inside
-
-
-def _around_pads(seen: _Points, gripper: Gripper) -> _Points:
-    """Those between the planes of the fingers, up to three pads wide."""
-    above = seen.z - gripper.palm_z
-    around = (np.abs(seen.y) < gripper.max_opening / 2) & (above > 0)
-    around &= above < gripper.max_tip_z - gripper.palm_z
-    return seen.where(around & (np.abs(seen.x) < 3 * gripper.pad_half_width))
-
-
-def _between_fingers(
-    points: _Points, normals: Float32, T_cloud_hand: Float32, side: Float32, gripper: Gripper
-) -> list[Float32]:
-    """Extent, middle and normals of what the closing fingers would meet."""
-    half, length = gripper.pad_half_width, gripper.max_tip_z - gripper.palm_z
-    x, y, z, middle = points.x, points.y, points.z - gripper.palm_z, length / 2
-    nx, ny, nz = np.einsum("pd,pdk->kp", normals[points.row], T_cloud_hand[points.hand, :3, :3])
-    nx *= side[points.hand]
-    inside = np.abs(x) < half
-    wide = _Region(points, np.ones(len(x), dtype=bool))
-    between = _Region(points, inside)
-    y_high, y_low = between.highest(y), between.lowest(y)
-    columns = [
-        between.log_count(),
-        *(between.highest(x), between.lowest(x), between.mean(x)),
-        *(y_high, y_low, between.mean(y)),
-        *(between.highest(z), between.lowest(z, length), between.mean(z, middle)),
-        *(wide.log_count(), wide.highest(x), wide.lowest(x), wide.mean(x)),
-        *(between.mean(np.abs(nx)), between.mean(np.abs(ny)), between.mean(nz)),
-        _Region(points, inside & (ny > FACING)).log_count(),
-        _Region(points, inside & (ny < -FACING)).log_count(),
-        _Region(points, inside & (y > AXIS)).mean(ny),
-        _Region(points, inside & (y < -AXIS)).mean(ny),
-    ]
-    for first in (y > y_high[points.hand] - SLAB, y < y_low[points.hand] + SLAB):
-        slab = _Region(points, inside & first)  # what a finger meets first
-        columns += [slab.log_count(), slab.mean(ny), slab.mean(z, middle), slab.mean(x)]
-    return columns
 
 
 def _stance(
@@ -285,3 +186,137 @@ def _stance(
         support_clearance(pose, support, gripper),
     ]
     return columns + [np.clip(h, -UNKNOWN_HEIGHT, UNKNOWN_HEIGHT) for h in heights]
+
+
+@compiled("contract")
+def _look_from_each(
+    bounds: Int64,
+    row: Int64,
+    columns: Float32,
+    normals: Float32,
+    axes: Float32,
+    side: Float32,
+    cut: NDArray[np.bool_],
+    hand: _Hand,
+    seen: _Seen,
+) -> None:
+    for e in range(len(side)):
+        start, stop = bounds[e], bounds[e + 1]
+        x, y, z = side[e] * columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+        _count_hits(x, y, z, hand, seen.hits[e])
+        across, ahead = np.abs(y) < hand.inner, z > hand.palm
+        pads = across & ahead & (np.abs(x) < hand.half + NEAR) & (z < hand.tip + NEAR)
+        wide = np.flatnonzero(across & ahead & (np.abs(x) < 3 * hand.half) & (z < hand.end))
+        points, facing = np.empty((2, 3, len(wide)), dtype=np.float32)
+        points[0], points[1], points[2] = x[wide], y[wide], z[wide] - hand.palm
+        for d in range(3):
+            for i in range(len(wide)):
+                n = normals[row[start + wide[i]]]
+                facing[d, i] = n[0] * axes[e, 0, d] + n[1] * axes[e, 1, d] + n[2] * axes[e, 2, d]
+        seen.cut_off[e] = np.log1p(np.sum(cut[row[start:stop]] & pads))
+        _measure_between(points, facing, hand, seen.between[e])
+        _runs_along(points[1][np.abs(points[0]) < hand.half], seen.first_met[e], seen.runs[e])
+
+
+@compiled("contract")
+def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) -> None:
+    """Count points in the open fingers, in the hand, near each finger, on the way in, ahead."""
+    on_way = _in_any(hand.boxes, x, y, z, 0.0, np.inf)
+    for finger in range(2):
+        outward = y if finger == 0 else -y
+        on_way |= _in_any(hand.fingers, x, outward, z, 0.0, APPROACH_LENGTH)
+        hits[finger] = np.sum(_in_any(hand.fingers, x, outward, z, 0.0, 0.0))
+        hits[3 + finger] = np.sum(_in_any(hand.fingers, x, outward, z, NEAR, 0.0))
+    hits[2] = np.sum(_in_any(hand.boxes, x, y, z, 0.0, 0.0))
+    hits[5] = np.sum(on_way)
+    hits[6] = np.sum((np.abs(x) < hand.half) & (np.abs(y) < hand.inner) & (z >= hand.tip))
+    hits[:] = np.log1p(hits)
+
+
+@compiled("contract")
+def _in_any(
+    boxes: Float32, x: Float32, y: Float32, z: Float32, around: float, behind: float
+) -> NDArray[np.bool_]:
+    """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
+    inside = np.zeros(len(x), dtype=np.bool_)
+    grown, longer = np.float32(around), np.float32(behind)
+    for b in range(len(boxes)):
+        low, high = boxes[b, 0] - grown, boxes[b, 1] + grown
+        back = boxes[b, 0, 2] - longer
+        for i in range(len(x)):
+            level = (x[i] > low[0]) & (x[i] < high[0]) & (y[i] > low[1]) & (y[i] < high[1])
+            inside[i] |= level & (z[i] > back) & (z[i] < high[2])
+    return inside
+
+
+@compiled("contract")
+def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Float32) -> None:
+    """Extent, middle and normals of points (3, P), z from the palm, that the fingers would meet.
+
+    Those between the pads: their number; greatest, least and mean x, y and z. All, up to three
+    pads wide: their number; greatest, least and mean x. Between the pads: the mean size of the
+    normals' x and y, and their mean z; how many face each finger; the mean y of the normals on
+    either side of the hand's axis. Of what each finger meets first: number, mean y of the normals,
+    mean z and mean x.
+    """
+    length = hand.end - hand.palm
+    between = np.flatnonzero(np.abs(points[0]) < hand.half)
+    inside, normal = points[:, between], normals[:, between]
+    x, y, z = inside
+    ny = normal[1]
+    numbers[0] = np.log1p(len(between))
+    for d in range(3):
+        empty = np.float32(0.0) if d < 2 else length
+        _extent(inside[d], empty, numbers[1 + 3 * d : 4 + 3 * d])
+    numbers[10] = np.log1p(len(points[0]))
+    _extent(points[0], np.float32(0.0), numbers[11:14])
+    numbers[14], numbers[15] = _mean(np.abs(normal[0])), _mean(np.abs(ny))
+    numbers[16] = _mean(normal[2])
+    numbers[17], numbers[18] = np.log1p(np.sum(ny > FACING)), np.log1p(np.sum(ny < -FACING))
+    numbers[19], numbers[20] = _mean(ny[y > AXIS]), _mean(ny[y < -AXIS])
+    for finger in range(2):
+        first = y > numbers[4] - SLAB if finger == 0 else y < numbers[5] + SLAB
+        count, at = np.sum(first), 21 + 4 * finger
+        numbers[at], numbers[at + 1] = np.log1p(count), _mean(ny[first])
+        numbers[at + 2] = _mean(z[first]) if count else length / 2
+        numbers[at + 3] = _mean(x[first])
+
+
+@compiled("contract")
+def _extent(values: Float32, empty: np.float32, numbers: Float32) -> None:
+    """Greatest, least and mean; 0, `empty` and half of it where there is no value."""
+    numbers[0], numbers[1], numbers[2] = 0.0, empty, empty / 2
+    if len(values):
+        numbers[0], numbers[1], numbers[2] = values.max(), values.min(), _mean(values)
+
+
+@compiled("contract")
+def _mean(values: Float32) -> float:
+    """0 where there is none."""
+    total = 0.0
+    for i in range(len(values)):
+        total += values[i]
+    return total / max(len(values), 1)
+
+
+@compiled("contract")
+def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
+    """The longest part of y without a point; how long what each finger meets goes on without a gap.
+
+    Also the greatest and the least y, which stay 0 where there is no point.
+    """
+    along = np.sort(y)
+    if len(along) == 0:
+        return
+    low, high = along[0], along[-1]
+    ends[0], ends[1] = high, low
+    runs[1], runs[2] = high - low, high - low
+    whole = True
+    for i in range(1, len(along)):
+        apart = along[i] - along[i - 1]
+        runs[0] = max(runs[0], apart)
+        if apart > GAP:
+            runs[1] = high - along[i]
+            if whole:
+                runs[2] = along[i - 1] - low
+            whole = False

@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import points_in_hand_boxes
+from edgegrasp_model.hand_kernels import points_in_hand_boxes
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.cloud import UP, Cloud
 
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
 
 NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
@@ -57,6 +59,11 @@ class HandView:
     def columns(self) -> Float32:
         """The positions with x, y, z in rows (3, P): a row at a time is many times faster."""
         return np.ascontiguousarray(self.position.T)
+
+    @cached_property
+    def bounds(self) -> Int64:
+        """Where the points of each hand begin, and the last's end: (E + 1,)."""
+        return np.searchsorted(self.candidate, np.arange(self.num_candidates + 1))
 
     def take(self, rows: NDArray[np.int64]) -> "HandView":
         """The views of the given hands, which must ascend."""
@@ -146,30 +153,49 @@ def points_around_fingers(
         (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
         zeros behind the last; and their number (E,).
     """
-    x, y, z = view.columns
-    near = (
-        (np.abs(x) < gripper.pad_half_width + BESIDE)
-        & (np.abs(y) < gripper.max_opening / 2 + OUTSIDE)
-        & (z > gripper.palm_z - BEHIND)
-        & (z < gripper.tip_z + BEYOND)
-    )
-    candidate, row, position = view.candidate[near], view.row[near], view.position[near]
-    found = np.bincount(candidate, minlength=view.num_candidates)
-    rank = np.arange(len(candidate)) - (np.cumsum(found) - found)[candidate]
-    kept_before = _kept(rank, found[candidate], limit)
-    kept = _kept(rank + 1, found[candidate], limit) > kept_before
-    candidate, slot = candidate[kept], kept_before[kept]
-    side = mirror_sides(T_cloud_hand, viewpoint)[candidate, None]  # (Q, 1)
-    turn = T_cloud_hand[candidate, :3, :3]
+    x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
+    low, high = (-x, -y, gripper.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND)
     points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
-    points[candidate, slot, :3] = position[kept] - np.array(
-        [0.0, 0.0, gripper.tip_z], dtype=np.float32
+    count = np.zeros(view.num_candidates, dtype=np.int64)
+    _around_fingers(
+        view.bounds,
+        view.row,
+        view.columns,
+        normals,
+        T_cloud_hand,
+        mirror_sides(T_cloud_hand, viewpoint),
+        np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32),
+        points,
+        count,
     )
-    points[candidate, slot, 3:] = np.einsum("pd,pdk->pk", normals[row[kept]], turn)
-    points[candidate, slot, 0::3] *= side
-    return points, np.minimum(found, limit)
+    return points, count
 
 
-def _kept(rank: NDArray[np.int64], found: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
-    """How many of the first `rank` of `found` points are kept."""
-    return np.where(found > limit, rank * limit // np.maximum(found, 1), rank)
+@compiled("contract")
+def _around_fingers(
+    bounds: Int64,
+    row: Int64,
+    columns: Float32,
+    normals: Float32,
+    T_cloud_hand: Float32,
+    side: Float32,
+    box: Float32,
+    points: Float32,
+    count: Int64,
+) -> None:
+    limit = points.shape[1]
+    low, high, origin = box
+    for e in range(len(side)):
+        x, y, z = columns[:, bounds[e] : bounds[e + 1]]
+        inside = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        near = bounds[e] + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
+        count[e] = min(len(near), limit)
+        for slot in range(count[e]):
+            # Where there are too many, those at even distances in the cloud's order.
+            p = near[((slot + 1) * len(near) - 1) // limit if len(near) > limit else slot]
+            for d in range(3):
+                points[e, slot, d] = columns[d, p] - origin[d]
+                for k in range(3):
+                    points[e, slot, 3 + d] += normals[row[p], k] * T_cloud_hand[e, k, d]
+            points[e, slot, 0] *= side[e]
+            points[e, slot, 3] *= side[e]

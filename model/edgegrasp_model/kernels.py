@@ -1,7 +1,7 @@
 """Loops over the points of a cloud, compiled to machine code by Numba.
 
-NumPy needs many passes over large arrays for these; here each takes one hand or one point at a
-time, in the processor's cache.
+NumPy needs many passes over large arrays for these; here each takes one point at a time, in the
+processor's cache.
 """
 
 from collections.abc import Callable
@@ -20,38 +20,6 @@ ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many tim
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 BLOCK = 512  # points at a time, so that their positions stay in the first cache
-
-
-def points_in_hand_boxes(
-    points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
-) -> tuple[Int64, Int64, Float32]:
-    """Points between two corners of hand frames.
-
-    Args:
-        points: (N, 3) of the cloud.
-        T_cloud_hand: (E, 4, 4).
-        low: (3,) corner, hand frame, metres.
-        high: (3,) corner.
-
-    Returns:
-        Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
-    """
-    columns, turn, shift = _columns(points), *_to_hand(T_cloud_hand)
-    count = np.empty(len(turn), dtype=np.int64)
-    _count_within(columns, turn, shift, low, high, count)
-    hand = np.repeat(np.arange(len(turn)), count)
-    row = np.empty(len(hand), dtype=np.int64)
-    position = np.empty((len(hand), 3), dtype=np.float32)
-    _fill_within(columns, turn, shift, low, high, np.cumsum(count) - count, row, position)
-    return hand, row, position
-
-
-def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
-    """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
-    turn, shift = _to_hand(T_cloud_hand)
-    hit = np.zeros(len(turn), dtype=np.bool_)
-    _meet(_columns(points), turn, shift, boxes.astype(np.float32), hit)
-    return hit
 
 
 def heights_and_distances(
@@ -86,16 +54,6 @@ def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float3
     return direction
 
 
-def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
-    """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
-    turn, shift = _to_hand(T_cloud_hand)
-    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
-    nearest = np.full(len(turn), np.inf, dtype=np.float32)
-    extents = np.stack((middle, half), axis=1).astype(np.float32)
-    _nearest_to_boxes(_columns(points), turn, shift, extents, nearest)
-    return nearest
-
-
 def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
     """The k nearest points of the same group, nearest first; the own row fills up small groups.
 
@@ -109,26 +67,8 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
     """
     nearest = np.empty((len(points), k), dtype=np.int64)
     if len(points):
-        _nearest(_columns(points), bounds, nearest)
+        _nearest(columns_of(points), bounds, nearest)
     return nearest
-
-
-def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
-    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
-
-    Args:
-        points: (N, 3) of the cloud.
-        T_cloud_hand: (E, 4, 4).
-        boxes: (B, 2, 3) of the hand, hand frame.
-        behind: Metres of way behind a box in which points are in its way too.
-
-    Returns:
-        Negative where a hand would have to move back; infinity where nothing is ahead.
-    """
-    turn, shift = _to_hand(T_cloud_hand)
-    way = np.full(len(turn), np.inf, dtype=np.float32)
-    _until_met(_columns(points), turn, shift, boxes.astype(np.float32), np.float32(behind), way)
-    return way
 
 
 def extents_across(
@@ -150,7 +90,7 @@ def extents_across(
         (M, 2) least and greatest distance from the edge into the object.
     """
     extent = np.zeros((len(frame), 2), dtype=np.float32)
-    _along_strips(_columns(points), rows, first, last, frame, strip, extent)
+    _along_strips(columns_of(points), rows, first, last, frame, strip, extent)
     return extent
 
 
@@ -192,60 +132,9 @@ def level_spread(
     return least, offset, deviation
 
 
-def distance_behind(
-    surface: Float32,
-    turn: NDArray[np.floating],
-    shift: NDArray[np.floating],
-    places: Float32,
-    cell: float,
-) -> Float32:
-    """How far places of some hands lie behind the first surface that a camera saw.
-
-    Args:
-        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle one ahead; inf
-            where nothing was seen.
-        turn: (E, 3, 3) from each hand's frame to the camera's: across, down, ahead.
-        shift: (E, 3) of each hand in the camera's frame.
-        places: (S, 3) hand frame.
-        cell: Tangent of the angle of a cell.
-
-    Returns:
-        (E, S) metres; 0 in front of the surface, and where nothing was seen.
-    """
-    behind = np.zeros((len(turn), len(places)), dtype=np.float32)
-    turn = np.ascontiguousarray(turn, dtype=np.float32)
-    _behind(surface, turn, shift.astype(np.float32), places, np.float32(1.0 / cell), behind)
-    return behind
-
-
-def runs_along(hand: Int64, y: Float32, num_hands: int, gap: float) -> tuple[Float32, Float32]:
-    """How points lie along an axis of some hands: in one run, or in several with gaps between.
-
-    Args:
-        hand: (P,) of each point, ascending.
-        y: (P,) metres.
-        num_hands: E.
-        gap: Metres without a point that end a run.
-
-    Returns:
-        (E, 2) greatest and least y; (E, 3) the longest part without a point, and the lengths of
-        the runs from the greatest and from the least y on. 0 where there is no point.
-    """
-    ends = np.zeros((num_hands, 2), dtype=np.float32)
-    runs = np.zeros((num_hands, 3), dtype=np.float32)
-    bounds = np.searchsorted(hand, np.arange(num_hands + 1))
-    _runs(np.ascontiguousarray(y), bounds, np.float32(gap), ends, runs)
-    return ends, runs
-
-
-def _columns(points: Float32) -> Float32:
-    return np.ascontiguousarray(points.T, dtype=np.float32)  # (3, N)
-
-
-def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
-    """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
-    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
-    return turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
+def columns_of(points: Float32) -> Float32:
+    """Points (N, 3) as rows x, y, z (3, N)."""
+    return np.ascontiguousarray(points.T, dtype=np.float32)
 
 
 def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -265,17 +154,6 @@ def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
             return fresh
 
     return decorate
-
-
-@compiled("contract")
-def _position(
-    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
-) -> tuple[np.float32, np.float32, np.float32]:
-    return (
-        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
-        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
-        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
-    )
 
 
 @compiled("contract")
@@ -348,94 +226,6 @@ def _rotate_away(matrix: Float64, axes: Float64, p: int, q: int) -> None:
 
 
 @compiled("contract")
-def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
-    inside: bool = (
-        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
-    )
-    return inside
-
-
-@compiled("contract")
-def _count_within(
-    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32, count: Int64
-) -> None:
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    for e in range(len(turn)):
-        found = 0
-        for i in range(len(xs)):
-            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-            found += _between(x, y, z, low, high)
-        count[e] = found
-
-
-@compiled("contract")
-def _fill_within(
-    columns: Float32,
-    turn: Float32,
-    shift: Float32,
-    low: Float32,
-    high: Float32,
-    first: Int64,
-    row: Int64,
-    position: Float32,
-) -> None:
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    for e in range(len(turn)):
-        place = first[e]
-        for i in range(len(xs)):
-            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-            if _between(x, y, z, low, high):
-                row[place] = i
-                position[place, 0], position[place, 1], position[place, 2] = x, y, z
-                place += 1
-
-
-@compiled("contract")
-def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
-    count = columns.shape[1]
-    xh, yh, zh = (
-        np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32),
-        np.empty(BLOCK, np.float32),
-    )
-    for e in range(len(turn)):
-        for start in range(0, count, BLOCK):
-            block = columns[:, start : start + BLOCK]
-            xs, ys, zs = block[0], block[1], block[2]
-            for i in range(len(xs)):
-                xh[i], yh[i], zh[i] = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-            inside = 0
-            for b in range(len(boxes)):
-                low, high = boxes[b, 0], boxes[b, 1]
-                for i in range(len(xs)):
-                    inside += _between(xh[i], yh[i], zh[i], low, high)
-            if inside:
-                hit[e] = True
-                break
-
-
-@compiled("contract", "nnan", "nsz", "reassoc")
-def _nearest_to_boxes(
-    columns: Float32, turn: Float32, shift: Float32, extents: Float32, nearest: Float32
-) -> None:
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    zero = np.float32(0.0)
-    for e in range(len(turn)):
-        for b in range(len(extents)):
-            middle, half = extents[b, 0], extents[b, 1]
-            apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
-            for i in range(len(xs)):
-                x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-                x = abs(x - middle[0]) - half[0]
-                y = abs(y - middle[1]) - half[1]
-                z = abs(z - middle[2]) - half[2]
-                deepest = min(deepest, max(x, y, z))
-                x, y, z = max(x, zero), max(y, zero), max(z, zero)
-                apart = min(apart, x * x + y * y + z * z)
-            nearest[e] = min(nearest[e], deepest if deepest < zero else np.sqrt(apart))
-
-
-@compiled("contract")
 def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
     k = nearest.shape[1]
     largest = np.max(bounds[1:] - bounds[:-1])
@@ -476,28 +266,6 @@ def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
                         best[place], mine[place] = best[place - 1], mine[place - 1]
                         place -= 1
                     best[place], mine[place] = here, start + j
-
-
-@compiled("contract")
-def _until_met(
-    columns: Float32,
-    turn: Float32,
-    shift: Float32,
-    boxes: Float32,
-    behind: np.float32,
-    way: Float32,
-) -> None:
-    xs, ys, zs = columns[0], columns[1], columns[2]
-    for e in range(len(turn)):
-        nearest = np.float32(np.inf)
-        for b in range(len(boxes)):
-            low, high = boxes[b, 0], boxes[b, 1]
-            for i in range(len(xs)):
-                x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-                above = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
-                if above & (z > low[2] - behind):
-                    nearest = min(nearest, z - high[2])
-        way[e] = nearest
 
 
 @compiled("contract")
@@ -601,43 +369,3 @@ def _level_spread(
         least[m, 0], least[m, 1], least[m, 2] = s * sx + t * tx, s * sy + t * ty, s * sz + t * tz
         offset[m] = outward
         deviation[m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
-
-
-@compiled("contract")
-def _behind(
-    surface: Float32,
-    turn: Float32,
-    shift: Float32,
-    places: Float32,
-    cells: np.float32,
-    behind: Float32,
-) -> None:
-    half = len(surface) // 2
-    for e in range(len(turn)):
-        for s in range(len(places)):
-            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
-            ahead = max(z, np.float32(1e-6))
-            i, j = np.floor(x / ahead * cells), np.floor(y / ahead * cells)
-            if (abs(i) <= half) & (abs(j) <= half):
-                first = surface[int(i) + half, int(j) + half]
-                behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
-
-
-@compiled("contract")
-def _runs(y: Float32, bounds: Int64, gap: np.float32, ends: Float32, runs: Float32) -> None:
-    for e in range(len(ends)):
-        along = np.sort(y[bounds[e] : bounds[e + 1]])
-        if len(along) == 0:
-            continue
-        low, high = along[0], along[-1]
-        ends[e, 0], ends[e, 1] = high, low
-        runs[e, 1], runs[e, 2] = high - low, high - low
-        whole = True
-        for i in range(1, len(along)):
-            apart = along[i] - along[i - 1]
-            runs[e, 0] = max(runs[e, 0], apart)
-            if apart > gap:
-                runs[e, 1] = high - along[i]
-                if whole:
-                    runs[e, 2] = along[i - 1] - low
-                whole = False

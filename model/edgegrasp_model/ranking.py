@@ -131,12 +131,12 @@ def non_max_suppression(
     """
     kept: list[int] = []
     dropped = [order[:0]]
-    left = order
+    left, place = order, np.ascontiguousarray(T_cloud_tcp[:, :3, 3].T)
     while len(left) and len(kept) < top_k:
         best, left = int(left[0]), left[1:]
         kept.append(best)
-        apart = np.linalg.norm(T_cloud_tcp[left, :3, 3] - T_cloud_tcp[best, :3, 3], axis=1)
-        near = apart < suppression.translation
+        x, y, z = place[:, left] - place[:, best, None]
+        near = x * x + y * y + z * z < suppression.translation**2
         turned = rotation_distance(T_cloud_tcp[left[near], :3, :3], T_cloud_tcp[best, :3, :3])
         near[near] = turned < suppression.rotation
         dropped.append(left[near])

@@ -18,7 +18,7 @@ class Outcome(StrEnum):
     SUPPORT = "support"  # it would go below the support plane
     NOT_CHECKED = "not-checked"  # left out at random before the collision check
     COLLISION = "collision"  # the hand would meet the cloud, the support or an obstacle
-    NOT_SCORED = "not-scored"  # left out at random, beyond num_candidates
+    NOT_SCORED = "not-scored"  # near another one, or left out at random, beyond num_candidates
     LOW_SCORE = "low-score"  # below min_score
     SUPPRESSED = "suppressed"  # near a better one
     BEYOND_TOP_K = "beyond-top-k"

@@ -1,16 +1,19 @@
 """What the one camera did not see of the space in and around a hand."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.kernels import distance_behind
+from edgegrasp_model.hand_kernels import distance_behind
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import Corner
 
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers: as far as the next point of the cloud
@@ -78,6 +81,7 @@ def unseen(behind: Float32) -> Float32:
     return share
 
 
+@lru_cache(maxsize=16)
 def probes(gripper: Gripper) -> list[Float32]:
     """Points of each part of the open hand, and of the space around it; hand frame, metres.
 
@@ -106,6 +110,7 @@ def probes(gripper: Gripper) -> list[Float32]:
     return [*fingers, *beyond, *between, np.concatenate(inside)]
 
 
+@lru_cache(maxsize=16)
 def _ways(gripper: Gripper) -> list[Float32]:
     """Points of the space that each finger sweeps behind its final place: each (S, 3)."""
     half, inner = gripper.pad_half_width, gripper.max_opening / 2
@@ -115,6 +120,7 @@ def _ways(gripper: Gripper) -> list[Float32]:
     return [_grid(x, side * (inner + np.array([0.15, 0.7]) * thick), z) for side in (1.0, -1.0)]
 
 
+@lru_cache(maxsize=16)
 def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
     """The y (LINE,) of places from beyond one finger to beyond the other, and points at each."""
     half, length = gripper.pad_half_width, gripper.tip_z - gripper.palm_z
@@ -157,7 +163,7 @@ class CameraFrame(NamedTuple):
         axes = np.stack([across, np.cross(ahead, across), ahead]).astype(np.float32)
         return cls(np.asarray(viewpoint, dtype=np.float32), axes, CELL / distance)
 
-    def seen(self, positions: Float32) -> tuple[NDArray[np.int64], Float32]:
+    def seen(self, positions: Float32) -> tuple[Int64, Float32]:
         """The cells (N, 2) that positions (N, 3) lie in, the middle one 0, and how far they are."""
         along = (positions - self.viewpoint) @ self.axes.T  # (N, 3)
         tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
@@ -185,14 +191,7 @@ class DepthMap:
         cell, distance = frame.seen(points)
         half = min(int(np.abs(cell).max()) + SPLAT, HALF)
         depth = np.full((2 * half + 1, 2 * half + 1), NOTHING)
-        order = np.argsort(-distance, kind="stable")  # the nearest is written last
-        cell, distance = cell[order] + half, distance[order]
-        for shift in np.ndindex(2 * SPLAT + 1, 2 * SPLAT + 1):
-            place = cell + np.asarray(shift) - SPLAT
-            inside = ((place >= 0) & (place <= 2 * half)).all(axis=1)
-            nearest = np.full_like(depth, NOTHING)
-            nearest[tuple(place[inside].T)] = distance[inside]
-            np.minimum(depth, nearest, out=depth)
+        _cover(depth, cell + half, distance)
         return cls(frame, depth)
 
     def behind(self, T_cloud_hand: Float32, places: Float32) -> Float32:
@@ -204,3 +203,12 @@ class DepthMap:
         turn = frame.axes @ T_cloud_hand[:, :3, :3]
         shift = (T_cloud_hand[:, :3, 3] - frame.viewpoint) @ frame.axes.T
         return distance_behind(self.distance, turn, shift, places, frame.cell)
+
+
+@compiled()
+def _cover(depth: Float32, cell: Int64, distance: Float32) -> None:
+    """Write the distances of points (N,) into the cells (N, 2) around theirs; the nearest stays."""
+    for n in range(len(cell)):
+        for i in range(max(cell[n, 0] - SPLAT, 0), min(cell[n, 0] + SPLAT + 1, len(depth))):
+            for j in range(max(cell[n, 1] - SPLAT, 0), min(cell[n, 1] + SPLAT + 1, len(depth))):
+                depth[i, j] = min(depth[i, j], distance[n])

@@ -9,16 +9,18 @@ from hypothesis import strategies as st
 from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.hand_view import hand_views, reach_of
-from edgegrasp_model.kernels import (
+from edgegrasp_model.hand_kernels import (
     any_point_in_boxes,
-    nearest_in_groups,
+    distinct_hands,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
+from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import nearest_in_ball
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.options import Collision
+from edgegrasp_model.ranking import rotation_distance
 from edgegrasp_model.scene.cloud import Cloud
 
 from . import oracles
@@ -44,6 +46,25 @@ def test_hands_see_the_points_within_reach(seed: int) -> None:
     for pair in both:
         np.testing.assert_allclose(pairs[0][pair], pairs[1][pair], rtol=0, atol=1e-6)
     assert list(pairs[0]) == sorted(pairs[0])
+
+
+def test_of_hands_that_are_near_each_other_one_is_kept() -> None:
+    hands = random_hands(60, seed=1)
+    hands[:, :3, 3] = np.random.default_rng(1).uniform(0, 0.015, (60, 3))
+    hands[30:, :3, :3] = hands[:30, :3, :3] * (-1, -1, 1)  # turned about their approach
+    first = np.arange(60) >= 40
+    kept = distinct_hands(hands, first, 0.01, 0.8)
+
+    def near(row: int) -> np.ndarray:
+        apart = np.linalg.norm(hands[:, :3, 3] - hands[row, :3, 3], axis=1)
+        return (apart < 0.01) & (rotation_distance(hands[:, :3, :3], hands[row, :3, :3]) < 0.8)
+
+    assert 10 < kept.sum() < 60
+    before = np.argsort(np.argsort(~first, kind="stable"))
+    for row in range(60):
+        earlier = near(row) & (before < before[row]) & kept
+        assert kept[row] == (not earlier.any())
+    assert distinct_hands(hands, first, 0.0, 0.0).all()
 
 
 @grippers

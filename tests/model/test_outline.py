@@ -10,7 +10,8 @@ from edgegrasp_model.candidates.outline import (
     outline_grasps,
     outlines,
 )
-from edgegrasp_model.kernels import extents_across, free_way, level_spread
+from edgegrasp_model.hand_kernels import free_way
+from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import DetectOptions, SupportPlane
 
 from .scenes import PANDA, detector, random_hands

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import any_point_in_boxes, signed_distance_to_boxes
 from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
-from edgegrasp_model.kernels import any_point_in_boxes, signed_distance_to_boxes
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import extents_between
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -46,8 +47,10 @@ def sample_approach_points(
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = rng.integers(len(points))
     nearest = np.full(len(points), np.inf, dtype=np.float32)
+    columns = np.ascontiguousarray(points.T)
     for i in range(1, count):
-        nearest = np.minimum(nearest, ((points - points[chosen[i - 1]]) ** 2).sum(axis=1))
+        x, y, z = columns - points[chosen[i - 1], :, None]
+        nearest = np.minimum(nearest, x * x + y * y + z * z)
         chosen[i] = int(nearest.argmax())
     return chosen
 
@@ -58,6 +61,11 @@ class BallCrop(NamedTuple):
     ball_rows: NDArray[np.int64]  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: NDArray[np.int64]  # (P,) ascending, 0..A-1
     radius: float  # metres
+
+    def bounds(self, ball: Int64) -> tuple[Int64, Int64]:
+        """Places in `ball_rows` where the points of balls (M,) begin, and where they end."""
+        ends = np.searchsorted(self.ball_of_point, np.arange(ball.max(initial=-1) + 2))
+        return ends[ball], ends[ball + 1]
 
 
 def crop_balls(
@@ -246,11 +254,12 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
     """
     boxes = gripper.boxes(gripper.max_opening, gripper.max_tip_z - gripper.tip_z)
     middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2  # (B, 3) each
-    normal = np.asarray(support.normal)
-    normal_in_hand = np.einsum("d,edk->ek", normal, T_cloud_hand[:, :3, :3])  # (E, 3)
-    origin_height = T_cloud_hand[:, :3, 3] @ normal - support.offset  # (E,)
-    lowest = (normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T).min(axis=1)
-    clearance: Float32 = origin_height + lowest
+    x, y, z = support.normal
+    rows = T_cloud_hand.astype(np.float64)
+    along = x * rows[:, 0] + y * rows[:, 1] + z * rows[:, 2]  # (E, 4): of the axes, the origin
+    normal_in_hand, origin_height = along[:, :3], along[:, 3] - support.offset
+    corners = normal_in_hand @ middle.T - np.abs(normal_in_hand) @ half.T  # (E, B)
+    clearance: Float32 = origin_height + np.min(list(corners.T), axis=0)
     return clearance.astype(np.float32)
 
 
@@ -278,21 +287,11 @@ def centred_grasps(
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
     wide = np.flatnonzero(np.abs(outward) > min_contact_offset(gripper))
-    ball = crop.ball_of_point[candidates.pair[wide]]
-    first = np.searchsorted(crop.ball_of_point, np.arange(ball.max(initial=-1) + 2))
-    low, high = np.full((2, len(wide)), np.nan, dtype=np.float32)
-    for number in np.unique(ball):
-        here = np.flatnonzero(ball == number)
-        near = points[crop.ball_rows[first[number] : first[number + 1]]]  # (P, 3)
-        turn, shift = axes[wide[here]], origin[wide[here]]
-        x, y, z = (
-            near @ turn[:, :, axis].T - np.einsum("kd,kd->k", shift, turn[:, :, axis])
-            for axis in range(3)
-        )  # (P, K) each, hand frame
-        between = np.abs(x) < gripper.pad_half_width + BESIDE_PADS
-        between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
-        low[here] = np.where(between, y, np.inf).min(axis=0)
-        high[here] = np.where(between, y, -np.inf).max(axis=0)
+    first, last = crop.bounds(crop.ball_of_point[candidates.pair[wide]])
+    half = gripper.pad_half_width + BESIDE_PADS
+    pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
+    hands = candidates.T_cloud_hand[wide]
+    low, high = extents_between(points, crop.ball_rows, first, last, hands, pads).T
     middle, width = (low + high) / 2, high - low
     moved = (width > WIDE * gripper.max_opening) & (width < gripper.max_opening)
     moved &= (np.abs(middle) > MIN_SHIFT) & (np.abs(middle) < MAX_SHIFT)

@@ -18,8 +18,9 @@ from edgegrasp_model.candidates.edge_grasps import (
     support_clearance,
 )
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import free_way
 from edgegrasp_model.hand_view import APPROACH_LENGTH
-from edgegrasp_model.kernels import extents_across, free_way, level_spread
+from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP
 
@@ -131,8 +132,7 @@ def _extents(
     points: Float32, crop: BallCrop, pair: Int64, frame: Float32, gripper: Gripper
 ) -> Float32:
     """How far the surface at contacts (M,) goes on between the pads, outward and inward (M, 2)."""
-    ball = crop.ball_of_point[pair]
-    first, last = (np.searchsorted(crop.ball_of_point, ball, side) for side in ("left", "right"))
+    first, last = crop.bounds(crop.ball_of_point[pair])
     strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
     return extents_across(points, crop.ball_rows, first, last, frame, strip)
 

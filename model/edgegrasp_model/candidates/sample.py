@@ -19,6 +19,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.candidates.outline import Outline, outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_kernels import distinct_hands
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
@@ -31,8 +32,10 @@ Bools = NDArray[np.bool_]
 SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
-MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 128  # of a scene
+MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
+FEWEST_EACH = 4  # of an object, however many there are
 OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
+NEAR, TURNED = 0.004, math.radians(10)  # TCPs and turns of hands that one score stands for
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
 SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
@@ -111,7 +114,8 @@ def sample_candidates(
         exhausted = len(approach_rows) <= len(approach_index) and len(passed) <= limit
         if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
             break
-    scored = rows_to_score(free, options, rng_candidates)
+    new = distinct_hands(candidates.T_cloud_hand @ gripper.T_hand_tcp, free, *alike(options))
+    scored = rows_to_score(free, new, options, rng_candidates)
     this.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
     candidates = candidates.take(scored)
@@ -147,7 +151,7 @@ def approach_points(
         wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
         wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
         wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
-        wanted = np.maximum(wanted, 1)
+        wanted = np.maximum(wanted, FEWEST_EACH)
     else:  # the largest objects first where there are fewer approach points than objects
         most = most or MAX_APPROACH_POINTS
         share = np.sqrt(size) / np.sqrt(size).sum() * most
@@ -202,11 +206,20 @@ def _constrained(
     return Attempt(candidates, outcome)
 
 
-def rows_to_score(free: Bools, options: DetectOptions, rng: np.random.Generator) -> Int64:
-    """Ascending rows of at most num_candidates candidates, those free of collision first."""
+def alike(options: DetectOptions) -> tuple[float, float]:
+    """Metres and radians within which suppression drops the other of two hands, whatever it is."""
+    rule = options.suppression
+    return (0.0, 0.0) if rule is None else (min(NEAR, rule.translation), min(TURNED, rule.rotation))
+
+
+def rows_to_score(
+    free: Bools, new: Bools, options: DetectOptions, rng: np.random.Generator
+) -> Int64:
+    """Ascending rows of at most num_candidates new candidates, those free of collision first."""
     if options.collision.mode == "ignore":
-        return random_rows(len(free), options.num_candidates, rng)
-    clear, hit = np.flatnonzero(free), np.flatnonzero(~free)
+        rows = np.flatnonzero(new)
+        return rows[random_rows(len(rows), options.num_candidates, rng)]
+    clear, hit = np.flatnonzero(free & new), np.flatnonzero(~free & new)
     rows = clear[random_rows(len(clear), options.num_candidates, rng)]
     if options.collision.mode == "penalise":
         rest = random_rows(len(hit), options.num_candidates - len(rows), rng)

@@ -19,11 +19,13 @@ from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import describe_hands
 from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
     EDGE_ROWS,
     PackedMlp,
     by_chunks,
+    float32_inference,
     in_chunks,
     maximum,
     mlp,
@@ -179,7 +181,29 @@ def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
     """Maximum and mean over the points (E, P, 6) that there are of their features: (E, 2 C)."""
     positions, normals = torch.split(points, 3, dim=2)
     unit = torch.cat((positions / POINT_UNIT, normals), dim=2)  # (E, P, 6)
+    encoded = encoder(unit)  # (E, P, C)
+    if float32_inference(encoded):
+        pooled = torch.zeros(len(encoded), 2 * encoded.shape[2])
+        _pool(encoded.numpy(), count.numpy(), pooled.numpy())
+        return pooled
     there = torch.arange(points.shape[1], device=points.device) < count.unsqueeze(1)  # (E, P)
-    features = F.relu(encoder(unit)) * there.unsqueeze(2)  # (E, P, C), none below 0
+    features = F.relu(encoded) * there.unsqueeze(2)  # (E, P, C), none below 0
     mean = features.sum(dim=1) / count.clamp_min(1).unsqueeze(1)  # (E, C)
     return torch.cat((maximum(features, dim=1), mean), dim=1)  # (E, 2 C)
+
+
+@compiled("contract", "nsz")
+def _pool(features: Float32, count: NDArray[np.int64], pooled: Float32) -> None:
+    """Maximum and mean of the ReLU of the first `count` (E,) of features (E, P, C)."""
+    channels = features.shape[2]
+    zero = np.float32(0.0)
+    for e in range(len(count)):
+        largest, mean = pooled[e, :channels], pooled[e, channels:]
+        for p in range(count[e]):
+            here = features[e, p]
+            for c in range(channels):
+                value = max(here[c], zero)
+                largest[c] = max(largest[c], value)
+                mean[c] += value
+        for c in range(channels):
+            mean[c] /= np.float32(max(count[e], 1))

@@ -21,6 +21,7 @@ from edgegrasp_model.scene.cloud import (
     CanonicalFrame,
     CheckedCloud,
     Cloud,
+    Neighbors,
     Voxels,
     assumed_viewpoint,
     estimate_normals,
@@ -155,11 +156,14 @@ def build_scene(
     if counts["voxels"] > max_voxels:
         raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
     middles = voxels.mean(canonical)
-    kept = statistical_outlier_removal(middles)
+    near = Neighbors.within(middles)
+    kept = statistical_outlier_removal(near)
     counts["kept"] = int(kept.sum())
     if counts["kept"] < MIN_POINTS:
         return None
-    cloud = Cloud(middles[kept], _normals(sent, middles, kept, voxels, frame, viewpoints))
+    normals = estimate_normals(middles, near)[kept]
+    normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
+    cloud = Cloud(middles[kept], normals)
     in_cloud = frame.points_in_cloud(middles)
     number = voxels.commonest(selected.number)[kept]
 
@@ -295,12 +299,12 @@ def near_things(plan: Float64, number: Int64) -> Bools:
     """Which points (M,), with places (M, 2) along the support, a hand at any thing could meet."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
-    cell = np.floor((plan - plan.min(axis=0)) / PLAN_CELL).astype(np.int64)
-    held = np.zeros(cell.max(axis=0) + 1, dtype=bool)
-    held[tuple(cell[number >= 0].T)] = True
+    x, y = (((axis - axis.min()) / PLAN_CELL).astype(np.int64) for axis in plan.T)
+    held = np.zeros((x.max() + 1, y.max() + 1), dtype=bool)
+    held[x[number >= 0], y[number >= 0]] = True
     square = np.ones((3, 3), dtype=bool)
     near = ndimage.binary_dilation(held, square, iterations=math.ceil(REACH / PLAN_CELL))
-    return np.asarray(near[tuple(cell.T)])
+    return np.asarray(near[x, y])
 
 
 def near_workspace_side(
@@ -366,22 +370,22 @@ def near_workspace(sent: CheckedCloud, box: Workspace | None, around: float) -> 
     return sent if box is None else sent.take(inside_workspace(sent.points, box, around))
 
 
-def _normals(
+def _turned_normals(
     sent: CheckedCloud,
-    middles: Float32,
+    points: Float32,
+    normals: Float32,
     kept: Bools,
     voxels: Voxels,
     frame: CanonicalFrame,
     viewpoints: NDArray[np.float64] | None,
 ) -> Float32:
-    """Unit normals of the kept voxels: those given, else estimated and turned to the camera."""
-    points = middles[kept]
+    """Unit normals of the kept voxels: those given, else the estimated, turned to the camera."""
     seen_from = assumed_viewpoint(points, UP)
     if viewpoints is not None:
         seen_from = frame.points(viewpoints).astype(np.float32)
         if len(viewpoints) > 1 and sent.view_ids is not None:
             seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
-    normals = orient_normals(points, estimate_normals(points), seen_from)
+    normals = orient_normals(points, normals, seen_from)
     if sent.normals is None:
         return normals
     given = frame.directions(voxels.mean(_unit(sent.normals))[kept])

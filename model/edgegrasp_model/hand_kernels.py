@@ -1,0 +1,400 @@
+"""Loops over the points that each hand may meet or see, compiled to machine code by Numba."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.kernels import Bools, Float32, Float64, Int64, columns_of, compiled
+
+BLOCK = 64  # points at a time that are passed over where none can be near
+SLACK = 1e-5  # metres that float32 may be off, many times over
+
+
+def points_in_hand_boxes(
+    points: Float32, T_cloud_hand: Float32, low: Float32, high: Float32
+) -> tuple[Int64, Int64, Float32]:
+    """Points between two corners of hand frames.
+
+    Args:
+        points: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        low: (3,) corner, hand frame, metres.
+        high: (3,) corner.
+
+    Returns:
+        Hand (P,) ascending, row (P,) ascending within each, position (P, 3) in its frame.
+    """
+    columns, turn, shift = columns_of(points), *_to_hand(T_cloud_hand)
+    count = np.empty(len(turn), dtype=np.int64)
+    _count_within(columns, turn, shift, low, high, count)
+    hand = np.repeat(np.arange(len(turn)), count)
+    row = np.empty(len(hand), dtype=np.int64)
+    position = np.empty((len(hand), 3), dtype=np.float32)
+    _fill_within(columns, turn, shift, low, high, np.cumsum(count) - count, row, position)
+    return hand, row, position
+
+
+def any_point_in_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Bools:
+    """Which hands (E,) have a point (N, 3) in one of their boxes (B, 2, 3), hand frame."""
+    turn, shift = _to_hand(T_cloud_hand)
+    hit = np.zeros(len(turn), dtype=np.bool_)
+    _meet(columns_of(points), turn, shift, boxes.astype(np.float32), hit)
+    return hit
+
+
+def signed_distance_to_boxes(points: Float32, T_cloud_hand: Float32, boxes: Float64) -> Float32:
+    """Signed distance (E,) of points (N, 3) to the boxes (B, 2, 3) of each hand, the least."""
+    turn, shift = _to_hand(T_cloud_hand)
+    middle, half = boxes.mean(axis=1), (boxes[:, 1] - boxes[:, 0]) / 2
+    nearest = np.full(len(turn), np.inf, dtype=np.float32)
+    extents = np.stack((middle, half), axis=1).astype(np.float32)
+    _nearest_to_boxes(columns_of(points), turn, shift, extents, nearest)
+    return nearest
+
+
+def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: float) -> Float32:
+    """How far (E,) hands can move along their z until a box has a point right ahead, metres.
+
+    Args:
+        points: (N, 3) of the cloud.
+        T_cloud_hand: (E, 4, 4).
+        boxes: (B, 2, 3) of the hand, hand frame.
+        behind: Metres of way behind a box in which points are in its way too.
+
+    Returns:
+        Negative where a hand would have to move back; infinity where nothing is ahead.
+    """
+    turn, shift = _to_hand(T_cloud_hand)
+    way = np.full(len(turn), np.inf, dtype=np.float32)
+    _until_met(columns_of(points), turn, shift, boxes.astype(np.float32), np.float32(behind), way)
+    return way
+
+
+def extents_between(
+    points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
+) -> Float32:
+    """From where to where hands have something between their pads.
+
+    Args:
+        points: (N, 3) of the cloud.
+        rows: (P,) of points to look at, group after group.
+        first: (E,) places in `rows` where the group of each hand begins.
+        last: (E,) and ends.
+        T_cloud_hand: (E, 4, 4).
+        pads: (2, 2) least and greatest x and z of the pads, hand frame.
+
+    Returns:
+        (E, 2) least and greatest y of those points; infinite, and less than nothing, of none.
+    """
+    turn, shift = _to_hand(T_cloud_hand)
+    extent = np.empty((len(turn), 2), dtype=np.float32)
+    _between_pads(columns_of(points[rows]), first, last, turn, shift, pads, extent)
+    return extent
+
+
+def distance_behind(
+    surface: Float32,
+    turn: NDArray[np.floating],
+    shift: NDArray[np.floating],
+    places: Float32,
+    cell: float,
+) -> Float32:
+    """How far places of some hands lie behind the first surface that a camera saw.
+
+    Args:
+        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle one ahead; inf
+            where nothing was seen.
+        turn: (E, 3, 3) from each hand's frame to the camera's: across, down, ahead.
+        shift: (E, 3) of each hand in the camera's frame.
+        places: (S, 3) hand frame.
+        cell: Tangent of the angle of a cell.
+
+    Returns:
+        (E, S) metres; 0 in front of the surface, and where nothing was seen.
+    """
+    behind = np.zeros((len(turn), len(places)), dtype=np.float32)
+    turn = np.ascontiguousarray(turn, dtype=np.float32)
+    _behind(surface, turn, shift.astype(np.float32), places, np.float32(1.0 / cell), behind)
+    return behind
+
+
+def distinct_hands(T_cloud_tcp: Float32, first: Bools, near: float, angle: float) -> Bools:
+    """Which hands are near no other one that was kept before them.
+
+    Args:
+        T_cloud_tcp: (E, 4, 4).
+        first: (E,) which of them go before the others.
+        near: Metres between two TCPs,
+        angle: and radians between two hands within which they are near. A hand turned by 180
+            degrees about its approach is the same.
+    """
+    order = np.argsort(~first, kind="stable")
+    kept = np.zeros(len(order), dtype=np.bool_)
+    turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
+    place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
+    limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
+    _keep_distinct(order, place, turn, limits, kept)
+    return kept
+
+
+def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
+    """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
+    turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
+    return turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
+
+
+@compiled("contract")
+def _position(
+    px: np.float32, py: np.float32, pz: np.float32, turn: Float32, shift: Float32
+) -> tuple[np.float32, np.float32, np.float32]:
+    return (
+        turn[0, 0] * px + turn[0, 1] * py + turn[0, 2] * pz + shift[0],
+        turn[1, 0] * px + turn[1, 1] * py + turn[1, 2] * pz + shift[1],
+        turn[2, 0] * px + turn[2, 1] * py + turn[2, 2] * pz + shift[2],
+    )
+
+
+@compiled("contract")
+def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Float32) -> bool:
+    inside: bool = (
+        (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
+def _blocks(columns: Float32) -> Float32:
+    """Spheres (K, 4) around BLOCK points at a time: middle and radius."""
+    count = columns.shape[1]
+    sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
+    for k in range(len(sphere)):
+        block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+        furthest = np.float32(0.0)
+        for d in range(3):
+            sphere[k, d] = (block[d].min() + block[d].max()) / np.float32(2.0)
+        for i in range(block.shape[1]):
+            x, y, z = (
+                block[0, i] - sphere[k, 0],
+                block[1, i] - sphere[k, 1],
+                block[2, i] - sphere[k, 2],
+            )
+            furthest = max(furthest, x * x + y * y + z * z)
+        sphere[k, 3] = np.sqrt(furthest) + np.float32(SLACK)
+    return sphere
+
+
+@compiled("contract")
+def _around_all(boxes: Float32) -> tuple[Float32, Float32]:
+    """Low and high corner (3,) of the box around boxes (B, 2, 3)."""
+    low, high = boxes[0, 0].copy(), boxes[0, 1].copy()
+    for b in range(1, len(boxes)):
+        low, high = np.minimum(low, boxes[b, 0]), np.maximum(high, boxes[b, 1])
+    return low, high
+
+
+@compiled("contract")
+def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
+    """Whether a point of a block may lie between two corners of a hand's frame."""
+    x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
+    r = sphere[3]
+    inside: bool = (
+        (x + r > low[0])
+        & (x - r < high[0])
+        & (y + r > low[1])
+        & (y - r < high[1])
+        & (z + r > low[2])
+        & (z - r < high[2])
+    )
+    return inside
+
+
+@compiled("contract")
+def _count_within(
+    columns: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32, count: Int64
+) -> None:
+    sphere = _blocks(columns)
+    for e in range(len(turn)):
+        found = 0
+        for k in range(len(sphere)):
+            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+                xs, ys, zs = block[0], block[1], block[2]
+                for i in range(len(xs)):
+                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                    found += _between(x, y, z, low, high)
+        count[e] = found
+
+
+@compiled("contract")
+def _fill_within(
+    columns: Float32,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    first: Int64,
+    row: Int64,
+    position: Float32,
+) -> None:
+    sphere = _blocks(columns)
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    for e in range(len(turn)):
+        place = first[e]
+        for k in range(len(sphere)):
+            if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                for i in range(k * BLOCK, min((k + 1) * BLOCK, len(xs))):
+                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                    if _between(x, y, z, low, high):
+                        row[place] = i
+                        position[place, 0], position[place, 1], position[place, 2] = x, y, z
+                        place += 1
+
+
+@compiled("contract")
+def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: Bools) -> None:
+    sphere = _blocks(columns)
+    least, most = _around_all(boxes)
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            if not _may_reach(sphere[k], turn[e], shift[e], least, most):
+                continue
+            inside = 0
+            for b in range(len(boxes)):
+                low, high = boxes[b, 0], boxes[b, 1]
+                if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                    block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+                    xs, ys, zs = block[0], block[1], block[2]
+                    for i in range(len(xs)):
+                        x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                        inside += _between(x, y, z, low, high)
+            if inside:
+                hit[e] = True
+                break
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_boxes(
+    columns: Float32, turn: Float32, shift: Float32, extents: Float32, nearest: Float32
+) -> None:
+    sphere = _blocks(columns)
+    for e in range(len(turn)):
+        for k in range(len(sphere)):
+            block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+            for b in range(len(extents)):
+                middle = sphere[k : k + 1, :3].T
+                if (
+                    _nearest_to_box(middle, turn[e], shift[e], extents[b]) - sphere[k, 3]
+                    < nearest[e]
+                ):
+                    here = _nearest_to_box(block, turn[e], shift[e], extents[b])
+                    nearest[e] = min(nearest[e], here)
+
+
+@compiled("contract", "nnan", "nsz", "reassoc")
+def _nearest_to_box(columns: Float32, turn: Float32, shift: Float32, extent: Float32) -> np.float32:
+    xs, ys, zs = columns[0], columns[1], columns[2]
+    zero = np.float32(0.0)
+    middle, half = extent[0], extent[1]
+    apart, deepest = np.float32(np.inf), zero  # squared distance outside, depth inside
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        x = abs(x - middle[0]) - half[0]
+        y = abs(y - middle[1]) - half[1]
+        z = abs(z - middle[2]) - half[2]
+        deepest = min(deepest, max(x, y, z))
+        x, y, z = max(x, zero), max(y, zero), max(z, zero)
+        apart = min(apart, x * x + y * y + z * z)
+    nearest: np.float32 = deepest if deepest < zero else np.sqrt(apart)
+    return nearest
+
+
+@compiled("contract")
+def _until_met(
+    columns: Float32,
+    turn: Float32,
+    shift: Float32,
+    boxes: Float32,
+    behind: np.float32,
+    way: Float32,
+) -> None:
+    sphere = _blocks(columns)
+    for e in range(len(turn)):
+        nearest = np.float32(np.inf)
+        for b in range(len(boxes)):
+            low, high = boxes[b, 0].copy(), boxes[b, 1].copy()
+            front = high[2]
+            low[2] -= behind
+            for k in range(len(sphere)):
+                high[2] = front + nearest  # what is further away changes nothing
+                if not _may_reach(sphere[k], turn[e], shift[e], low, high):
+                    continue
+                block = columns[:, k * BLOCK : (k + 1) * BLOCK]
+                xs, ys, zs = block[0], block[1], block[2]
+                for i in range(len(xs)):
+                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+                    above = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+                    if above & (z > low[2]):
+                        nearest = min(nearest, z - front)
+        way[e] = nearest
+
+
+@compiled("contract")
+def _between_pads(
+    columns: Float32,
+    first: Int64,
+    last: Int64,
+    turn: Float32,
+    shift: Float32,
+    pads: Float32,
+    extent: Float32,
+) -> None:
+    low, high = pads
+    for e in range(len(turn)):
+        xs, ys, zs = columns[:, first[e] : last[e]]
+        least, most = np.float32(np.inf), np.float32(-np.inf)
+        for i in range(len(xs)):
+            x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
+            between = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
+            least = min(least, y if between else np.float32(np.inf))
+            most = max(most, y if between else np.float32(-np.inf))
+        extent[e, 0], extent[e, 1] = least, most
+
+
+@compiled("contract")
+def _keep_distinct(
+    order: Int64, place: Float32, turn: Float32, limits: Float32, kept: Bools
+) -> None:
+    rows, found = np.empty(len(order), np.int64), 0
+    xs, ys, zs = np.empty((3, len(order)), np.float32)
+    for row in order:
+        px, py, pz = place[row]
+        kept[row] = True
+        for k in range(found):
+            x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
+            if x * x + y * y + z * z < limits[0]:
+                along = (turn[row] * turn[rows[k]]).sum(axis=0)  # cosines of matching axes
+                if along[2] + abs(along[0] + along[1]) > limits[1]:
+                    kept[row] = False
+                    break
+        if kept[row]:
+            xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
+            found += 1
+
+
+@compiled("contract")
+def _behind(
+    surface: Float32,
+    turn: Float32,
+    shift: Float32,
+    places: Float32,
+    cells: np.float32,
+    behind: Float32,
+) -> None:
+    half = len(surface) // 2
+    for e in range(len(turn)):
+        for s in range(len(places)):
+            x, y, z = _position(places[s, 0], places[s, 1], places[s, 2], turn[e], shift[e])
+            ahead = max(z, np.float32(1e-6))
+            i, j = np.floor(x / ahead * cells), np.floor(y / ahead * cells)
+            if (abs(i) <= half) & (abs(j) <= half):
+                first = surface[int(i) + half, int(j) + half]
+                behind[e, s] = max(np.sqrt(x * x + y * y + z * z) - first, np.float32(0.0))
