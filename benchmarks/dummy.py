@@ -30,8 +30,8 @@ from edgegrasp_model.scene.cloud import CloudInput, check_cloud, check_edges, ch
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
+APPROACH_POINTS = 32  # where a request names no number
 GRASPS = 10  # made at most
-APPROACH_POINTS = 32  # where a request does not say
 WARNING = "The dummy detector made these grasps up."
 SECONDS = float(os.environ.get("DUMMY_SECONDS", "0"))  # of service time
 
@@ -56,10 +56,10 @@ class DummyDetector:
 
     def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
         """Draw approach points, the same ones for the same cloud and options."""
-        count = options.num_approach_points or APPROACH_POINTS
-        points = check_cloud(cloud, count).points
+        points = check_cloud(cloud, options.num_approach_points or 1).points
         random = np.random.default_rng(options.seed)
-        drawn = random.choice(len(points), count, replace=False)
+        wanted = options.num_approach_points or min(APPROACH_POINTS, len(points))
+        drawn = random.choice(len(points), wanted, replace=False)
         scores = np.sort(random.random(len(drawn), dtype=np.float32))[::-1]
         counts = {"points": len(points), "scored": len(drawn)}
         counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own

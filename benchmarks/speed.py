@@ -37,8 +37,8 @@ from edgegrasp_model.networks.config import (
     NetworkConfig,
 )
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.camera import Observation, TableView
+from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.recipes import recipe
 
@@ -68,7 +68,7 @@ def main() -> None:
         "paper": lambda: {
             name: beside_textbook(config, observation) for name, config in PAPER.items()
         },
-        "simulator": lambda: {str(kind): simulator(kind) for kind in SceneKind},
+        "simulator": lambda: {str(kind): simulator(kind) for kind in CLUTTER},
         "server": server_footprint,
     }
     for name, part in parts.items():
@@ -111,7 +111,7 @@ def shipped() -> dict[str, Any]:
 
     Processor seconds on one thread, and seconds of the clock on two.
     """
-    scenes = {str(kind): observe(kind, views=1) for kind in SceneKind}
+    scenes = {str(kind): observe(kind, views=1) for kind in CLUTTER}
     detectors = {name: detector(recipe(name).network) for name in SHIPPED}
     runs = {
         (name, scene): partial(ours.detect, seen.cloud, request(seen))
@@ -138,10 +138,11 @@ def server_footprint() -> dict[str, float]:
     with served() as server:
         ready = time.perf_counter() - start
         at_rest = server.memory()
-        cloud = observe().cloud
+        seen = observe(views=1, table="auto")
+        viewpoint = tuple(seen.camera_position.tolist())
         with GraspClient(server.grpc_address) as client:
             for seed in range(10):
-                client.detect(cloud, seed=seed, num_approach_points=32, num_candidates=2000)
+                client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": server.memory()}
 
 
@@ -170,12 +171,14 @@ def simulator(kind: SceneKind) -> dict[str, float]:
     }
 
 
-def observe(kind: SceneKind = SceneKind.PILE, views: int = 2) -> Observation:
+def observe(
+    kind: SceneKind = SceneKind.PILE, views: int = 2, table: TableView = "known"
+) -> Observation:
     """A scene of the built-in objects; a pile seen from two sides has some 15,000 points."""
     with ClutterSimulation() as simulation:
         simulation.reset(kind, np.random.default_rng(1))
         streams = np.random.default_rng(1), np.random.default_rng(2)
-        return simulation.observe(*streams, num_views=views)
+        return simulation.observe(*streams, num_views=views, table=table)
 
 
 def detector(config: NetworkConfig) -> GraspDetector:

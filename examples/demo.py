@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
-from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.camera import Observation, crop
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.simulation import ClutterSimulation
 
@@ -29,7 +29,7 @@ def main(seed: int, output: Path) -> None:
     scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
     with ClutterSimulation() as simulation:
         placed = simulation.reset("pile", scene, num_objects=6)
-        seen = simulation.observe(camera, noise)
+        seen = simulation.observe(camera, noise, table="auto")
         print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
 
         over_grpc, over_rest = detect_over_both(seen, seed)
@@ -51,7 +51,7 @@ def main(seed: int, output: Path) -> None:
     drawn = over_grpc.grasps[:LISTED]
     draw_grasps(
         output / "grasps.png",
-        seen.cloud,
+        crop(seen.cloud, seen.workspace, 0.05),
         drawn,
         camera_position=seen.camera_position,
         title=f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}.",
@@ -60,12 +60,13 @@ def main(seed: int, output: Path) -> None:
 
 
 def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection]:
-    """Grasps of one cloud over gRPC and over REST, from a server of our own."""
+    """Grasps of one cloud over gRPC and over REST, from a server of our own.
+
+    The table is in the cloud: the server finds it, and what stands on it.
+    """
     options: DetectOptions = {
         "seed": seed,
         "viewpoint": seen.camera_position.tolist(),
-        "support": {"normal": (0.0, 0.0, 1.0), "offset": seen.table_height},
-        "num_approach_points": 96,
         "top_k": 20,
         "suppression": {"translation": 0.02, "rotation": 3.2},  # one grasp every 2 cm
     }

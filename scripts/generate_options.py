@@ -403,7 +403,8 @@ def _default(name: str, field: Schema, parent: Schema) -> str:
     if name in parent.get("required", ()):
         return "required"
     if isinstance(field["default"], dict):
-        return "those of the object"
+        only = field["default"].get("kind") if len(field["default"]) == 1 else None
+        return f'`"{only}"`' if only else "those of the object"
     return f"`{json.dumps(field['default'])}`"
 
 

@@ -40,7 +40,8 @@ Workers = Annotated[
 Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
 # Options of a detection that the simulation, the protocol or another flag decides.
 DECIDED = (
-    *("model", "gripper", "seed", "viewpoint", "up", "support", "workspace", "top_k", "debug"),
+    *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
+    *("top_k", "debug"),
 )
 
 

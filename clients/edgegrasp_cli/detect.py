@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 from numpy.typing import NDArray
 
@@ -83,7 +82,9 @@ def detect(
     with open_client(server, timeout, connection, weights, grippers, device) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if as_document:
-        print(json.dumps(_json_document(detection)))
+        from edgegrasp_service.worker.http_bodies import write
+
+        print(write(detection).decode())
     else:
         _print_detection(detection)
 
@@ -233,32 +234,6 @@ def _on_mask(options: Mapping[str, Any], mask: NDArray[Any]) -> dict[str, Any]:
         region = options.get(name) or {}
         regions[name] = region | {"exclude": [*region.get("exclude", ()), outside]}
     return regions
-
-
-def _json_document(detection: Any) -> dict[str, Any]:
-    """The same document as the HTTP API's.
-
-    Args:
-        detection: From the detector or from the client; their fields have the same names.
-    """
-    grasps = [_plain(vars(grasp)) for grasp in detection.grasps]
-    debug = None if detection.debug is None else _plain(vars(detection.debug))
-    return dict(vars(detection)) | {"grasps": grasps, "debug": debug}
-
-
-def _plain(fields: dict[str, Any]) -> dict[str, Any]:
-    """Arrays as lists, floats as float32, NaN as None."""
-    plain = dict(fields)
-    for name, value in fields.items():
-        if isinstance(value, float):
-            plain[name] = float(np.float32(value))
-        elif isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            numbers = value.astype(np.float32).astype(object)
-            numbers[np.isnan(value)] = None
-            plain[name] = numbers.tolist()
-        elif isinstance(value, np.ndarray):
-            plain[name] = value.tolist()
-    return plain
 
 
 def _print_detection(detection: Any) -> None:

@@ -40,7 +40,8 @@ def experiment(
     rounds: Annotated[int, Option(min=1, help="Rounds of each case for each seed.")] = 100,
     seeds: Seeds = None,
     scene: Annotated[
-        list[str] | None, Option(help="packed or pile; may be repeated. Else both.")
+        list[str] | None,
+        Option(help="packed, pile, bin, table; may be repeated. Else the first two."),
     ] = None,
     protocol: Annotated[str, Option(help="The protocol that is varied.")] = "edgegrasp",
     model: Annotated[
@@ -61,12 +62,12 @@ def experiment(
     """
     from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores
     from edgegrasp_sim.experiments import cases_of
-    from edgegrasp_sim.objects import SceneKind
+    from edgegrasp_sim.objects import CLUTTER, SceneKind
     from edgegrasp_sim.protocol import load_protocol
     from edgegrasp_sim.results import ResultFolder, record_of
 
     with interruptible("experiment", resumes=True):
-        scenes = [SceneKind(each) for each in scene or [kind.value for kind in SceneKind]]
+        scenes = [SceneKind(each) for each in scene or CLUTTER]
         asked = SAMPLES | parse_option_flags(options)
         cases = cases_of(name, load_protocol(protocol), scenes, model or [""], output)
         done: list[dict[str, Any]] = []

@@ -1,7 +1,7 @@
 """What a server answers, as typed values, and how they are read from either transport."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -74,10 +74,10 @@ class Detection:
     seconds: dict[str, float]  # spent in each stage, and their `total`
     model: str  # name of the weights used
     warnings: list[str]
+    debug: DebugInfo | None  # where `debug` is asked for
+    support: FoundSupport | None  # given or found
     up: Float32  # (3,) unit, away from gravity, as it was used
-    support: FoundSupport | None = None  # given or found
-    objects: list[DetectedObject] = field(default_factory=list)  # the largest first
-    debug: DebugInfo | None = None  # where `debug` is asked for
+    objects: list[DetectedObject]  # the largest first
 
 
 @dataclass(frozen=True, eq=False)

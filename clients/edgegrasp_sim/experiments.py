@@ -20,7 +20,7 @@ FLIPPED_PERCENT = (0.0, 5.0, 10.0, 25.0, 50.0)
 # Approach points and candidates, named as in the paper's table.
 SAMPLES = {"16-1k": (16, 1000), "32-2k": (32, 2000), "64-4k": (64, 4000)}
 BASELINES = ("edge-sample", "oracle", "oracle-own")
-COLOURS = {"packed": "#2f6db3", "pile": "#e08a1e"}
+COLOURS = {"packed": "#2f6db3", "pile": "#e08a1e", "bin": "#3a9d5d", "table": "#8a4fb0"}
 STYLES = ("-", "--", ":", "-.")  # of the models
 
 

@@ -60,6 +60,9 @@ class SceneKind(StrEnum):
         raise ValueError(f"scene is {value!r}; choose one of {', '.join(cls)}")
 
 
+CLUTTER = (SceneKind.PACKED, SceneKind.PILE)  # those of the published clutter removal
+
+
 @dataclass(frozen=True, slots=True)
 class ObjectModel:
     """An object that can be put into a scene.

@@ -91,7 +91,8 @@ class Prepared:
     def warn_of_few_points(self) -> None:
         """Say that too few points are left for a scene."""
         self.warnings.append(
-            f"only {self.counts['kept']} points are left after cropping and cleaning."
+            f"only {self.counts['kept']} points are left beside the support plane, what is far "
+            "from every thing, and outliers; see counts."
         )
 
     def total_seconds(self) -> dict[str, float]:

@@ -91,7 +91,7 @@ def camera_files(tmp_path: Path) -> list[str]:
 
 
 def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, run) -> None:
-    flags = (*camera_files, "--json", "--num-approach-points", "4", "--debug", "--seed", "3")
+    flags = (*camera_files, "--json", "--num-approach-points", "4", "--debug", "--support", "none")
     document = json.loads(run("detect", *flags))
     assert document["counts"]["points"] == 24 * 32
     assert document["counts"]["in_approach_region"] < document["counts"]["kept"]

@@ -4,13 +4,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 from typer.testing import CliRunner
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
+from edgegrasp_service.worker.job import Answer, Facts, Job
 
 HEAVY = {"torch", "open3d", "grpc", "pybullet", "fastapi", "uvicorn", "matplotlib", "httpx"}
 
@@ -76,12 +77,9 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
         response = grasp_pb2.DetectGraspsResponse(model=model, seconds={"total": seconds})
         return response.SerializeToString()
 
-    def replay(path: Path, settings: object) -> tuple[SimpleNamespace, ...]:
-        answer = SimpleNamespace(
-            body=body(path.stem, 2.0), error=None, facts=SimpleNamespace(grasps=7)
-        )
-        job = SimpleNamespace(transport=transport, method="DetectGrasps")
-        return job, SimpleNamespace(body=body("plus", 1.0)), answer
+    def replay(path: Path, settings: object) -> tuple[Job, Answer, Answer]:
+        job, facts = Job("DetectGrasps", transport, b"", 60.0), Facts(grasps=7)
+        return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
 
     recording = ModuleType("edgegrasp_service.recording")
     recording.replay = replay  # type: ignore[attr-defined]

@@ -65,8 +65,9 @@ class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
 
     def respond(self, request: httpx.Request) -> httpx.Response:
         if (problem := self._problem()) is None:
-            body = {"grasps": [], "counts": {}, "seconds": {}, "model": "fake"}
-            return httpx.Response(200, json=body | {"warnings": [], "debug": None})
+            body = {"grasps": [], "counts": {}, "seconds": {}, "model": "fake", "warnings": []}
+            found = {"debug": None, "support": None, "up": [0, 0, 1], "objects": []}
+            return httpx.Response(200, json=body | found)
         if not problem.kind:
             return httpx.Response(problem.status, text="<html>")
         told = {"detail": "what happened", "field": "f", "value": "v", "fix": "x"}

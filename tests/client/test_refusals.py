@@ -63,7 +63,6 @@ def test_options(options: dict[str, Any], field: str, client, cloud) -> None:
         ({"cloud": np.full((40, 3), np.nan)}, "cloud", "40 points with NaN"),
         ({"cloud": np.full((40, 3), 1e300)}, "cloud", "40 points with NaN or infinity"),
         ({"cloud": np.zeros((0, 3))}, "cloud", "no points"),
-        ({"cloud": np.zeros((3, 3))}, "cloud", "3 points for num_approach_points"),
         ({"cloud": np.zeros((40, 3), dtype=object)}, "cloud", "dtype object"),
         ({"cloud": [[0.0, 0.0, 0.0]]}, "cloud", "a list"),
         ({"cloud": "cloud.las"}, "cloud", "'cloud.las'"),

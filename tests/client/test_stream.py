@@ -28,12 +28,12 @@ def test_answers_are_those_of_single_requests(either_client, cloud) -> None:
 def test_errors_are_answers(either_client, cloud) -> None:
     requests = [
         StreamRequest(cloud, request_id="fine"),
-        StreamRequest(cloud[:3], request_id="few"),
+        StreamRequest(cloud[:0], request_id="empty"),
         StreamRequest(cloud, request_id="model", model="none of mine"),
         StreamRequest(cloud, request_id="fine again"),
     ]
     answers = list(either_client.detect_stream(requests))
-    assert [answer.request_id for answer in answers] == ["fine", "few", "model", "fine again"]
+    assert [answer.request_id for answer in answers] == ["fine", "empty", "model", "fine again"]
     kinds = [None if answer.error is None else type(answer.error) for answer in answers]
     assert kinds == [None, InvalidRequestError, UnknownModelError, None]
     assert (answers[1].error.field, answers[2].error.field) == ("cloud", "options.model")

@@ -323,6 +323,11 @@ def check_order(fields: dict, grasps: list[Grasp]) -> None:
         assert keys == sorted(keys, reverse=True)
         return
     worth = [g.score if is_free else g.score / 2 for g, is_free in zip(grasps, free, strict=True)]
+    if fields["order"] == "score":  # the best of each object come first
+        firsts = len({grasp.object for grasp in grasps if grasp.score >= 0.5})
+        assert all(a >= b - 1e-6 for a, b in itertools.pairwise(worth[:firsts]))
+        assert len({grasp.object for grasp in grasps[:firsts]}) == firsts
+        worth = worth[firsts:]
     sure = sum(value >= 0.9 for value in worth) if fields["order"] == "highest" else 0
     heights = [float(grasp.T_cloud_tcp[:3, 3] @ up) for grasp in grasps[:sure]]
     assert all(a >= b - 1e-5 for a, b in itertools.pairwise(heights))

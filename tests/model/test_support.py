@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import RansacPlane, SupportPlane, parse_options
+from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 from edgegrasp_model.scene.depth_scale import correct_depth_scale, depth_scale
 from edgegrasp_model.scene.scene import build_scene, select_points
@@ -64,6 +64,19 @@ def test_a_plane_that_is_too_steep_or_too_small_is_none(request_: RansacPlane) -
     cloud = rng.uniform(-0.3, 0.3, (1000, 3))
     points = np.concatenate([wall, cloud]).astype(np.float32)
     assert largest(points, request_, (0, 0, 1)) is None
+
+
+@given(seed=st.integers(0, SEED), things=st.integers(1, 3))
+def test_round_things_without_a_table_are_no_error(seed: int, things: int) -> None:
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(things, int(rng.integers(30, 600)), 3))
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    radius = rng.uniform(0.01, 0.06, (things, 1, 3)) * rng.uniform(0.3, 1.0, (things, 1, 3))
+    points = radius * direction + rng.uniform(-0.1, 0.1, (things, 1, 3)) + (0.0, 0.0, 0.6)
+    points = (points + rng.normal(0.0, 0.001, points.shape)).reshape(-1, 3).astype(np.float32)
+    seen = Seen(points, np.zeros(3), np.zeros(len(points), dtype=bool))
+    found = find_support(seen, AutoPlane(), None, 0.4, np.random.default_rng(0), [])
+    assert found is None or np.isclose(np.linalg.norm(found.plane.normal), 1.0)
 
 
 def test_a_steep_plane_is_found_where_it_may_be_steep() -> None:

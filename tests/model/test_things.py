@@ -125,10 +125,19 @@ def test_segments_are_the_objects_where_they_are_sent() -> None:
     cloud = render([table(), *boxes], T_world_camera)
     in_world = cloud.reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     near = np.nan_to_num(in_world, nan=9.0)
-    segment = np.where(boxes[2].distance(near) < 0.004, 7, 0).reshape(cloud.shape[:2])
+    segment = np.where(boxes[2].distance(near) < 0.004, 2**31 - 1, 0).reshape(cloud.shape[:2])
     found = detect(CloudInput(cloud, segment_ids=segment))
-    assert {grasp.object for grasp in found.grasps} == {7}
-    assert [thing.number for thing in found.objects] == [7]
+    assert {grasp.object for grasp in found.grasps} == {2**31 - 1}
+    assert [thing.number for thing in found.objects] == [2**31 - 1]
+
+
+def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
+    cloud = render([table(), *things(5)], camera(0.8, -1.5, 0.7))
+    segment = np.arange(1, cloud.shape[0] * cloud.shape[1] + 1).reshape(cloud.shape[:2])
+    found = detect(CloudInput(cloud, segment_ids=segment))
+    assert len(found.objects) > 256
+    assert found.counts["approach_points"] <= 128
+    assert found.grasps
 
 
 def test_without_a_support_in_view_everything_is_a_thing_and_the_answer_says_so() -> None:

@@ -58,15 +58,15 @@ def test_python_example_prints_five_grasps(dummy_server, cloud_file: Path) -> No
 
 
 def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(dummy_server, cloud_file) -> None:
-    few = cloud_file.with_name("few.npy")
-    np.save(few, np.zeros((3, 3), np.float32))
-    names = [str(cloud_file), str(few), str(cloud_file)]
+    empty = cloud_file.with_name("empty.npy")
+    np.save(empty, np.zeros((0, 3), np.float32))
+    names = [str(cloud_file), str(empty), str(cloud_file)]
     for address in (dummy_server.grpc_address, dummy_server.http_url):
         done = run(sys.executable, EXAMPLES / "04_stream_of_clouds.py", *names, "--server", address)
         first, second, third = done.stdout.splitlines()
         assert first == third
         assert first.startswith(f"{cloud_file}: score 0.")
-        assert second.startswith(f"{few}: cloud: got ")
+        assert second.startswith(f"{empty}: cloud: got ")
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")

@@ -50,7 +50,7 @@ async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray)
             await client.score(cloud, edges=np.array([[0, 1]]))
             await client.models()
             with pytest.raises(Exception, match="points"):
-                await client.detect(cloud[:2])
+                await client.detect(cloud[:0])
     found = await read(server)
     total = requests_total(found)
     for transport, fine, bad in (("grpc", "OK", "INVALID_ARGUMENT"), ("http", "200", "400")):
@@ -77,7 +77,7 @@ async def test_requests_are_counted_on_both_transports(serve, cloud: np.ndarray)
 async def test_streams_are_counted_by_result(serve, cloud: np.ndarray) -> None:
     server = (await serve()).server
     async with AsyncGraspClient(server.grpc_address) as client:
-        requests = [StreamRequest(points) for points in (cloud, cloud[:2], cloud)]
+        requests = [StreamRequest(points) for points in (cloud, cloud[:0], cloud)]
         answers = [answer async for answer in client.detect_stream(requests)]
     assert len(answers) == 3
     found = await read(server)

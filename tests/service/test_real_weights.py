@@ -83,7 +83,7 @@ def scene(box: np.ndarray) -> dict[str, np.ndarray]:
     points = np.concatenate([box, table]).astype(np.float32)
     return {
         "points": points,
-        "segment_ids": np.repeat(np.array([0, 1], np.int32), 6000),
+        "segment_ids": np.repeat(np.array([2, 1], np.int32), 6000),
         "view_ids": (points[:, 0] < 0).astype(np.int32),
     }
 

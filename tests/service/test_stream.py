@@ -58,7 +58,7 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, clou
     bad = request("negative", cloud)
     bad.timeout = -1.0
     empty = grasp_pb2.DetectGraspsStreamRequest(request_id="empty")
-    few = request("few", cloud[:5])
+    few = request("few", cloud[:5], num_approach_points=6)
     for message in (request("fine", cloud), empty, bad, few, request("again", cloud)):
         await stream.write(message)
     await stream.done_writing()

@@ -146,22 +146,23 @@ def approach_points(
     """
     number = scene.object_of_point[rows]
     objects, size = np.unique(number, return_counts=True)
-    if options.num_approach_points is None:
+    most = options.num_approach_points
+    if most is None and len(objects) <= MAX_APPROACH_POINTS:
         wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
         wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
         wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
         wanted = np.maximum(wanted, FEWEST_EACH)
     else:  # the largest objects first where there are fewer approach points than objects
-        share = np.sqrt(size) / np.sqrt(size).sum() * options.num_approach_points
+        most = most or MAX_APPROACH_POINTS
+        share = np.sqrt(size) / np.sqrt(size).sum() * most
         wanted = np.floor(share).astype(np.int64)
-        rest = options.num_approach_points - wanted.sum()
+        rest = most - wanted.sum()
         wanted[np.argsort(wanted - share, kind="stable")[:rest]] += 1
     chosen = []
-    for which, count in zip(objects, wanted, strict=True):
+    for which, count in zip(objects[wanted > 0], wanted[wanted > 0], strict=True):
         mine = rows[number == which]
         points = scene.cloud.points[mine]
-        if count > 0:
-            chosen.append(mine[sample_approach_points(points, count, options.sampling, rng)])
+        chosen.append(mine[sample_approach_points(points, count, options.sampling, rng)])
     return np.concatenate(chosen)
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
@@ -299,11 +300,13 @@ class Voxels:
         """Share (V,) of each voxel's points for which something holds (N,)."""
         return np.bincount(self.voxel, holds, len(self.size)) / self.size
 
-    def commonest(self, labels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-        """Commonest label (V,) in each voxel, of labels (N,) from 0 to count - 1."""
-        tally = np.bincount(self.voxel * count + labels, minlength=count * len(self.size))
-        best: NDArray[np.int64] = tally.reshape(-1, count).argmax(axis=1)
-        return best
+    def commonest(self, labels: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Commonest label (V,) in each voxel, of any labels (N,); the lowest of those as common."""
+        low, one = labels.min(), np.ones(len(labels), dtype=np.int64)
+        tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels), few of them
+        voxel = np.repeat(np.arange(len(self.size)), np.diff(tally.indptr))
+        order = np.lexsort((-tally.indices, tally.data, voxel))
+        return np.asarray(tally.indices[order[tally.indptr[1:] - 1]] + low, dtype=np.int64)
 
 
 def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:

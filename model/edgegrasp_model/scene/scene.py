@@ -165,7 +165,7 @@ def build_scene(
     normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
     cloud = Cloud(middles[kept], normals)
     in_cloud = frame.points_in_cloud(middles)
-    number = voxels.commonest(selected.number + 1, int(selected.number.max()) + 2)[kept] - 1
+    number = voxels.commonest(selected.number)[kept]
 
     def allowed(region: Region | None) -> Bools:
         if region is None:
@@ -384,7 +384,7 @@ def _turned_normals(
     if viewpoints is not None:
         seen_from = frame.points(viewpoints).astype(np.float32)
         if len(viewpoints) > 1 and sent.view_ids is not None:
-            seen_from = seen_from[voxels.commonest(sent.view_ids, len(viewpoints))[kept]]
+            seen_from = seen_from[voxels.commonest(sent.view_ids)[kept]]
     normals = orient_normals(points, normals, seen_from)
     if sent.normals is None:
         return normals

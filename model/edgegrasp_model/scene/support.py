@@ -31,6 +31,7 @@ VIEW = 12_000  # points that say what stands on a plane
 CELL = 0.02  # metres
 NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
 MAX_BELOW = 0.5  # share of what is seen at and right under a plane that lies under it
+MIN_AREA = 0.03  # square metres of a support that are seen: more than of an object's side
 BARE = 0.5  # share of the seen surface from which a plane is a support with nothing on it
 NOTHING_ON_IT = 0.02  # weight of a plane's own points beside those of things
 ALIKE = 0.7  # share of the best plane's worth from which another one is a doubt
@@ -240,6 +241,8 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
         for _ in range(REFINEMENTS):
             near = np.abs(plane.heights(points[left])) < thick[left]
             mine = left[near & (normals[left] @ plane.normal > ROUGHLY_SAME_WAY)]
+            if len(mine) < NEIGHBORS:  # on round things a plane slips off
+                break
             plane = _fitted(points[mine], weight[mine], plane.normal)
         planes.append(plane)
         gone = np.abs(plane.heights(points[left])) < 1.5 * thick[left]
@@ -312,12 +315,17 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
     distance, height = seen.distance(), plane.heights(seen.points)
     thick = thickness(distance)
     on = np.abs(height) < thick
+    size = int(on.sum())
+    if size == 0:
+        return 0.0
     if seen.viewpoint is not None and plane.heights(seen.viewpoint) < thick[on].mean():
         return 0.0
-    size, far = int(on.sum()), float(np.median(distance[on]))
+    far = float(np.median(distance[on]))
     below = (height < -3 * thick) & (height > -NEAR_BELOW)
     axes = plan_axes(plane.normal, seen.viewpoint, seen.points)
     plan = seen.points @ axes.T
+    if _area(plan[on]) < MIN_AREA:
+        return 0.0
     near_below = _over_hull(plan[on], plan[below])
     if near_below > MAX_BELOW * (near_below + size):
         return 0.0
@@ -332,6 +340,12 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
     through = _seen_through(seen, height, height < -3 * thick, plan[on], axes, plane)
     worth = math.sqrt((min(things, size) + NOTHING_ON_IT * size) * size) / far
     return max(worth * size / (size + near_below) - through / far, 0.0)
+
+
+def _area(plan: Float64) -> float:
+    """Square metres of the cells that points (N, 2) of a plane lie in."""
+    cells = np.unique(np.floor(plan / CELL).astype(np.int64), axis=0)
+    return len(cells) * CELL**2
 
 
 def _over_hull(on: Float64, others: Float64) -> int:

@@ -20,7 +20,7 @@ from werkzeug.http import parse_options_header
 
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Detection, Grasp, Scoring
+from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.worker.formats import FILE_FORMATS
 from edgegrasp_service.worker.job import Job
@@ -87,8 +87,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     fields = vars(value)
-    if not isinstance(value, Grasp):
-        return fields
     floats = {name: one for name, one in fields.items() if isinstance(one, float)}
     return fields | {name: float(np.float32(one)) for name, one in floats.items()}
 

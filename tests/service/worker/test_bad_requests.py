@@ -120,8 +120,8 @@ CASES = {
     "NaN": Malformed("cloud", "row 17", "finite", points=spoiled(17, NAN)),
     "millimetres": Malformed("cloud", "millimetres", "divide by 1000", points=POINTS * 1000),
     "fewer points than approach points": Malformed(
-        "cloud", "5 points for num_approach_points = 32", "lower options.num",
-        {"num_approach_points": 32}, points=POINTS[:5],
+        "cloud", "5 points for num_approach_points = 6", "lower options.num", points=POINTS[:5],
+        options={"num_approach_points": 6},
     ),
     "normals for other points": Malformed(
         "normals", "shape (59, 3)", "60 points", points=POINTS, beside={"normals": POINTS[1:]}

@@ -111,6 +111,7 @@ ransac = st.fixed_dictionaries(
         "min_share": numbers(1e-3, 1.0),
     },
 )
+auto = st.just({"kind": "auto"})
 names = st.text(st.characters(exclude_categories=("Cs",)), max_size=20)
 
 
@@ -124,18 +125,17 @@ def drawn(schema: dict[str, Any]) -> st.SearchStrategy[Any]:
         case "integer":
             return st.integers(schema["minimum"], schema.get("maximum", 2**63 - 1))
         case "number":
-            return numbers(schema.get("minimum", 0.01), schema["maximum"])
+            return numbers(schema.get("minimum", 1e-6), schema["maximum"])
     return names
 
 
-OPTIONS = {
-    name: drawn(schema) for name, schema in DetectOptions.model_json_schema()["properties"].items()
-} | {
+SCHEMAS = DetectOptions.model_json_schema()["properties"]
+OPTIONS = {name: drawn(schema) for name, schema in SCHEMAS.items() if "anyOf" not in schema} | {
     "gripper": st.none() | st.sampled_from(["panda", "robotiq-2f-85", "7"]) | gripper,
     "viewpoint": st.none() | vector | st.lists(vector, min_size=1, max_size=4),
     "num_approach_points": st.none() | st.integers(1, 256),
-    "up": direction,
-    "support": st.none() | plane | ransac,
+    "up": st.none() | direction,
+    "support": st.none() | st.sampled_from(["auto", "ransac", "none"]) | plane | ransac | auto,
     "workspace": st.none() | corners(),
     "approach_region": st.none() | region,
     "contact_region": st.none() | region,
