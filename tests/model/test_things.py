@@ -140,6 +140,19 @@ def test_a_segment_for_every_pixel_takes_no_more_approach_points() -> None:
     assert found.grasps
 
 
+def test_a_speck_before_a_thing_is_no_part_of_it() -> None:
+    boxes, T_world_camera = [box((0, 0, 0.05), (0.03, 0.04, 0.05))], camera(0.8, -1.5, 0.7)
+    cloud = render([table(), *boxes], T_world_camera)
+    middle = T_world_camera[:3, :3].T @ (boxes[0].center - T_world_camera[:3, 3])
+    row, column = (round(270 * middle[k] / middle[2]) + m for k, m in ((1, 120), (0, 160)))
+    cloud[row - 12 : row - 4, column - 3 : column + 3] *= 0.94  # 4 cm before the box
+    found = detect(cloud, debug=True)
+    assert len(found.objects) == 1
+    for grasp in found.grasps:
+        contact = T_world_camera[:3, :3] @ grasp.contact_point + T_world_camera[:3, 3]
+        assert boxes[0].distance(contact[None])[0] < 0.012
+
+
 def test_without_a_support_in_view_everything_is_a_thing_and_the_answer_says_so() -> None:
     cloud = render([box((0, 0, 0), (0.03, 0.04, 0.06), 0.4)], camera(0.8, -1.5, 0.5))
     found = detect(cloud)

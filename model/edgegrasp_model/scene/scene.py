@@ -33,7 +33,13 @@ from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
 from edgegrasp_model.scene.support import Seen, Support, find_support, measured
-from edgegrasp_model.scene.things import CELL, FINE_CELL, PlaneView, find_things
+from edgegrasp_model.scene.things import (
+    CELL,
+    FINE_CELL,
+    PlaneView,
+    find_things,
+    without_speckles,
+)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -117,7 +123,7 @@ def select_points(
     counts["above_support"] = int(inside.sum())
     plan = support.plan(sent.points)
     view = PlaneView(plan, height[above], margin[above], on_plan, seen.at_border)
-    number = _numbers(view, sent, inside, options, warnings)
+    number = _numbers(view, sent, seen, inside, options, warnings)
     kept = near_things(view.plan, number)
     return SelectedPoints(sent.take(kept), number[kept], support, up, viewpoints)
 
@@ -245,6 +251,7 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
 def _numbers(
     view: PlaneView,
     sent: CheckedCloud,
+    seen: Seen,
     inside: Bools,
     options: DetectOptions,
     warnings: list[str],
@@ -260,6 +267,8 @@ def _numbers(
     inside = inside & ~beside_what_is_beyond(view.plan, sent.points, inside, options.workspace)
     for cell in (CELL, FINE_CELL):  # things that touch furniture may be told from it more finely
         number = np.where(inside, find_things(view, options.max_object_size, sure, cell), -1)
+        if sent.image_size is not None:
+            number = without_speckles(number, sent.row, sent.image_size, seen.distance())
         if (number >= 0).any() or not inside.any():
             return number
     warnings.append(

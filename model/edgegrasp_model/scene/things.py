@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 Float64 = NDArray[np.float64]
@@ -27,6 +29,10 @@ CUT_OFF_POINTS = 3
 STANDS_OUT = 2.0  # margins over the plane that a thing rises at least
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
 MIN_BOX = 0.25  # metres, longest side of the smallest open box that is told from a thing
+
+JUMP = 0.015  # share of the distance between neighbouring pixels that parts them
+SPECK = 0.001  # of an image's pixels, below which a piece of it may be a speck
+SPECK_SHARE = 0.05  # of a thing's points, below which a piece of it may be one
 
 STRIP = 0.025  # metres inside a side of a rectangle where a wall is looked for
 STEP = 0.02  # metres along a wall
@@ -118,6 +124,40 @@ def clusters(plan: Float64, height: NDArray[np.floating], size: float = CELL) ->
     start = np.cumsum(count) - count
     large = [int(one) for one in np.argsort(-count, kind="stable") if count[one] >= MIN_POINTS]
     return [order[start[one] : start[one] + count[one]] for one in large]
+
+
+def without_speckles(
+    number: Int64, row: Int64, image_size: tuple[int, int], distance: NDArray[np.floating]
+) -> Int64:
+    """The numbers of things, without the specks that depth cameras see before or behind them.
+
+    A speck is a small piece of the image whose depths are not those of the pixels around it.
+
+    Args:
+        number: (M,) the thing of each point; -1: none.
+        row: (M,) its pixel, row-major, ascending.
+        image_size: (H, W).
+        distance: (M,) metres from the camera.
+
+    Returns:
+        (M,) numbers; -1 for specks.
+    """
+    height, width = image_size
+    place = np.full(height * width, -1, dtype=np.int64)
+    place[row] = np.arange(len(row))
+    ends = []
+    for step, inside in ((1, row % width < width - 1), (width, row < (height - 1) * width)):
+        start = np.flatnonzero(inside)
+        end = place[row[start] + step]
+        start, end = start[end >= 0], end[end >= 0]
+        near = np.abs(distance[start] - distance[end]) < JUMP * distance[start]
+        ends.append((start[near], end[near]))
+    start, end = np.concatenate(ends, axis=1)
+    links = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(row), len(row)))
+    _, piece = connected_components(links, directed=False)
+    size = np.bincount(piece)[piece]
+    of_thing = np.bincount(number + 1)[number + 1]
+    return np.where((size < SPECK * height * width) & (size < SPECK_SHARE * of_thing), -1, number)
 
 
 def support_outline(plan: Float64) -> Float64 | None:
