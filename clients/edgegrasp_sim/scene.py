@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.engine import TIME_STEP, Body, World
 from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, ObjectSet
+from edgegrasp_sim.poses import Matrix
 from edgegrasp_sim.surroundings import (
     MIDDLE,
     OPEN_TABLE,
@@ -126,18 +127,11 @@ def make_bin(
     scales: tuple[float, float] = PILE_SCALE,
 ) -> list[SceneObject]:
     """Drop objects into a bin one after another; those that do not fit in it are taken away."""
-    low, high = np.asarray(surroundings.bounds)
+    low, high = np.asarray(surroundings.bounds)[:, :2]
     walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
-    dropped: list[SceneObject] = []
-    for _ in range(num_objects):
-        model = objects.sample(rng)
-        quaternion = Rotation.random(rng=rng).as_quat().tolist()
-        x, y = rng.uniform(low[:2] + BIN_DROP_MARGIN, high[:2] - BIN_DROP_MARGIN)
-        scale = float(rng.uniform(*scales))
-        dropped.append(
-            load_object(world, model, (x, y, walls + BIN_DROP_HEIGHT), quaternion, scale)
-        )
-        wait_for_rest(world, dropped, BIN_DROP_SECONDS)
+    where = low + BIN_DROP_MARGIN, high - BIN_DROP_MARGIN
+    height = walls + BIN_DROP_HEIGHT
+    dropped = _drop(world, objects, rng, num_objects, scales, where, height, BIN_DROP_SECONDS)
     return settle(world, dropped, surroundings)
 
 
@@ -150,15 +144,9 @@ def make_pile(
 ) -> list[SceneObject]:
     """Drop objects into an open box one after another, then take the box away."""
     walls = [box.add_to(world) for box in _pile_box()]
-    dropped: list[SceneObject] = []
-    for _ in range(num_objects):
-        model = objects.sample(rng)
-        quaternion = Rotation.random(rng=rng).as_quat().tolist()
-        x, y = rng.uniform(SIZE / 3, 2 * SIZE / 3, size=2)
-        scale = float(rng.uniform(*scales))
-        position = (x, y, TABLE_HEIGHT + PILE_DROP_HEIGHT)
-        dropped.append(load_object(world, model, position, quaternion, scale))
-        wait_for_rest(world, dropped, DROP_SECONDS)
+    middle = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
+    height = TABLE_HEIGHT + PILE_DROP_HEIGHT
+    dropped = _drop(world, objects, rng, num_objects, scales, middle, height, DROP_SECONDS)
     for wall in walls:
         wall.remove()
     return settle(world, dropped, OPEN_TABLE)
@@ -191,6 +179,39 @@ def settle(
         for item in outside:
             item.body.remove()
         remaining = [item for item in remaining if item not in outside]
+
+
+def _drop(
+    world: World,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float],
+    where: tuple[Matrix, Matrix],
+    height: float,
+    seconds: float,
+) -> list[SceneObject]:
+    """Drop objects, turned any way, one after another.
+
+    Args:
+        world: gets them.
+        objects: to draw from.
+        rng: source of the draws.
+        num_objects: how many.
+        scales: range of the factor on their size.
+        where: lowest and highest x and y, (2,) each, metres.
+        height: z that they are dropped from, metres.
+        seconds: given to each to come to rest.
+    """
+    dropped: list[SceneObject] = []
+    for _ in range(num_objects):
+        model = objects.sample(rng)
+        quaternion = Rotation.random(rng=rng).as_quat().tolist()
+        x, y = rng.uniform(*where)
+        scale = float(rng.uniform(*scales))
+        dropped.append(load_object(world, model, (x, y, height), quaternion, scale))
+        wait_for_rest(world, dropped, seconds)
+    return dropped
 
 
 def _upright(rng: np.random.Generator) -> list[float]:

@@ -103,6 +103,10 @@ class Seen(NamedTuple):
         border = None if self.at_border is None else self.at_border[rows]
         return Seen(self.points[rows], self.viewpoint, border)
 
+    def thinned(self, count: int) -> "Seen":
+        """Every so many-th of the points, at least `count` where there are as many."""
+        return self.take(np.arange(0, len(self.points), max(len(self.points) // count, 1)))
+
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
         if self.viewpoint is None:
@@ -153,12 +157,12 @@ def find_support(
     """
     up = None if up is None else up / np.linalg.norm(up)
     planes = _planes(seen, up, rng)
+    most = request.max_tilt + 1e-9 if isinstance(request, RansacPlane) else MAX_TILT
+    level = [plane for plane in planes if up is None or _tilt(plane, up) <= most]
     if isinstance(request, RansacPlane):
-        level = [p for p in planes if up is None or _tilt(p, up) <= request.max_tilt + 1e-9]
         best = max(level, key=lambda plane: plane.share, default=None)
         best = None if best is None or best.share < request.min_share else best
     else:
-        level = [p for p in planes if up is None or _tilt(p, up) <= MAX_TILT]
         best = _most_stood_on(seen, level, max_size, rng, warnings)
     if best is None:
         warnings.append(_none_found(planes, up))
@@ -178,7 +182,7 @@ def measured(
         least: Metres over it that belong to it anyway.
         share: Of the seen surface, where it is known.
     """
-    sample = seen.take(np.arange(0, len(seen.points), max(len(seen.points) // VIEW, 1)))
+    sample = seen.thinned(VIEW)
     points, distance = sample.points.astype(np.float64), sample.distance()
     normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
     origin = points.mean(axis=0) if len(points) else np.zeros(3)
@@ -282,7 +286,7 @@ def _most_stood_on(
     warnings: list[str],
 ) -> _Plane | None:
     """The plane of greatest worth; None where none is a support at all."""
-    sample = seen.take(np.arange(0, len(seen.points), max(len(seen.points) // VIEW, 1)))
+    sample = seen.thinned(VIEW)
     best, worth, second = None, 0.0, 0.0
     for plane in (_refined(sample, plane) for plane in planes):
         this = _worth(sample, plane, max_size, least=worth * ALIKE)
