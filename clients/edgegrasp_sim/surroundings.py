@@ -25,7 +25,7 @@ MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 # Metres, inside. The palm of the Panda's hand is 20 cm wide and 5 cm above its fingertips: along
 # a higher wall it holds little.
-BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.36, 0.58), (0.28, 0.40), (0.03, 0.08)
+BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.40, 0.60), (0.30, 0.42), (0.03, 0.08)
 BIN_WALL = (0.008, 0.015)  # metres; its floor is as thick. Objects are pressed through thin ones.
 GROUND = 0.2  # metres that a bin's floor reaches down into what it stands on, for the same reason
 BIN_STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor

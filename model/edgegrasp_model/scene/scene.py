@@ -54,7 +54,7 @@ MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
-WALL = 0.01  # metres inside a side of the workspace where a wall at it is seen
+WALL = 0.008  # metres, at least, inside a side of the workspace where a wall at it is seen
 ON = 10_000  # points of the support, at least, that tell its outline
 
 
@@ -264,7 +264,8 @@ def _numbers(
     if sent.segment_ids is not None or by_rows or options.objects == "off":
         return np.where(inside, _given_numbers(sent), UNKNOWN)
     if options.workspace is not None:
-        view = view._replace(beyond=beyond_workspace(view.plan, sent.points, options.workspace))
+        beyond = beyond_workspace(view, sent.points, options.workspace)
+        view = view._replace(beyond=beyond)
     # Things that touch furniture may be told from it more finely.
     for cell, strict in ((CELL, True), (FINE_CELL, True), (CELL, False)):
         number = find_things(view, options.max_object_size, cell, strict)
@@ -285,13 +286,14 @@ def _numbers(
     return number
 
 
-def beyond_workspace(plan: Float64, points: Float32, box: Workspace) -> Int64:
+def beyond_workspace(view: PlaneView, points: Float32, box: Workspace) -> Int64:
     """Which side of the workspace points are beyond, or at, beside something beyond it.
 
-    The walls of a bin whose inside is the workspace are seen partly in it.
+    The walls of a bin whose inside is the workspace are seen partly in it: as far as their points
+    may lie off them.
 
     Args:
-        plan: (M, 2) along the support, metres.
+        view: M points.
         points: (M, 3) the same, cloud frame, metres.
         box: The workspace.
 
@@ -300,11 +302,13 @@ def beyond_workspace(plan: Float64, points: Float32, box: Workspace) -> Int64:
     """
     low, high = np.asarray(box.min), np.asarray(box.max)
     outside = np.concatenate([points < low, points > high], axis=1)  # (M, 6)
-    at_side = np.concatenate([points < low + WALL, points > high - WALL], axis=1)
+    wall = np.maximum(view.margin, WALL)[:, None]
+    at_side = np.concatenate([points < low + wall, points > high - wall], axis=1)
     inside = ~outside.any(axis=1)
     beside = np.flatnonzero(inside & at_side.any(axis=1))
     if not inside.all() and len(beside):
-        apart, _ = cKDTree(plan[~inside]).query(plan[beside], distance_upper_bound=WALL)
+        around = cKDTree(view.plan[~inside])
+        apart, _ = around.query(view.plan[beside], distance_upper_bound=2 * WALL)
         outside[beside] = at_side[beside] & np.isfinite(apart)[:, None]
     return np.where(outside.any(axis=1), outside.argmax(axis=1) + 1, 0)
 
