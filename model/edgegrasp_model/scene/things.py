@@ -43,7 +43,8 @@ FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
 WALL = 0.02  # metres inside the outline that belong to a wall
-HOLLOW = 0.03  # metres that the inside is seen below the rim
+HOLLOW = 0.02  # metres that the inside is seen below the rim
+SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
 FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside at its level
 
 
@@ -197,7 +198,7 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> tuple[Bools, Bo
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
     is lower inside. The points on its floor are neither.
     """
-    axes, low, size = smallest_rectangle(plan)
+    axes, low, size = smallest_rectangle(plan[_dense(plan)])
     place = plan @ axes.T - low
     if size.min() < MIN_WIDTH:
         return None
@@ -218,6 +219,14 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> tuple[Bools, Bo
     if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
         inside &= height > lowest + FLOOR
     return inside, walls
+
+
+def _dense(plan: Float64) -> Bools:
+    """Which points (M, 2) have about as many around them as the others."""
+    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    number = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    count = np.bincount(number)
+    return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
