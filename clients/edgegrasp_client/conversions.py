@@ -2,7 +2,7 @@
 
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
 - `moveit_msgs/Grasp`, as a dictionary of its fields.
-- `isaac_grasp` YAML, the file format of Isaac Sim's Grasp Editor, version 1.0; needs the extra
+- `isaac_grasp` YAML 1.0, as Isaac Sim's Grasp Editor and as Isaac ROS have it; needs the extra
   `yaml`.
 
 Pictures of the frames stand in docs/frames.md.
@@ -11,7 +11,7 @@ Pictures of the frames stand in docs/frames.md.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,6 +120,11 @@ PANDA_JOINTS = FingerJoints(
 )
 """The Panda's two finger joints: metres from the middle, each half the opening."""
 
+PANDA_LINK8: Float64 = np.eye(4)
+"""T_hand_link of the link that carries the Panda hand in MoveIt's configuration, `panda_link8`."""
+PANDA_LINK8[:2, :2] = np.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]])  # 45 degrees about z
+PANDA_LINK8.setflags(write=False)
+
 
 def moveit_grasp(
     grasp: Grasp,
@@ -142,7 +147,7 @@ def moveit_grasp(
         name: The message's `id`.
         joints: The gripper's joints.
         T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
-            MoveIt wants; None: it is the hand frame.
+            MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
         approach_distance: Metres of straight way in.
         retreat_distance: Metres of straight way out.
         retreat_direction: (3,) way out, cloud frame; None: back along the approach.
@@ -208,6 +213,7 @@ def isaac_grasps(
     T_object_cloud: ArrayLike | None = None,
     T_hand_gripper: ArrayLike | None = None,
     joints: FingerJoints = PANDA_JOINTS,
+    dialect: Literal["isaac-sim", "isaac-ros"] = "isaac-sim",
 ) -> str:
     """Grasps as the text of an `isaac_grasp` file.
 
@@ -218,6 +224,8 @@ def isaac_grasps(
         T_object_cloud: (4, 4) pose of the cloud's frame in the object's; None: they are the same.
         T_hand_gripper: (4, 4) pose of the gripper's frame in our hand frame; None: the same.
         joints: The gripper's joints.
+        dialect: What the frames are called: `object_frame_link` and `gripper_frame_link` in Isaac
+            Sim, `object_frame` and `gripper_frame` in Isaac ROS.
 
     Returns:
         YAML; orientations are w and xyz.
@@ -227,11 +235,12 @@ def isaac_grasps(
     """
     T_object_cloud = _matrix(T_object_cloud)
     T_hand_gripper = _matrix(T_hand_gripper)
+    link = {"isaac-sim": "_link", "isaac-ros": ""}[dialect]
     file = {
         "format": "isaac_grasp",
         "format_version": 1.0,
-        "object_frame_link": object_frame,
-        "gripper_frame_link": gripper_frame,
+        f"object_frame{link}": object_frame,
+        f"gripper_frame{link}": gripper_frame,
         "grasps": {
             f"grasp_{number}": _isaac_fields(
                 grasp, T_object_cloud @ _matrix(grasp.T_cloud_hand) @ T_hand_gripper, joints
@@ -243,7 +252,7 @@ def isaac_grasps(
 
 
 def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
-    """The grasps of an `isaac_grasp` file.
+    """The grasps of an `isaac_grasp` file of either dialect.
 
     Raises:
         ModuleNotFoundError: The extra `yaml` is not installed.
