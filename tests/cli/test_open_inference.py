@@ -127,6 +127,6 @@ def test_a_server_that_is_away() -> None:
     with GraspClient("127.0.0.1:1", timeout=0.2, retry=False) as client:
         models = Models(client, "grasps", 0.2)
         assert not models.ready()
-        with pytest.raises(RefusedError, match="server|time") as caught:
+        with pytest.raises(RefusedError) as caught:
             models.check("grasps")
         assert caught.value.status in (503, 504)
