@@ -19,7 +19,7 @@ from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import http_bodies, messages
+from edgegrasp_service.worker import http_bodies, messages, outcomes
 from edgegrasp_service.worker.job import Answer, Facts, Job
 from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
@@ -77,11 +77,14 @@ class _Work:
         self._job = job
         self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
+        self._settings = settings
         self._max_points = settings.max_points
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
         """The body of the answer; raises any error that there may be."""
+        if self._job.method == "RecordOutcome":
+            return outcomes.append(self._job.body, self._catalogue, self._settings)
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
