@@ -97,7 +97,7 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     # sigmoid((logit + shift * temperature) / temperature): the shift goes into the last bias.
     last = [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
     with torch.no_grad():
-        last.bias += shift * temperature
+        last.bias.add_(shift * temperature)
     held = float(outcomes.held.mean())
     learned = {"outcomes": len(outcomes.held), "outcomes_held": round(held, 3)}
     training = {**metadata.training, **learned, "recalibrated_from_digest": metadata.digest}
