@@ -26,6 +26,7 @@ from edgegrasp_training.outcomes import Outcomes, fit, read_outcomes
 FINGER_FRICTION = 0.2  # of training: 0.75
 NOISE_STD = 0.002  # metres, of each coordinate of each point; of training: 0.001
 PER_OBJECT = 3  # grasps tried of each object in a scene, the best
+MIN_SCORE = 0.8  # below which a robot would not try
 SIZES = (25, 50, 100, 200)  # outcomes
 DRAWS = 400  # of scenes to learn from, for the intervals
 
@@ -72,9 +73,9 @@ def table(path: Path) -> list[dict[str, object]]:
             scale, shift = fit(outcomes.of(chosen)) if size else (1.0, 0.0)
             logit = scale * outcomes.logit[judged] + shift
             figures.append(_figures(outcomes.of(judged), logit))
-        means = np.mean(figures, axis=0)
-        low, high = np.percentile(figures, [2.5, 97.5], axis=0)
-        names = ("cross_entropy", "brier", "predicted_minus_held")
+        means = np.nanmean(figures, axis=0)
+        low, high = np.nanpercentile(figures, [2.5, 97.5], axis=0)
+        names = ("cross_entropy", "predicted_minus_held", "passed", "held_of_passed")
         row: dict[str, object] = {"outcomes": size}
         for name, *values in zip(names, means, low, high, strict=True):
             row[name] = [round(float(value), 3) for value in values]
@@ -86,11 +87,12 @@ def table(path: Path) -> list[dict[str, object]]:
     return rows
 
 
-def _figures(judged: Outcomes, logit: np.ndarray) -> tuple[float, float, float]:
+def _figures(judged: Outcomes, logit: np.ndarray) -> tuple[float, float, float, float]:
     probability = 1.0 / (1.0 + np.exp(-logit))
     gap = float(probability.mean() - judged.held.mean())
-    brier = float(np.mean((probability - judged.held) ** 2))
-    return cross_entropy(logit, judged.held), brier, gap
+    passed = probability >= MIN_SCORE
+    held = float(judged.held[passed].mean()) if passed.any() else float("nan")
+    return cross_entropy(logit, judged.held), gap, float(passed.mean()), held
 
 
 def main() -> None:
