@@ -131,6 +131,7 @@ def moveit_grasp(
     frame_id: str,
     *,
     name: str = "",
+    stamp: Message | None = None,
     joints: FingerJoints = PANDA_JOINTS,
     T_hand_link: ArrayLike | None = None,
     approach_distance: float = 0.05,
@@ -145,6 +146,8 @@ def moveit_grasp(
         grasp: What the server answered.
         frame_id: Name of the cloud's frame.
         name: The message's `id`.
+        stamp: When the cloud was taken, `sec` and `nanosec`: a frame that moves with the hand is
+            somewhere else later; None: 0, which is the latest.
         joints: The gripper's joints.
         T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
             MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
@@ -158,18 +161,19 @@ def moveit_grasp(
     approach = np.asarray(grasp.approach_direction, dtype=np.float64)
     retreat = -approach if retreat_direction is None else np.asarray(retreat_direction, np.float64)
     T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
+    header = {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     return {
         "id": name,
-        "pre_grasp_posture": _posture(joints, grasp.width, frame_id),
-        "grasp_posture": _posture(joints, 0.0, frame_id),
+        "pre_grasp_posture": _posture(joints, grasp.width, header),
+        "grasp_posture": _posture(joints, 0.0, header),
         "grasp_pose": {
-            "header": _header(frame_id),
+            "header": header,
             "pose": _pose(T_cloud_link),
         },
         "grasp_quality": float(grasp.score),
-        "pre_grasp_approach": _translation(approach, approach_distance, frame_id),
-        "post_grasp_retreat": _translation(retreat, retreat_distance, frame_id),
-        "post_place_retreat": _translation(-approach, retreat_distance, frame_id),
+        "pre_grasp_approach": _translation(approach, approach_distance, header),
+        "post_grasp_retreat": _translation(retreat, retreat_distance, header),
+        "post_place_retreat": _translation(-approach, retreat_distance, header),
         "max_contact_force": 0.0,
         "allowed_touch_objects": [],
     }
@@ -331,10 +335,6 @@ def _matrix(pose: ArrayLike | None) -> Float64:
     return np.eye(4) if pose is None else np.asarray(pose, dtype=np.float64)
 
 
-def _header(frame_id: str) -> Message:
-    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
-
-
 def _pose(T: Float64) -> Message:
     return {
         "position": _xyz(T[:3, 3]),
@@ -342,7 +342,7 @@ def _pose(T: Float64) -> Message:
     }
 
 
-def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
+def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
     point = {
         "positions": list(joints.at(opening).values()),
         "velocities": [],
@@ -351,16 +351,16 @@ def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
         "time_from_start": {"sec": 0, "nanosec": 0},
     }
     return {
-        "header": _header(frame_id),
+        "header": header,
         "joint_names": list(joints.names),
         "points": [point],
     }
 
 
-def _translation(direction: Float64, distance: float, frame_id: str) -> Message:
+def _translation(direction: Float64, distance: float, header: Message) -> Message:
     unit = direction / np.linalg.norm(direction)
     return {
-        "direction": {"header": _header(frame_id), "vector": _xyz(unit)},
+        "direction": {"header": header, "vector": _xyz(unit)},
         "desired_distance": float(distance),
         "min_distance": float(distance),
     }

@@ -112,7 +112,8 @@ def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud
         np.testing.assert_allclose(matrix(grasp.grasp_pose.pose), hand @ PANDA_LINK8, atol=1e-5)
         assert grasp.grasp_quality == pytest.approx(wanted.score)
         way = grasp.pre_grasp_approach.direction
-        assert way.header.frame_id == "base"
+        for header in (way.header, grasp.grasp_pose.header):
+            assert (header.frame_id, header.stamp.sec, header.stamp.nanosec) == ("base", 12, 345)
         np.testing.assert_allclose(
             [way.vector.x, way.vector.y, way.vector.z], hand[:3, 2], atol=1e-5
         )

@@ -204,6 +204,7 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
             grasp,
             found.frame_id,
             name=f"grasp_{number}",
+            stamp=found.stamp,
             joints=settings.joints,
             T_hand_link=T_hand_link,
         )
