@@ -72,9 +72,8 @@ class Settings(BaseModel):
     record_folder: Path | None = Field(None, description="folder to record requests and answers in")
     record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
     outcomes_file: Path | None = Field(
-        None, description="file that /v1/outcomes appends to; none: there is no such path"
+        None, description="file that /v1/outcomes appends to, up to 64 MiB; none: no such path"
     )
-    outcomes_bytes: Size = Field(64 * MIB, description="size at which it takes no more")
     max_header_bytes: int = Field(
         32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )

@@ -15,8 +15,10 @@ TRIED = {"model": "dummy", "score": 0.9, "held": True, "request_id": "a1"}
 
 def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Path) -> None:
     file = tmp_path / "outcomes.jsonl"
-    flags = ("--outcomes-file", str(file), "--outcomes-bytes", str(2**20))
-    with start_dummy(*flags) as server, httpx.Client(base_url=server.http_url) as http:
+    with (
+        start_dummy("--outcomes-file", str(file)) as server,
+        httpx.Client(base_url=server.http_url) as http,
+    ):
         jsonschema.validate(TRIED, DOCUMENT["components"]["schemas"]["TriedGrasp"])
         assert http.post("/v1/outcomes", json=TRIED).json() == {}
         assert http.post("/v1/outcomes", json={**TRIED, "held": False}).is_success
@@ -34,10 +36,14 @@ def test_outcomes_are_appended_until_the_file_is_full(start_dummy, tmp_path: Pat
         ):
             answer = http.post("/v1/outcomes", json=TRIED | changes)
             assert answer.json()["field"] == field
-        assert http.post("/v1/outcomes", content=b"{").status_code == 400
+        as_json = {"content-type": "application/json"}
+        assert http.post("/v1/outcomes", content=b"{", headers=as_json).status_code == 400
+        # A form of a web page elsewhere.
+        assert http.post("/v1/outcomes", content=json.dumps(TRIED)).status_code == 415
         assert len(file.read_text().splitlines()) == 2
 
-        file.write_bytes(file.read_bytes() + b"\n" * 2**20)
+        with file.open("r+b") as grown:
+            grown.truncate(64 * 2**20 + 1)
         full = http.post("/v1/outcomes", json=TRIED)
         assert full.status_code == 413
         assert "Move the file away" in full.json()["detail"]

@@ -4,12 +4,14 @@ from datetime import UTC, datetime
 from typing import Any
 
 import orjson
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from edgegrasp_model.options import invalid_options
-from edgegrasp_service.errors import PayloadTooLarge
-from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.http_bodies import read_json
+from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.worker.http_bodies import JSON, read_json
+from edgegrasp_service.worker.job import Job
+from edgegrasp_service.worker.request_cloud import parse
+
+MAX_BYTES = 64 * 2**20  # size at which the file takes no more
 
 
 class TriedGrasp(BaseModel):
@@ -23,19 +25,16 @@ class TriedGrasp(BaseModel):
     request_id: str = Field("", max_length=200, description="of the request that found it")
 
 
-def append(body: bytes, catalogue: Any, settings: Settings) -> bytes:
-    """Append a grasp and the digest of its weights; raises InvalidRequest or PayloadTooLarge."""
-    fields = read_json("body", body)
-    try:
-        tried = TriedGrasp.model_validate(fields)
-    except ValidationError as error:
-        raise invalid_options(error, fields, "body") from None
+def append(job: Job, catalogue: Any, path: Any) -> bytes:
+    """Append a grasp and the digest of its weights; raises an EdgeGraspError of a bad request."""
+    if not job.content_type.lower().startswith(JSON):  # which no foreign web page can send
+        raise UnsupportedMediaType("Content-Type", repr(job.content_type[:40]), f"Send {JSON}.")
+    tried = parse(TriedGrasp, read_json("body", job.body), "body")
     catalogue.get(tried.model)  # or it is unknown
     digest = {row["name"]: row["digest"] for row in catalogue.describe()}[tried.model]
     line = tried.model_dump() | {"digest": digest, "time": datetime.now(UTC).isoformat()}
-    assert settings.outcomes_file is not None
-    with settings.outcomes_file.open("ab") as file:
-        if file.tell() > settings.outcomes_bytes:
-            raise PayloadTooLarge("outcomes", "more than outcomes_bytes", "Move the file away.")
+    with path.open("ab") as file:
+        if file.tell() > MAX_BYTES:
+            raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
         file.write(orjson.dumps(line) + b"\n")  # one write: lines of several workers stay whole
     return b"{}"
