@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -29,17 +30,17 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
         models = Models(client, "grasps", 60.0)
         config = uvicorn.Config(http_app(models, LIMIT), port=0, log_level="error")
         server = uvicorn.Server(config)
-        socket = config.bind_socket()
-        thread = threading.Thread(target=server.run, args=([socket],))
+        bound = config.bind_socket()
+        thread = threading.Thread(target=server.run, args=([bound],))
         thread.start()
         with grpc_server(models, "127.0.0.1:0", LIMIT) as port:
             yield {
-                "http": f"127.0.0.1:{socket.getsockname()[1]}",
+                "http": f"127.0.0.1:{bound.getsockname()[1]}",
                 "grpc": f"127.0.0.1:{port}",
             }
         server.should_exit = True
         thread.join()
-        socket.close()
+        bound.close()
 
 
 @pytest.fixture
@@ -121,6 +122,30 @@ def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> Non
     answer = post(body, model)
     assert answer.status_code == status, answer.text
     assert told in answer.json()["error"]
+
+
+def test_the_command_serves_both_transports(dummy_server) -> None:
+    free = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
+    ports = [str(one.getsockname()[1]) for one in free]
+    for one in free:
+        one.close()
+    flags = [
+        "--server",
+        dummy_server.grpc_address,
+        "--http-port",
+        ports[0],
+        "--grpc-port",
+        ports[1],
+    ]
+    program = "from edgegrasp_cli.main import main; main()"
+    with subprocess.Popen([sys.executable, "-c", program, "open-inference", *flags]) as process:
+        try:
+            with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
+                ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)
+            assert ready.json() == {"ready": True}
+            socket.create_connection(("127.0.0.1", int(ports[1]))).close()
+        finally:
+            process.terminate()
 
 
 def test_a_server_that_is_away() -> None:
