@@ -43,7 +43,8 @@ FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
 WALL = 0.02  # metres inside the outline that belong to a wall
-HOLLOW = 0.03  # metres that the inside is seen below the rim
+HOLLOW = 0.02  # metres that the inside is seen below the rim
+SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
 FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside at its level
 
 
@@ -197,27 +198,31 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> tuple[Bools, Bo
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
     is lower inside. The points on its floor are neither.
     """
-    axes, low, size = smallest_rectangle(plan)
-    place = plan @ axes.T - low
-    if size.min() < MIN_WIDTH:
+    from_side, levels = _rims(plan, height, plan)
+    if len(levels) < 3:
         return None
-    from_side = [place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]]
-    rims = []
-    for side, distance in enumerate(from_side):
-        at = distance < STRIP
-        along = 1 - side // 2
-        rims.append(_rim(place[at, along], height[at], float(size[along])))
-    levels = [rim for rim in rims if rim is not None]
-    inside: Bools = np.min(from_side, axis=0) > WALL
+    # Stray points beside the walls lie lower than the rim: again, around the rim alone.
+    level = np.median(levels)
+    rim = (np.abs(height - level) < LEVEL) & (from_side.min(axis=0) < 2 * STRIP)
+    from_side, levels = _rims(plan, height, plan[rim])
+    inside: Bools = from_side.min(axis=0) > WALL
     walls = ~inside
     if len(levels) < 3 or inside.sum() < MIN_POINTS:
         return None
-    if np.percentile(height[inside], 5) > np.median(levels) - HOLLOW:
+    if np.percentile(height[inside], 5) > level - HOLLOW:
         return None
     lowest = np.percentile(height[inside], 3)
     if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
         inside &= height > lowest + FLOOR
     return inside, walls
+
+
+def _dense(plan: Float64) -> Bools:
+    """Which points (M, 2) have about as many around them as the others."""
+    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    number = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    count = np.bincount(number)
+    return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
@@ -235,6 +240,24 @@ def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
     size = np.ptp(turned, axis=1)
     best = int(size.prod(axis=1).argmin())
     return axes[best], turned[best].min(axis=0), size[best]
+
+
+def _rims(
+    plan: Float64, height: NDArray[np.floating], around: Float64
+) -> tuple[Float64, list[float]]:
+    """Distance (4, M) of points (M, 2) from the sides of the smallest rectangle around some.
+
+    And the heights of the level rims along those sides; none of a small rectangle.
+    """
+    axes, low, size = smallest_rectangle(around[_dense(around)])
+    place = plan @ axes.T - low
+    from_side = np.stack([place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]])
+    levels = []
+    for side, distance in enumerate(from_side if size.min() > MIN_WIDTH else from_side[:0]):
+        at = distance < STRIP
+        along = 1 - side // 2
+        levels.append(_rim(place[at, along], height[at], float(size[along])))
+    return from_side, [level for level in levels if level is not None]
 
 
 def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
