@@ -6,6 +6,7 @@ its context, and `visualize_grasps` shows it a picture.
 
 import functools
 import io
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from edgegrasp_client import Detection, GraspClient
 
-MOST_GRASPS = 20  # in one answer: some 4,000 characters
+MOST_GRASPS = 20  # in one answer: some 5,000 characters
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
@@ -76,14 +77,17 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
 
     def tool(function: Callable[..., Any]) -> None:
         description = f"{function.__doc__} {options_text if 'grasps' in function.__name__ else ''}"
-        server.tool(description=description.strip())(_with_sentences(function))
+        # Compact text: as structured output the SDK would send it twice, once indented.
+        server.tool(description=description.strip(), structured_output=False)(
+            _with_sentences(function)
+        )
 
     def generate_grasps_from_point_cloud(
         point_cloud_file: str,
         num_grasps: int = 5,
         viewpoint: list[float] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
+    ) -> str:
         """Grasps in a point cloud file (.npy, .npz, .ply, .pcd, .xyz), best first.
 
         `viewpoint` is the camera's position: give it if you know it.
@@ -98,7 +102,7 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         depth_scale: float | None = None,
         num_grasps: int = 5,
         options: dict[str, Any] | None = None,
-    ) -> dict[str, Any]:
+    ) -> str:
         """Grasps in a depth image (.png of 16 bits, or .npy), best first.
 
         `intrinsics` are fx, fy, cx, cy in pixels. `mask_file` is an image of the same size that is
@@ -139,10 +143,11 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         """Whether the grasp server is there and answers requests."""
         return "ready" if client.ready(timeout=5.0) else "not there, or still loading its weights"
 
-    def edgegrasp_server_info() -> list[dict[str, Any]]:
+    def edgegrasp_server_info() -> str:
         """The weights that the option `model` can name, and the gripper that each is for."""
         names = ("name", "architecture", "gripper", "default", "device")
-        return [{name: getattr(model, name) for name in names} for model in client.models()]
+        models = client.models()
+        return json.dumps([{name: getattr(model, name) for name in names} for model in models])
 
     for function in (
         generate_grasps_from_point_cloud,
@@ -212,8 +217,8 @@ def _with_sentences(function: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def _short(found: "Detection") -> dict[str, Any]:
-    """What an agent needs of a detection, in few digits."""
+def _short(found: "Detection") -> str:
+    """What an agent needs of a detection, as JSON in few digits."""
     from edgegrasp_client.conversions import quaternion_from_matrix
 
     grasps = [
@@ -239,7 +244,7 @@ def _short(found: "Detection") -> dict[str, Any]:
     ]
     up = _digits(found.up, 3)
     answer = {"grasps": grasps, "objects": objects, "up": up, "warnings": found.warnings}
-    return answer if grasps else {**answer, "counts": found.counts}
+    return json.dumps(answer if grasps else {**answer, "counts": found.counts})
 
 
 def _digits(vector: Any, digits: int) -> list[float]:
