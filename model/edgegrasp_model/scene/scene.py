@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,8 +33,9 @@ from edgegrasp_model.scene.cloud import (
 from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
-from edgegrasp_model.scene.support import Seen, Support, find_support, measured
+from edgegrasp_model.scene.support import Seen, Support, find_support, measured, raised
 from edgegrasp_model.scene.things import (
+    BOX_FLOOR,
     CELL,
     FINE_CELL,
     UNKNOWN,
@@ -56,6 +58,7 @@ REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 WALL = 0.008  # metres, at least, inside a side of the workspace where a wall at it is seen
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
+MIN_BOX_FLOOR = 500  # points of a box's floor that make it the support of what is in the box
 ON = 10_000  # points of the support, at least, that tell its outline
 
 
@@ -117,18 +120,47 @@ def select_points(
         counts["above_support"] = int(inside.sum())
         number = np.where(inside, _given_numbers(sent), UNKNOWN)
         return SelectedPoints(sent, number, None, up, viewpoints)
+    said: list[str] = []
+    standing = _standing_on(support, sent, seen, inside, options, said)
+    floor = standing.number == BOX_FLOOR
+    if floor.sum() > MIN_BOX_FLOOR and not isinstance(options.support, SupportPlane):
+        # Things in an open box stand on its floor.
+        support, said = raised(support, standing.seen.take(np.flatnonzero(floor))), []
+        standing = _standing_on(support, sent, seen, inside, options, said)
+    warnings += said
+    counts["above_support"] = int(standing.inside.sum())
+    kept = near_things(standing.plan, standing.number)
+    return SelectedPoints(standing.sent.take(kept), standing.number[kept], support, up, viewpoints)
+
+
+class _Standing(NamedTuple):
+    """M points over the support."""
+
+    sent: CheckedCloud
+    seen: Seen
+    inside: Bools  # (M,) in the workspace
+    plan: Float64  # (M, 2) metres along the support
+    number: Int64  # (M,) as from `find_things`
+
+
+def _standing_on(
+    support: Support,
+    sent: CheckedCloud,
+    seen: Seen,
+    inside: Bools,
+    options: DetectOptions,
+    warnings: list[str],
+) -> _Standing:
     height, margin, thick = support.heights(seen)
     # Where the cloud was cut off above the support, what is near it does not tell its outline.
     near = (np.abs(height) < thick) & math.isfinite(support.spread)
     on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
     on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
-    counts["above_support"] = int(inside.sum())
     plan = support.plan(sent.points)
     view = PlaneView(plan, height[above], margin[above], on_plan, seen.at_border)
     number = _numbers(view, sent, seen, inside, options, warnings)
-    kept = near_things(view.plan, number)
-    return SelectedPoints(sent.take(kept), number[kept], support, up, viewpoints)
+    return _Standing(sent, seen, inside, plan, number)
 
 
 def build_scene(

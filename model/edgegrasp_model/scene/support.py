@@ -210,6 +210,13 @@ def measured(
     return Support(plane, float(np.median(off)), found, spread, middle, least, bow, axes)
 
 
+def raised(support: Support, seen: Seen) -> Support:
+    """The support moved along its normal to points that lie over it: the floor of a box on it."""
+    plane = support.plane
+    offset = plane.offset + float(np.median(plane.heights(seen.points)))
+    return measured(seen, plane.model_copy(update={"offset": offset}), MIN_MARGIN, support.share)
+
+
 def _squares(plan: Float64) -> Float64:
     """1, x, y, x^2, x y, y^2 (N, 6) of points (N, 2)."""
     x, y = plan.T

@@ -27,7 +27,8 @@ OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
 STANDS_OUT = 2.0  # margins over the plane that a thing rises at least
-FIXED, UNKNOWN = -1, -2  # in place of a thing's number: furniture; what may belong to one
+# In place of a thing's number: furniture; what may belong to one; the floor of an open box.
+FIXED, UNKNOWN, BOX_FLOOR = -1, -2, -3
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
 AROUND = 3  # sides of a workspace beyond which a cluster goes on where its inside is a box's
 BOX_SHARE = 0.75  # of points on the sides and the top of a box
@@ -44,10 +45,11 @@ STEP = 0.02  # metres along a wall
 FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
-WALL = 0.02  # metres inside the outline that belong to a wall
+WALL = 0.02  # metres inside the outline that belong to a wall whose rim is not seen
+BESIDE = 0.008  # metres further in that noise takes a wall's points
 HOLLOW = 0.02  # metres that the inside is seen below the rim
 SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
-FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside at its level
+FLOOR, MIN_FLOOR = 0.012, 0.2  # metres over a box's floor; share of the box where it is seen
 
 
 class PlaneView(NamedTuple):
@@ -89,7 +91,7 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
         strict: Otherwise things may be cut off.
 
     Returns:
-        (M,) number of each point's thing, from 0; FIXED: of furniture; UNKNOWN: of neither.
+        (M,) number of each point's thing, from 0; FIXED: of furniture; BOX_FLOOR; UNKNOWN.
     """
     number = np.full(len(view.height), UNKNOWN, dtype=np.int64)
     found = 0
@@ -106,11 +108,12 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
         contents: Contents | None = None
         if np.count_nonzero(sides) >= AROUND and view.beyond is not None:
             inside = view.beyond[mine] == 0
-            contents = Contents(inside, ~inside, inside)
+            contents = Contents(inside, ~inside, inside, ~inside & False)
         elif length > MIN_BOX:
             contents = box_contents(view.plan[mine], view.height[mine])
         if contents is not None:
             number[mine[contents.walls]] = FIXED
+            number[mine[contents.floor]] = BOX_FLOOR
             deep, mine = contents.deep[contents.inside], mine[contents.inside]
             for part in clusters(view.plan[mine], view.height[mine]):
                 if deep[part].mean() < DEEP:
@@ -155,13 +158,13 @@ def without_speckles(
     A speck is a small piece of the image whose depths are not those of the pixels around it.
 
     Args:
-        number: (M,) the thing of each point, FIXED or UNKNOWN.
+        number: (M,) as from `find_things`.
         row: (M,) its pixel, row-major, ascending.
         image_size: (H, W).
         distance: (M,) metres from the camera.
 
     Returns:
-        (M,) numbers; UNKNOWN for specks.
+        (M,) numbers; UNKNOWN for specks of things.
     """
     height, width = image_size
     place = np.full(height * width, -1, dtype=np.int64)
@@ -177,9 +180,9 @@ def without_speckles(
     links = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(row), len(row)))
     _, piece = connected_components(links, directed=False)
     size = np.bincount(piece)[piece]
-    of_thing = np.bincount(number - UNKNOWN)[number - UNKNOWN]
+    of_thing = np.bincount(number - BOX_FLOOR)[number - BOX_FLOOR]
     speck = (size < SPECK * height * width) & (size < SPECK_SHARE * of_thing)
-    return np.where(speck, UNKNOWN, number)
+    return np.where(speck & (number >= 0), UNKNOWN, number)
 
 
 def support_outline(plan: Float64) -> Float64 | None:
@@ -202,11 +205,12 @@ def support_outline(plan: Float64) -> Float64 | None:
 
 
 class Contents(NamedTuple):
-    """Of M points of an open box. Those on its floor are neither inside nor walls."""
+    """Of M points of an open box."""
 
-    inside: Bools  # (M,)
+    inside: Bools  # (M,) but for its floor
     walls: Bools  # (M,)
     deep: Bools  # (M,) further in than noise takes a wall's points
+    floor: Bools  # (M,)
 
 
 def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None:
@@ -222,24 +226,35 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None
     level = np.median(levels)
     rim = (np.abs(height - level) < LEVEL) & (from_side.min(axis=0) < 2 * STRIP)
     from_side, levels = _rims(plan, height, plan[rim])
-    inside: Bools = from_side.min(axis=0) > WALL
-    walls, deep = ~inside, from_side.min(axis=0) > 2 * WALL
+    rim = np.abs(height - level) < LEVEL / 2
+    from_wall = np.min([distance - _wall(distance[rim]) for distance in from_side], axis=0)
+    inside: Bools = from_wall > 0
+    walls, deep = ~inside, from_wall > WALL
     if len(levels) < 3 or inside.sum() < MIN_POINTS:
         return None
     if np.percentile(height[inside], 5) > level - HOLLOW:
         return None
     lowest = np.percentile(height[inside], 3)
-    if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
-        inside &= height > lowest + FLOOR
-    return Contents(inside, walls, deep)
+    floor = inside & (height < lowest + FLOOR)
+    size = from_side[::2].max(axis=1) + from_side[1::2].min(axis=1)
+    if len(np.unique(_cells(plan[floor]))) * CELL**2 < MIN_FLOOR * size.prod():
+        floor[:] = False
+    return Contents(inside & ~floor, walls, deep, floor)
 
 
 def _dense(plan: Float64) -> Bools:
     """Which points (M, 2) have about as many around them as the others."""
-    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
-    number = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    number = _cells(plan)
     count = np.bincount(number)
     return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
+
+
+def _cells(plan: Float64) -> Int64:
+    """The number (M,) of the cell that each point (M, 2) is in."""
+    if len(plan) == 0:
+        return np.zeros(0, dtype=np.int64)
+    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    return np.asarray(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1])
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
@@ -275,6 +290,12 @@ def _rims(
         along = 1 - side // 2
         levels.append(_rim(place[at, along], height[at], float(size[along])))
     return from_side, [level for level in levels if level is not None]
+
+
+def _wall(distance: Float64) -> float:
+    """How far in a wall goes whose rim's points have a distance (M,) from its outside; metres."""
+    near = distance[distance < 2 * STRIP]
+    return float(np.percentile(near, 90)) + BESIDE if len(near) else WALL
 
 
 def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
