@@ -10,6 +10,7 @@ import grpc
 from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
+HTTP_OVER_UNIX = "http+unix:"
 
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
@@ -47,7 +48,7 @@ class Tls:
 
 def is_rest(address: str) -> bool:
     """Whether an address names the REST transport."""
-    return address.startswith(("http://", "https://"))
+    return address.startswith(("http://", "https://", HTTP_OVER_UNIX))
 
 
 def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:

@@ -47,6 +47,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.settings import UNIX
 from edgegrasp_service.worker.job import Answer, Job, Method
 
 logger = logging.getLogger(__name__)
@@ -111,8 +112,9 @@ class GrpcServer:
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=options)
         self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
+        sockets = settings.host.startswith(UNIX)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        place = f"{host}:{settings.grpc_port}"
+        place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
         try:
             if credentials is None:
                 port = self._server.add_insecure_port(place)
@@ -120,7 +122,7 @@ class GrpcServer:
                 port = self._server.add_secure_port(place, credentials)
         except RuntimeError as error:
             raise AddressInUse(f"gRPC: cannot listen on {place} ({error})") from None
-        self.address = f"{host}:{port}"
+        self.address = place if sockets else f"{host}:{port}"
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
