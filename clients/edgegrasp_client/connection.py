@@ -15,6 +15,7 @@ HTTP_OVER_UNIX = "http+unix:"
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
+    ("grpc.lb_policy_name", "round_robin"),  # of all servers that a name stands for
     ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
     ("grpc.max_reconnect_backoff_ms", 1000),
     # A server that vanished without a word is found out, and streams to it end.

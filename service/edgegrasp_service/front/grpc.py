@@ -107,6 +107,8 @@ class GrpcServer:
             # A client that vanished without a word is found out, and its streams end.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),
+            # Clients look up the servers anew now and then, and so find those that were added.
+            ("grpc.max_connection_age_ms", 300_000),
             ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
         ]
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
