@@ -24,12 +24,14 @@ work=$(mktemp -d)
 name=edgegrasp-test-$$
 trap 'podman rm -f $name >/dev/null 2>&1; kill "${server:-}" 2>/dev/null; rm -rf "$work"' EXIT
 
-# runc: crun refuses machines with both kinds of cgroups. Limits: those of the machine may be higher
-# than it lets a container have.
+# runc: crun refuses machines with both kinds of cgroups. Limits: podman asks for more than a machine
+# may let it have.
+processes=$(ulimit -Hu)
+[[ $processes != unlimited && $processes -lt 32768 ]] || processes=32768
 export CONTAINERS_CONF=$work/containers.conf
-cat >"$CONTAINERS_CONF" <<'CONF'
+cat >"$CONTAINERS_CONF" <<CONF
 [containers]
-default_ulimits = ["nofile=65536:65536", "nproc=32768:32768"]
+default_ulimits = ["nofile=$(ulimit -Sn):$(ulimit -Sn)", "nproc=$processes:$processes"]
 [engine]
 runtime = "runc"
 cgroup_manager = "cgroupfs"
