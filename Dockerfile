@@ -21,8 +21,6 @@ FROM base AS build
 # without CUDA, and without what only its compiler requires.
 ARG PIP_INDEX_URL
 ARG TORCH="--no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch"
-# The processors that compiled loops are for, by LLVM's name: since 2013, or "generic" for any.
-ARG CPU=x86-64-v3
 ENV PIP_NO_CACHE_DIR=1 PIP_COMPILE=0 PIP_CONSTRAINT=/source/constraints.txt
 
 # hadolint ignore=DL3008
@@ -45,10 +43,11 @@ RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["
     && find /venv -name draw_plotly.py -exec sh -c \
         'echo "get_plotly_fig = draw_plotly = draw_plotly_server = None" > "$0"' {} \; \
     && find /venv -type d \( -name tests -o -path '*/torch/include' -o -path '*/torch/test' \
-        -o -path '*/open3d/examples' -o -path '*/open3d/resources' \) -prune -exec rm -r {} + \
+        -o -path '*/torch/_inductor' -o -path '*/open3d/_ml3d' -o -path '*/open3d/examples' \
+        -o -path '*/open3d/resources' \) -prune -exec rm -r {} + \
     && find /venv \( -path '*/torch/bin/*[tT]est*' -o -path '*/torch/bin/protoc*' \
         -o -name 'open3d_t*_ops.so' \) -delete \
-    && find /venv \( -name 'libtorch_*.so' -o -name libllvmlite.so \) -exec strip -s {} +
+    && find /venv -name '*.so' -not -path '*.libs/*' -exec strip --strip-unneeded {} +
 
 COPY LICENSE README.md ./
 COPY clients clients
@@ -56,11 +55,14 @@ COPY model model
 COPY proto proto
 COPY service service
 RUN /tools/bin/pip install --no-deps .
-# Loads as a server does: modules and loops are compiled that a server needs, and no others.
-ENV NUMBA_CACHE_DIR=/venv/loops NUMBA_CPU_NAME=${CPU} NUMBA_CPU_FEATURES=
-RUN /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server, open3d; \
-    from edgegrasp_service.worker.answer import Settings, load_catalogue; \
-    load_catalogue(Settings())' \
+# Loads as a server does: modules and loops are compiled that it needs, and no others; loops for what
+# processors have had since 2013, and for AVX-512 where this one has it.
+RUN for kind in x86-64-v3 $(grep -q avx512vl /proc/cpuinfo && echo x86-64-v4); do \
+        NUMBA_CACHE_DIR=/venv/loops/$kind NUMBA_CPU_NAME=$kind NUMBA_CPU_FEATURES='' \
+            /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server, open3d; \
+            from edgegrasp_service.worker.answer import Settings, load_catalogue; \
+            load_catalogue(Settings())' || exit 1; \
+    done \
     && mkdir /venv/share/edgegrasp \
     && /tools/bin/cyclonedx-py environment /venv/bin/python -o /venv/share/edgegrasp/sbom.json \
     && /tools/bin/pip-licenses --python /venv/bin/python --format markdown \
@@ -69,8 +71,8 @@ RUN /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server, o
 
 FROM base
 COPY --from=build /venv /venv
+COPY docker/start.sh /start.sh
 
-ARG CPU=x86-64-v3
 ARG VERSION
 LABEL org.opencontainers.image.title="EdgeGrasp" \
     org.opencontainers.image.description="Grasp detection as a service" \
@@ -78,11 +80,9 @@ LABEL org.opencontainers.image.title="EdgeGrasp" \
     org.opencontainers.image.licenses="MIT"
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
-    NUMBA_CACHE_DIR=/tmp/loops NUMBA_CPU_NAME=${CPU} NUMBA_CPU_FEATURES= \
     EDGEGRASP_HOST=0.0.0.0
 USER 10001
 EXPOSE 8000 50051
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
     CMD ["python", "-m", "edgegrasp_service.probe"]
-# Numba reads loops only from where it could write new ones.
-ENTRYPOINT ["sh", "-c", "cp -r /venv/loops /tmp; exec edgegrasp serve \"$@\"", "edgegrasp"]
+ENTRYPOINT ["/start.sh"]

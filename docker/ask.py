@@ -23,6 +23,7 @@ cloud = np.concatenate([table, *boxes]).astype(np.float32)
 found = {}
 for address in sys.argv[1:3]:
     with GraspClient(address) as client:
+        client.wait_until_ready()
         seconds = []
         for _ in range(int((sys.argv[3:] or ["12"])[0])):
             start = time.perf_counter()

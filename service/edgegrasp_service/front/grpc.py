@@ -313,7 +313,7 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
     code = grpc.StatusCode[problem.code]
     status = Status(code=code.value[0], message=problem.detail, details=_details(problem))
     trailing = (
-        (ERROR_METADATA, _error_detail(problem).SerializeToString()),
+        (ERROR_METADATA, error_detail(problem).SerializeToString()),
         (STATUS_METADATA, status.SerializeToString()),
         (REQUEST_ID_HEADER, call.request_id),
     )
@@ -321,7 +321,7 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
     raise AssertionError("abort raises")
 
 
-def _error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
+def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
     """An error as the message of edgegrasp.v1."""
     names = [field.name for field in grasp_pb2.ErrorDetail.DESCRIPTOR.fields]
     return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
@@ -434,7 +434,7 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
         return _serialized(response) + b"\x12" + _serialized(BytesValue(value=detection))[1:]
     response.error.code = grpc.StatusCode[problem.code].value[0]
     response.error.message = problem.detail
-    response.error.detail.CopyFrom(_error_detail(problem))
+    response.error.detail.CopyFrom(error_detail(problem))
     return _serialized(response)
 
 
