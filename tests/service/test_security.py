@@ -2,7 +2,6 @@
 
 import asyncio
 import ssl
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from edgegrasp_client import (
     ServerUnavailableError,
     Tls,
 )
-from edgegrasp_service.errors import AddressInUse, InvalidSettings, ReloadFailed
+from edgegrasp_service.errors import InvalidSettings, ReloadFailed
 from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls
 from edgegrasp_service.server import warn
@@ -219,22 +218,6 @@ async def test_the_health_check_reads_what_the_server_reads(
     assert not await asyncio.to_thread(is_ready, **read_settings())  # speaks TLS
     monkeypatch.setenv("EDGEGRASP_TLS_CERTIFICATE", str(server_tls["tls_certificate"]))
     assert await asyncio.to_thread(is_ready, **read_settings())
-
-
-async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> None:
-    """As a controller on the same machine uses them; the folder's path is short, as it must be."""
-    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
-        for _ in range(2):  # again over the sockets that the first has left
-            running = await serve(host=f"unix:{folder}")
-            kind, name = ("unix", "grpc") if transport == "grpc" else ("http+unix", "http")
-            assert running.address(transport) == f"{kind}:{folder}/{name}.sock"
-            async with AsyncGraspClient(running.address(transport)) as client:
-                assert len((await client.detect(cloud, timeout=20)).grasps) == 10
-            assert await asyncio.to_thread(is_ready, f"unix:{folder}")
-            with pytest.raises(AddressInUse, match=r"http\.sock .*in use"):
-                await serve(host=f"unix:{folder}")
-            running.stop.set()
-            await running.serving
 
 
 @pytest.mark.parametrize(
