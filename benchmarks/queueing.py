@@ -31,14 +31,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.queueing")
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each run")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=4.0, help="of each run")
+    parser.add_argument("--rounds", type=int, default=6)
     given = parser.parse_args()
     runs = measure(given.workers, given.seconds, given.rounds)
     series = runs.pop(given.workers)
-    capacity = given.workers / np.mean(np.concatenate(series))
+    capacity = given.workers / float(np.mean(np.concatenate(series)))
     results: dict[str, Any] = {"machine": machine(), "points": POINTS, **OPTIONS}
-    results |= {"workers": given.workers, "most_per_second": float(capacity)}
+    results |= {"workers": given.workers, "most_per_second": capacity}
     results["service_ms"] = percentiles(np.concatenate(series).tolist())
     results["compared"] = [
         compared(clients, [one for run in measured for one in run], series, given.workers)
