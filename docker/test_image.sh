@@ -7,6 +7,7 @@
 # TORCH: what pip is to install as torch, see the Dockerfile.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+. scripts/bare_debian.sh
 python=${1:-python3}
 
 skip() {
@@ -39,11 +40,7 @@ CONF
 
 base=localhost/edgegrasp-base
 if ! podman image exists $base; then
-    read -r mirror suite < <(
-        apt-get indextargets --format '$(REPO_URI) $(CODENAME)' 'Created-By: Packages' | head -n 1
-    )
-    debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates \
-        "$suite" "$work/base" "$mirror" >"$work/log" || { cat "$work/log" && exit 1; }
+    bare_debian "$work/base" python3,python3-venv,ca-certificates
     # As the slim images do.
     rm -rf "$work"/base/usr/share/{doc,info,locale,man}/* "$work"/base/var/{cache/apt,lib/apt/lists}/*
     tar -C "$work/base" -c . | podman import --quiet - $base
@@ -52,16 +49,9 @@ fi
 
 # pip looks where this machine's does: its settings as a file, and the files and folders they name.
 mounts=()
-"$python" - >"$work/pip.conf" <<'CODE'
-import ast, re, subprocess, sys
-found = {}
-listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True)
-for key, value in re.findall(r"^(?::env:|\w+)\.([\w-]+)=(.*)$", listed.stdout.decode(), re.M):
-    found[key] = ast.literal_eval(value)
-print("[global]", *(f"{key} = {value}" for key, value in found.items()), sep="\n")
-CODE
-for path in $(grep -o -E '(^|[ =]|file://)/[^ ]+' "$work/pip.conf" | sed -E 's,^[^/]*(//)?,,; s,/simple$,,'); do
-    [ ! -e "$path" ] || mounts+=(--volume "$path:$path:ro")
+pip_settings "$work/pip.conf"
+for path in $(pip_paths "$work/pip.conf"); do
+    mounts+=(--volume "$path:$path:ro")
 done
 torch=${TORCH:-}
 if [ -z "$torch" ] && grep -q '^find-links' "$work/pip.conf"; then
@@ -85,7 +75,8 @@ fail() {
 }
 begun=$(date +%s.%N)
 podman run --detach --name $name --read-only --tmpfs /tmp --cap-drop ALL --network none \
-    --security-opt no-new-privileges --memory 4g --pids-limit 512 localhost/edgegrasp \
+    --security-opt no-new-privileges --memory 4g --pids-limit 512 \
+    --health-interval disable localhost/edgegrasp \
     --workers 2 >/dev/null
 until podman healthcheck run $name >/dev/null 2>&1; do
     [ "$(podman inspect --format '{{.State.Running}}' $name)" = true ] || fail "it died"
