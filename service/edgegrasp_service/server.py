@@ -115,9 +115,7 @@ class Server:
             grpc_server = GrpcServer(self.service, self.reloader, credentials)
             http_server = self._http_server()
             scheme = "http" if self._tls is None else "https"
-            self.http_url = f"{scheme}://{_host_and_port(http_socket)}"
-            if settings.host.startswith(UNIX):
-                self.http_url = f"{scheme}+unix:{http_socket.getsockname()}"
+            self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
             await grpc_server.start()
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
@@ -270,8 +268,7 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         raise AddressInUse(f"HTTP: cannot listen on {place} ({error.strerror})") from None
     if family != socket.AF_UNIX:
-        # Connections inherit it; asyncio sets it on its own sockets only. Without, answers wait
-        # 40 ms.
+        # Connections inherit it; asyncio sets it on its own sockets only. Answers waited for 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listening
 
@@ -283,6 +280,8 @@ def _remove_unused(path: str) -> None:
             Path(path).unlink(missing_ok=True)
 
 
-def _host_and_port(listening: socket.socket) -> str:
+def _url(scheme: str, listening: socket.socket) -> str:
+    if listening.family == socket.AF_UNIX:
+        return f"{scheme}+unix:{listening.getsockname()}"
     host, port = listening.getsockname()[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
