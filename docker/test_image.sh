@@ -106,9 +106,13 @@ answered() {
 before=$(answered)
 for _ in 1 2 3 4; do
     podman exec --detach --interactive $name python -c "$(sed 's/^assert.*//' docker/ask.py)" \
-        http://127.0.0.1:8000 127.0.0.1:50051 100 >/dev/null
+        http://127.0.0.1:8000 127.0.0.1:50051 1000 >/dev/null
 done
-sleep 4
+for _ in $(seq 300); do
+    [ "$(answered)" -eq "$before" ] || break
+    sleep 0.2
+done
+before=$(answered)
 podman kill --signal TERM $name >/dev/null
 code=$(podman wait $name)
 [ "$code" = 0 ] || fail "SIGTERM: it ended with $code"
