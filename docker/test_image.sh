@@ -76,8 +76,7 @@ fail() {
 begun=$(date +%s.%N)
 podman run --detach --name $name --read-only --tmpfs /tmp --cap-drop ALL --network none \
     --security-opt no-new-privileges --memory 4g --pids-limit 512 \
-    --health-interval disable localhost/edgegrasp \
-    --workers 2 >/dev/null
+    localhost/edgegrasp --workers 2 >/dev/null 2>"$work/log" || { cat "$work/log" && exit 1; }
 until podman healthcheck run $name >/dev/null 2>&1; do
     [ "$(podman inspect --format '{{.State.Running}}' $name)" = true ] || fail "it died"
     sleep 0.2
