@@ -81,7 +81,7 @@ until podman healthcheck run $name >/dev/null 2>&1; do
     [ "$(podman inspect --format '{{.State.Running}}' $name)" = true ] || fail "it died"
     sleep 0.2
 done
-echo "start: $(echo "$(date +%s.%N) - $begun" | bc | xargs printf '%.1f') s"
+awk "BEGIN { printf \"start: %.1f s\n\", $(date +%s.%N) - $begun }"
 [ "$(podman exec $name id -u)" = 10001 ] || fail "it runs as another user"
 ! podman exec $name touch /venv/file 2>/dev/null || fail "its root can be written"
 [ "$(podman exec $name ls /sys/class/net)" = lo ] || fail "it has a network"
