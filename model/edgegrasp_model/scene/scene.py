@@ -117,7 +117,9 @@ def select_points(
         number = np.where(inside, _given_numbers(sent), UNKNOWN)
         return SelectedPoints(sent, number, None, up, viewpoints)
     height, margin, thick = support.heights(seen)
-    on, above = np.flatnonzero(np.abs(height) < thick), np.flatnonzero(height > margin)
+    # Where the cloud was cut off above the support, what is near it does not tell its outline.
+    near = (np.abs(height) < thick) & math.isfinite(support.spread)
+    on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
     on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
@@ -276,12 +278,10 @@ def _numbers(
             break
     if strict:
         return number
-    said = (
-        "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
-    )
+    said = "nothing over the support plane looks like a thing (longer than max_object_size, "
     said += "cut off by the image, or not on the plane)"
     if (number >= 0).any():
-        said += ": what is over it and not shaped like a box is taken for things"
+        said += ": what the image cuts off is taken for things"
     warnings.append(f"{said}. Send objects: off to look for grasps on all that is over it.")
     return number
 
