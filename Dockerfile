@@ -1,43 +1,88 @@
-# The EdgeGrasp server: gRPC on 50051, HTTP on 8000.
+# The EdgeGrasp server: gRPC on 50051, HTTP on 8000. docs/containers.md says how to run it.
 #
 #   docker build -t edgegrasp .
-#   docker run --rm -p 8000:8000 -p 50051:50051 edgegrasp
+#   docker build -t edgegrasp:cuda --build-arg TORCH=torch .    # as the package index has it
 
-FROM python:3.11-slim AS build
+ARG BASE=python:3.11-slim-bookworm
 
+FROM ${BASE} AS base
+# What Open3D loads; of GL without the Mesa behind it, whose compiler is as large as Python.
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends libgomp1 libidn2-0 libusb-1.0-0 libx11-6 \
+    && apt-get download libegl1 libgl1 libglvnd0 libglx0 \
+    && for package in ./*.deb; do dpkg -x "$package" /; done \
+    && rm -rf ./*.deb /var/lib/apt/lists/* /var/cache/apt/* \
+    && useradd --system --uid 10001 --no-create-home edgegrasp
+
+
+FROM base AS build
+# Where packages come from, in the place of pip's default; and what pip is to install as torch: one
+# without CUDA, and without what only its compiler requires.
+ARG PIP_INDEX_URL
+ARG TORCH="--no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch"
+ENV PIP_NO_CACHE_DIR=1 PIP_COMPILE=0 PIP_CONSTRAINT=/source/constraints.txt
+
+# hadolint ignore=DL3008
+RUN apt-get update && apt-get install -y --no-install-recommends binutils
 WORKDIR /source
-RUN python -m venv /venv
+COPY pyproject.toml constraints.txt ./
+RUN python3 -m venv /tools && /tools/bin/pip install cyclonedx-bom pip-licenses \
+    && python3 -m venv --without-pip /venv
+ENV PIP_PYTHON=/venv/bin/python
+# hadolint ignore=SC2086
+RUN /tools/bin/pip install ${TORCH}
+# Open3D comes without what it requires: notebooks, and a web server for its viewers.
+RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+    extras = [p["optional-dependencies"][name] for name in ("cli", "files", "model", "service")]; \
+    named = p["dependencies"] + [one for extra in extras for one in extra]; \
+    print(*(a for a in named if not a.startswith(("edgegrasp", "open3d", "torch"))), sep="\n")' \
+    > requirements.txt \
+    && /tools/bin/pip install -r requirements.txt \
+    && /tools/bin/pip install --no-deps open3d-cpu \
+    && find /venv -name draw_plotly.py -exec sh -c \
+        'echo "get_plotly_fig = draw_plotly = draw_plotly_server = None" > "$0"' {} \; \
+    && find /venv -type d \( -name tests -o -path '*/torch/include' -o -path '*/torch/test' \
+        -o -path '*/torch/_inductor' -o -path '*/open3d/_ml3d' -o -path '*/open3d/examples' \
+        -o -path '*/open3d/resources' \) -prune -exec rm -r {} + \
+    && find /venv \( -path '*/torch/bin/*[tT]est*' -o -path '*/torch/bin/protoc*' \
+        -o -name 'open3d_t*_ops.so' \) -delete \
+    && find /venv -name '*.so' -not -path '*.libs/*' -exec strip --strip-unneeded {} +
 
-# Where pip looks besides its default, for example for a torch without CUDA: a third of the size.
-ARG PIP_EXTRA_INDEX_URL
-
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY LICENSE README.md ./
 COPY clients clients
 COPY model model
 COPY proto proto
 COPY service service
-RUN /venv/bin/pip install --no-cache-dir --constraint constraints.txt '.[service]'
+RUN /tools/bin/pip install --no-deps .
+# Loads as a server does: modules and loops are compiled that it needs, and no others; loops for what
+# processors have had since 2013, and for AVX-512 where this one has it.
+RUN for kind in x86-64-v3 $(grep -q avx512vl /proc/cpuinfo && echo x86-64-v4); do \
+        NUMBA_CACHE_DIR=/venv/loops/$kind NUMBA_CPU_NAME=$kind NUMBA_CPU_FEATURES='' \
+            /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server, open3d; \
+            from edgegrasp_service.worker.answer import Settings, load_catalogue; \
+            load_catalogue(Settings())' || exit 1; \
+    done \
+    && mkdir /venv/share/edgegrasp \
+    && /tools/bin/cyclonedx-py environment /venv/bin/python -o /venv/share/edgegrasp/sbom.json \
+    && /tools/bin/pip-licenses --python /venv/bin/python --format markdown \
+        --output-file /venv/share/edgegrasp/licences.md
 
 
-FROM python:3.11-slim
-
-# What Open3D loads on import.
-RUN apt-get update \
-    && apt-get install -y --no-install-recommends \
-        libegl1 libgl1 libgomp1 libusb-1.0-0 libx11-6 \
-    && rm -rf /var/lib/apt/lists/*
-
-RUN useradd --system --uid 10001 --no-create-home edgegrasp
+FROM base
 COPY --from=build /venv /venv
+COPY docker/start.sh /start.sh
 
+ARG VERSION
+LABEL org.opencontainers.image.title="EdgeGrasp" \
+    org.opencontainers.image.description="Grasp detection as a service" \
+    org.opencontainers.image.version="${VERSION}" \
+    org.opencontainers.image.licenses="MIT"
 ENV PATH=/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     EDGEGRASP_HOST=0.0.0.0
-
-USER edgegrasp
+USER 10001
 EXPOSE 8000 50051
-
 HEALTHCHECK --interval=10s --timeout=3s --start-period=60s \
     CMD ["python", "-m", "edgegrasp_service.probe"]
-
-ENTRYPOINT ["edgegrasp", "serve"]
+ENTRYPOINT ["/start.sh"]

@@ -10,10 +10,10 @@ GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.js
 	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
 .DEFAULT_GOAL := help
-.PHONY: help venv lint format test bench fuzz demo proto constraints clean
+.PHONY: help venv lint format test bench fuzz demo image-test proto constraints clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 venv: $(INSTALLED) ## make .venv with everything, and the system libraries it needs
 
@@ -28,8 +28,11 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy $(wildcard examples/*.py)
+	$(BIN)/mypy --python-version 3.10 --package edgegrasp_client
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/unasync.py --check
+	$(BIN)/hadolint Dockerfile
+	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
 	mkdir -p build
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
@@ -50,6 +53,9 @@ bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites 
 
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
+
+image-test: $(INSTALLED) ## build the container image, run it locked up (root, Debian: podman)
+	docker/test_image.sh $(BIN)/python
 
 proto: $(INSTALLED) ## generate the gRPC code, the contract and the OpenAPI document
 	PYTHON=$(BIN)/python scripts/generate_proto.sh

@@ -226,9 +226,10 @@ Generated from the server's own definition by `make proto`; do not edit.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NotRequired, TypedDict
+from typing import Any, Literal
 
 from numpy.typing import NDArray
+from typing_extensions import NotRequired, TypedDict
 
 Vector = Sequence[float] | NDArray[Any]  # x, y, z in the cloud's frame
 '''

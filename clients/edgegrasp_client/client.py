@@ -3,11 +3,12 @@
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Self, TypeVar, Unpack
+from typing import Any, TypeVar
 
 import grpc
 import httpx
 from numpy.typing import NDArray
+from typing_extensions import Self, Unpack
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import grpc_wire, rest_wire
@@ -15,6 +16,7 @@ from edgegrasp_client.clouds import Cloud, DepthImage
 from edgegrasp_client.connection import (
     CHANNEL_OPTIONS,
     DEFAULT_ADDRESS,
+    HTTP_OVER_UNIX,
     Tls,
     channel_credentials,
     is_rest,
@@ -50,7 +52,9 @@ class GraspClient:
     """Asks one server for grasps; use as a context manager, or close it.
 
     Args:
-        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST.
+        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
+            of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
+            "http+unix:/run/edgegrasp/http.sock" for REST.
         timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
             for each of connecting, sending and waiting.
         retry: Whether to try again, after short random delays, where the server is away or busy
@@ -312,6 +316,9 @@ class _RestTransport:
         tls: Tls | None,
         transport: httpx.BaseTransport | None,
     ) -> None:
+        if address.startswith(HTTP_OVER_UNIX):
+            transport = httpx.HTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
+            address = "http://localhost"
         self._http = httpx.Client(
             base_url=address,
             headers=dict(token_metadata(token)),

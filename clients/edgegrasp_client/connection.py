@@ -10,10 +10,12 @@ import grpc
 from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
+HTTP_OVER_UNIX = "http+unix:"
 
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
+    ("grpc.lb_policy_name", "round_robin"),  # of all servers that a name stands for
     ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
     ("grpc.max_reconnect_backoff_ms", 1000),
     # A server that vanished without a word is found out, and streams to it end.
@@ -47,7 +49,7 @@ class Tls:
 
 def is_rest(address: str) -> bool:
     """Whether an address names the REST transport."""
-    return address.startswith(("http://", "https://"))
+    return address.startswith(("http://", "https://", HTTP_OVER_UNIX))
 
 
 def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:

@@ -2,10 +2,11 @@
 
 from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from edgegrasp_client.clouds import Cloud, DepthImage
 from edgegrasp_client.errors import invalid

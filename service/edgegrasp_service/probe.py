@@ -4,40 +4,67 @@ usage: python -m edgegrasp_service.probe    exits with 0 where it is
 """
 
 import contextlib
-import http.client
+import os
 import socket
-import ssl
 import sys
-
-from edgegrasp_service.settings import Settings, load_settings
+import tomllib
+from pathlib import Path
+from typing import Any
 
 TIMEOUT = 2.0  # seconds
+NAMES = ("host", "http_port", "tls_certificate", "tls_client_ca")
+REQUEST = b"GET /health/ready HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
 
 
-def is_ready(settings: Settings) -> bool:
+def read_settings() -> dict[str, Any]:
+    """Those of NAMES that the server's file and environment give.
+
+    Not as `edgegrasp_service.settings` does it, whose Pydantic takes far longer than the check.
+    """
+    path = os.environ.get("EDGEGRASP_CONFIG")
+    given: dict[str, Any] = tomllib.loads(Path(path).read_text("utf-8")) if path else {}
+    given |= {name: text for name in NAMES if (text := os.environ.get(f"EDGEGRASP_{name.upper()}"))}
+    return {name: given[name] for name in NAMES if name in given}
+
+
+def is_ready(
+    host: str = "127.0.0.1",
+    http_port: int | str = 8000,
+    tls_certificate: object = None,
+    tls_client_ca: object = None,
+) -> bool:
     """Whether a server on this machine answers requests.
 
     One that wants a client's certificate is asked for nothing more than to listen: it does once it
     has started, ready or not.
     """
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(settings.host, settings.host)
     try:
-        if settings.tls_client_ca is not None:
-            socket.create_connection((host, settings.http_port), TIMEOUT).close()
-            return True
-        connection = http.client.HTTPConnection(host, settings.http_port, timeout=TIMEOUT)
-        if settings.tls_certificate is not None:
-            # The certificate is for the name others call the server by; this asks itself.
-            context = ssl._create_unverified_context()
-            connection = http.client.HTTPSConnection(
-                host, settings.http_port, timeout=TIMEOUT, context=context
-            )
-        with contextlib.closing(connection):
-            connection.request("GET", "/health/ready")
-            return connection.getresponse().status == 200
-    except (OSError, http.client.HTTPException):
+        with contextlib.ExitStack() as stack:
+            connection = stack.enter_context(_connect(host, int(http_port)))
+            if tls_client_ca is not None:
+                return True
+            if tls_certificate is not None:
+                import ssl
+
+                # The certificate is for the name others call the server by; this asks itself.
+                context = ssl._create_unverified_context()
+                connection = stack.enter_context(context.wrap_socket(connection))
+            connection.sendall(REQUEST)
+            answer = stack.enter_context(connection.makefile("rb"))
+            return answer.readline().startswith(b"HTTP/1.1 200 ")
+    except OSError:
         return False
 
 
+def _connect(host: str, port: int) -> socket.socket:
+    if not host.startswith("unix:"):
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+        return socket.create_connection((host, port), TIMEOUT)
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(TIMEOUT)
+    connection.connect(f"{host.removeprefix('unix:')}/http.sock")
+    return connection
+
+
 if __name__ == "__main__":
-    sys.exit(not is_ready(load_settings()))
+    sys.exit(not is_ready(**read_settings()))

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import ipaddress
 import logging
 import signal
@@ -9,6 +10,7 @@ import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -21,7 +23,7 @@ from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder
 from edgegrasp_service.security import ServerTls, load_tokens
-from edgegrasp_service.settings import Settings
+from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -113,7 +115,7 @@ class Server:
             grpc_server = GrpcServer(self.service, self.reloader, credentials)
             http_server = self._http_server()
             scheme = "http" if self._tls is None else "https"
-            self.http_url = f"{scheme}://{_host_and_port(http_socket)}"
+            self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
             await grpc_server.start()
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
@@ -244,7 +246,7 @@ def warn(settings: Settings) -> None:
     try:
         local = ipaddress.ip_address(settings.host).is_loopback
     except ValueError:
-        local = settings.host == "localhost"
+        local = settings.host == "localhost" or settings.host.startswith(UNIX)
     if not local and settings.tls_certificate is None:
         logger.warning("%s: others can reach this server, and nothing is encrypted", settings.host)
     if not local and not (load_tokens(settings).required or settings.tls_client_ca):
@@ -255,16 +257,31 @@ def warn(settings: Settings) -> None:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    family, place = socket.AF_INET6 if ":" in host else socket.AF_INET, f"{host}:{port}"
+    address: Any = (host, port)
+    if host.startswith(UNIX):
+        family, place = socket.AF_UNIX, f"{host.removeprefix(UNIX)}/http.sock"
+        address = place
+        _remove_unused(place)
     try:
-        listening = socket.create_server((host, port), family=family, backlog=BACKLOG)
+        listening = socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
-        raise AddressInUse(f"HTTP: cannot listen on {host}:{port} ({error.strerror})") from None
-    # Connections inherit it; asyncio sets it on its own sockets only. Without, answers wait 40 ms.
-    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        raise AddressInUse(f"HTTP: cannot listen on {place} ({error.strerror})") from None
+    if family != socket.AF_UNIX:
+        # Connections inherit it; asyncio sets it on its own sockets only. Answers waited for 40 ms.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listening
 
 
-def _host_and_port(listening: socket.socket) -> str:
+def _remove_unused(path: str) -> None:
+    """Remove a Unix domain socket that a server has left, not one that a server listens on."""
+    with socket.socket(socket.AF_UNIX) as trying:
+        if trying.connect_ex(path) == errno.ECONNREFUSED:
+            Path(path).unlink(missing_ok=True)
+
+
+def _url(scheme: str, listening: socket.socket) -> str:
+    if listening.family == socket.AF_UNIX:
+        return f"{scheme}+unix:{listening.getsockname()}"
     host, port = listening.getsockname()[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"

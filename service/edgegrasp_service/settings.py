@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
+UNIX = "unix:"  # begins a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
 NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
@@ -28,7 +29,10 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    host: str = Field("127.0.0.1", description="address both transports bind to")
+    host: str = Field(
+        "127.0.0.1",
+        description="address both transports bind to; unix:FOLDER: sockets http.sock and grpc.sock",
+    )
     http_port: Port = Field(8000, description="0: any free port")
     grpc_port: Port = Field(50051, description="0: any free port")
     weights: tuple[Path, ...] = Field(

@@ -74,3 +74,23 @@ def test_curl_example_prints_five_grasps(dummy_server, cloud_file: Path) -> None
     done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, dummy_server.http_url)
     assert done.returncode == 0, done.stderr
     assert len(json.loads(done.stdout)["grasps"]) == 5
+
+
+def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Path) -> None:
+    for program in ("cmake", "c++", "protoc", "grpc_cpp_plugin", "pkg-config"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is not installed, see examples/cpp/CMakeLists.txt")
+    if run("pkg-config", "--exists", "grpc++").returncode:
+        pytest.skip("gRPC for C++ is not installed, see examples/cpp/CMakeLists.txt")
+    build = tmp_path / "build"
+    made = run("cmake", "-S", EXAMPLES / "cpp", "-B", build)
+    made = made if made.returncode else run("cmake", "--build", build, "--parallel", 2)
+    assert made.returncode == 0, made.stdout + made.stderr
+    depth = tmp_path / "depth.raw"
+    depth.write_bytes(np.full((48, 64), 600, "<u2").tobytes())
+    camera = (depth, 64, 48, 60, 60, 32, 24)
+    done = run(build / "detect", *camera, dummy_server.grpc_address)
+    assert done.stdout.count("score 0.") == 5, done.stderr
+    wrong = run(build / "detect", depth, 99, *camera[2:], dummy_server.grpc_address)
+    assert wrong.returncode == 1
+    assert wrong.stderr.startswith("error 3: depth_images.0")

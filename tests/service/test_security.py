@@ -21,7 +21,7 @@ from edgegrasp_client import (
     Tls,
 )
 from edgegrasp_service.errors import InvalidSettings, ReloadFailed
-from edgegrasp_service.probe import is_ready
+from edgegrasp_service.probe import is_ready, read_settings
 from edgegrasp_service.security import ServerTls
 from edgegrasp_service.server import warn
 from edgegrasp_service.settings import Settings
@@ -194,7 +194,7 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
     given = server_tls | {"tls_client_ca": pem["ca"]}
     server = (await serve(**given, tokens=[USER])).server
     port = int(server.http_url.rpartition(":")[2])
-    assert await asyncio.to_thread(is_ready, Settings(**given, http_port=port))
+    assert await asyncio.to_thread(is_ready, HOST, port, pem["server"], pem["ca"])
     loaded = ServerTls(Settings(**given))
     assert loaded.http.current.minimum_version == ssl.TLSVersion.TLSv1_2
 
@@ -202,10 +202,22 @@ async def test_no_tls_older_than_1_2_and_a_health_check(serve, server_tls, pem) 
 async def test_the_health_check_waits_for_weights(begin) -> None:
     running, ready = await begin(lambda stages: stages.shut("load"))
     port = int(running.server.http_url.rpartition(":")[2])
-    assert not await asyncio.to_thread(is_ready, Settings(http_port=port))
+    assert not await asyncio.to_thread(is_ready, http_port=port)
     running.stages.open("load")
     await ready.wait()
-    assert await asyncio.to_thread(is_ready, Settings(http_port=port, host="0.0.0.0"))
+    assert await asyncio.to_thread(is_ready, "0.0.0.0", str(port))
+
+
+async def test_the_health_check_reads_what_the_server_reads(
+    serve, server_tls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = int((await serve(**server_tls)).server.http_url.rpartition(":")[2])
+    config = tmp_path / "server.toml"
+    config.write_text(f"http_port = {port}\nworkers = 1\ntls_key = 'key.pem'\n")
+    monkeypatch.setenv("EDGEGRASP_CONFIG", str(config))
+    assert not await asyncio.to_thread(is_ready, **read_settings())  # speaks TLS
+    monkeypatch.setenv("EDGEGRASP_TLS_CERTIFICATE", str(server_tls["tls_certificate"]))
+    assert await asyncio.to_thread(is_ready, **read_settings())
 
 
 @pytest.mark.parametrize(
@@ -214,6 +226,7 @@ async def test_the_health_check_waits_for_weights(begin) -> None:
         ({}, []),
         ({"host": "::1"}, []),
         ({"host": "localhost"}, []),
+        ({"host": "unix:/run/edgegrasp"}, []),
         ({"host": "0.0.0.0"}, ["nothing is encrypted", "asks nobody who"]),
         ({"host": "robot.example", "token_file": "tokens"}, ["nothing is encrypted"]),
     ],

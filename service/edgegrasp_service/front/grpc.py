@@ -47,6 +47,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.settings import UNIX
 from edgegrasp_service.worker.job import Answer, Job, Method
 
 logger = logging.getLogger(__name__)
@@ -106,13 +107,16 @@ class GrpcServer:
             # A client that vanished without a word is found out, and its streams end.
             ("grpc.keepalive_time_ms", 30_000),
             ("grpc.keepalive_timeout_ms", 10_000),
+            # Clients look up the servers anew now and then, and so find those that were added.
+            ("grpc.max_connection_age_ms", 300_000),
             ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
         ]
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=options)
         self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
+        sockets = settings.host.startswith(UNIX)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        place = f"{host}:{settings.grpc_port}"
+        place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
         try:
             if credentials is None:
                 port = self._server.add_insecure_port(place)
@@ -120,7 +124,7 @@ class GrpcServer:
                 port = self._server.add_secure_port(place, credentials)
         except RuntimeError as error:
             raise AddressInUse(f"gRPC: cannot listen on {place} ({error})") from None
-        self.address = f"{host}:{port}"
+        self.address = place if sockets else f"{host}:{port}"
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
@@ -309,7 +313,7 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
     code = grpc.StatusCode[problem.code]
     status = Status(code=code.value[0], message=problem.detail, details=_details(problem))
     trailing = (
-        (ERROR_METADATA, _error_detail(problem).SerializeToString()),
+        (ERROR_METADATA, error_detail(problem).SerializeToString()),
         (STATUS_METADATA, status.SerializeToString()),
         (REQUEST_ID_HEADER, call.request_id),
     )
@@ -317,7 +321,7 @@ async def _abort(context: Any, problem: Problem) -> NoReturn:
     raise AssertionError("abort raises")
 
 
-def _error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
+def error_detail(problem: Problem) -> grasp_pb2.ErrorDetail:
     """An error as the message of edgegrasp.v1."""
     names = [field.name for field in grasp_pb2.ErrorDetail.DESCRIPTOR.fields]
     return grasp_pb2.ErrorDetail(**{name: getattr(problem, name) for name in names})
@@ -430,7 +434,7 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
         return _serialized(response) + b"\x12" + _serialized(BytesValue(value=detection))[1:]
     response.error.code = grpc.StatusCode[problem.code].value[0]
     response.error.message = problem.detail
-    response.error.detail.CopyFrom(_error_detail(problem))
+    response.error.detail.CopyFrom(error_detail(problem))
     return _serialized(response)
 
 

@@ -173,7 +173,7 @@ class _GraspResponse(Response):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; raises the errors of `GraspService`."""
         service, call, headers = self._service, current_call(), Headers(scope=scope)
-        call.limit(_timeout(headers))
+        call.limit(requested_timeout(headers))
         size = int(headers.get("content-length", service.settings.max_body_bytes))
         content_type, query = headers.get("content-type", ""), scope["query_string"]
         job = Job(self._method, "http", b"", 0.0, content_type, query.decode("latin-1"))
@@ -239,7 +239,7 @@ async def _gone(receive: Receive) -> None:
         pass
 
 
-def _timeout(headers: Headers) -> float:
+def requested_timeout(headers: Headers) -> float:
     """Seconds that the caller waits; infinity: it does not say."""
     text = headers.get(TIMEOUT)
     if text is None:

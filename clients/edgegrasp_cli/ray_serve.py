@@ -1,0 +1,99 @@
+"""The worker's function as a Ray Serve application, for more machines than one.
+
+serve run docker/ray/serve.yaml
+
+docs/scaling.md says when. Ray does what `edgegrasp_service.front` does for one machine: it admits,
+queues, chooses a replica, adds and replaces replicas. Streams, tokens and TLS it has not.
+"""
+
+import asyncio
+from typing import Any, cast, get_args
+
+from grpc import StatusCode
+from ray import serve
+from ray.serve.grpc_util import RayServegRPCContext
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_model.errors import EdgeGraspError
+from edgegrasp_service.errors import report
+from edgegrasp_service.front.grpc import ERROR_METADATA, error_detail
+from edgegrasp_service.front.http import METHODS, requested_timeout
+from edgegrasp_service.front.http_protocol import problem_document
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import answer, load_catalogue
+from edgegrasp_service.worker.job import Answer, Facts, Job, Method
+
+
+@serve.deployment(max_ongoing_requests=1, user_config={})
+class Grasps:
+    """A worker: one request at a time, bytes in and bytes out."""
+
+    async def reconfigure(self, settings: dict[str, Any]) -> None:
+        """Load what these settings of the server name; Ray calls it at start and as they change."""
+        given = Settings(**settings)
+        self._catalogue = await asyncio.to_thread(load_catalogue, given)
+        self._settings = given
+
+    async def __call__(self, request: Request) -> Response:
+        """Answer over HTTP."""
+        method = METHODS.get(request.url.path, "")
+        if method in ("Live", "Ready"):
+            return JSONResponse({"status": method.lower()})
+        if method == "ListModels":
+            return JSONResponse({"models": self._catalogue.describe()})
+        if method not in get_args(Method) or request.method != "POST":
+            return Response(status_code=404)
+        content_type = request.headers.get("content-type", "")
+        body, query = await request.body(), request.url.query
+        try:
+            seconds = min(requested_timeout(request.headers), self._settings.max_request_seconds)
+        except EdgeGraspError as error:
+            found = Answer(b"", Facts(), report(error))
+        else:
+            job = Job(cast(Method, method), "http", body, seconds, content_type, query)
+            found = await self._answer(job)
+        if found.error is None:
+            return Response(found.body, media_type="application/json")
+        document = problem_document(found.error)
+        return Response(document, found.error.status, media_type="application/problem+json")
+
+    async def DetectGrasps(  # noqa: N802  # as the RPC
+        self, request: grasp_pb2.DetectGraspsRequest, grpc_context: RayServegRPCContext
+    ) -> grasp_pb2.DetectGraspsResponse:
+        """Answer over gRPC."""
+        body = await self._answer_call("DetectGrasps", request, grpc_context)
+        return grasp_pb2.DetectGraspsResponse.FromString(body)
+
+    async def ScoreGrasps(  # noqa: N802  # as the RPC
+        self, request: grasp_pb2.ScoreGraspsRequest, grpc_context: RayServegRPCContext
+    ) -> grasp_pb2.ScoreGraspsResponse:
+        """Answer over gRPC."""
+        body = await self._answer_call("ScoreGrasps", request, grpc_context)
+        return grasp_pb2.ScoreGraspsResponse.FromString(body)
+
+    async def ListModels(  # noqa: N802  # as the RPC
+        self, request: grasp_pb2.ListModelsRequest
+    ) -> grasp_pb2.ListModelsResponse:
+        """Answer over gRPC."""
+        models = [grasp_pb2.Model(**facts) for facts in self._catalogue.describe()]
+        return grasp_pb2.ListModelsResponse(models=models)
+
+    async def _answer_call(
+        self, method: Method, request: Any, context: RayServegRPCContext
+    ) -> bytes:
+        seconds = self._settings.max_request_seconds
+        found = await self._answer(Job(method, "grpc", request.SerializeToString(), seconds))
+        if (problem := found.error) is not None:
+            context.set_code(StatusCode[problem.code])
+            context.set_details(problem.detail)
+            detail = error_detail(problem).SerializeToString()
+            context.set_trailing_metadata([(ERROR_METADATA, detail)])  # type: ignore[list-item]
+        return found.body
+
+    async def _answer(self, job: Job) -> Answer:
+        return await asyncio.to_thread(answer, job, self._catalogue, self._settings)
+
+
+app = Grasps.bind()  # type: ignore[attr-defined]  # the decorator makes it a deployment

@@ -1,0 +1,93 @@
+"""What is released: built as a release is, looked into, installed without this checkout, run."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from edgegrasp_client import GraspClient
+
+ROOT = Path(__file__).parents[2]
+VERSION = re.search(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.M)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The sdist, and the wheel that is made of it."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
+
+
+def test_what_they_hold(built: tuple[Path, Path]) -> None:
+    with tarfile.open(built[0]) as sdist, zipfile.ZipFile(built[1]) as wheel:
+        names = [name.partition("/")[2] for name in sdist.getnames()]
+        ours = [name for name in wheel.namelist() if ".dist-info/" not in name]
+    for name in (*names, *ours):
+        assert not re.search(r"__pycache__|\.py[co]$|\.nb[ic]$|(^|/)tests?/|_cache/", name), name
+    weights = {path.name for path in (ROOT / "model/edgegrasp_model/weights").iterdir()}
+    assert weights == {Path(name).name for name in ours if "/weights/" in name}
+    v1 = {"grasp.proto", "grasp_pb2.py", "grasp_pb2.pyi", "grasp_pb2_grpc.pyi", "openapi.json"}
+    assert v1 <= {name.removeprefix("edgegrasp/v1/") for name in ours}
+    packages = {name.partition("/")[0] for name in ours}
+    assert packages == {Path(name).parent.name for name in ours if name.endswith("/py.typed")}
+    assert len(packages) == 7
+
+
+def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> None:
+    """With what this environment has for it to require, and not its own edgegrasp."""
+    new = tmp_path / "venv"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(new)], check=True)
+    (packages,) = new.glob("lib/python*/site-packages")
+    install = ["install", "--quiet", "--no-deps", "--no-index", str(built[1])]
+    subprocess.run([sys.executable, "-m", "pip", f"--python={new}", *install], check=True)
+    (packages / "required.pth").write_text(sysconfig.get_path("purelib"))
+    for loop in (ROOT / "model").rglob("*.nb[ci]"):  # compiled here: it would take a minute
+        to = packages / loop.relative_to(ROOT / "model")
+        to.parent.mkdir(exist_ok=True)
+        shutil.copy(loop, to)
+    command = [str(new / "bin/edgegrasp"), "serve", "--http-port=0", "--grpc-port=0", "--workers=1"]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+    ) as server:
+        try:
+            assert server.stdout is not None
+            _, _, _, url, _, address = server.stdout.readline().split()
+            document = httpx.get(f"{url}/openapi.json").json()
+            with GraspClient(address) as client:
+                box = np.random.default_rng(0).uniform(-0.03, 0.03, (2000, 3))
+                assert client.detect(box, viewpoint=(0.0, 0.0, 0.5)).model == "edgegrasp-plus"
+        finally:
+            server.terminate()
+        assert server.wait(20) == 0
+    assert "/v1/grasps" in document["paths"]
+    found = subprocess.run(
+        [str(new / "bin/python"), "-c", "import edgegrasp_service as s; print(s.__file__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+    )
+    assert found.stdout.startswith(str(new))
+
+
+def test_the_version_is_that_of_the_project_file(built: tuple[Path, Path]) -> None:
+    assert VERSION is not None
+    assert built[1].name == f"edgegrasp-{VERSION[1]}-py3-none-any.whl"
+    assert (
+        f"image: edgegrasp:{VERSION[1]}\n"
+        in (ROOT / "docker/kubernetes/edgegrasp.yaml").read_text()
+    )
+    assert f"## {VERSION[1]}" in (ROOT / "CHANGELOG.md").read_text()
