@@ -3,14 +3,17 @@
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
-from edgegrasp_sim.engine import ASSETS, TIME_STEP, Body, Joint, World, WorldAnchor, couple_joints
+from edgegrasp_sim.engine import TIME_STEP, Body, HandModel, World
+from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
-MESHES = ASSETS / "franka_panda" / "meshes" / "collision"
+SHAPES = Path(__file__).parent / "panda_hand.obj"
 MAX_OPENING = 0.08  # metres between the fingers
 FINGERTIP = 0.1122  # metres ahead of the link
 # The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
@@ -22,12 +25,8 @@ HAND_FRICTION = 1.0
 FINGER_MASS = 0.1  # kg
 FINGER_FRICTION = 0.75
 FINGER_SPINNING_FRICTION = 0.05
-FINGER_STIFFNESS = 30000.0  # N/m at a contact
-FINGER_DAMPING = 1000.0  # N s/m at a contact
 FINGER_FORCE = 20.0  # N
 FINGER_BASE = 0.0584  # metres ahead of the link
-GEAR_FORCE = 30.0  # N
-GEAR_ERP = 0.1
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
 COLLISION_DEPTH = 0.001  # metres; a finger sliding along an object overlaps it by less
@@ -182,34 +181,13 @@ class Gripper:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.body = world.add_hand(
-            MESHES / "hand.obj",
-            MESHES / "finger.obj",
-            palm_mass=HAND_MASS,
-            palm_centre=T_HAND_HANDCOM[:3, 3].tolist(),
-            finger_mass=FINGER_MASS,
-            finger_base=FINGER_BASE,
-            position=_PARKED[:3, 3].tolist(),
-        )
-        self.body.set_dynamics(mass=HAND_MASS, friction=HAND_FRICTION)
-        self.fingers = (Joint(self.body, 0), Joint(self.body, 1))
-        for finger in self.fingers:
-            self.body.set_finger(
-                finger.index,
-                friction=FINGER_FRICTION,
-                spinning_friction=FINGER_SPINNING_FRICTION,
-                stiffness=FINGER_STIFFNESS,
-                damping=FINGER_DAMPING,
-                max_position=0.5 * MAX_OPENING,
-            )
-        self._anchor = WorldAnchor(self.body, _PARKED[:3, 3].tolist(), TOOL_FORCE)
-        couple_joints(self.body, 0, 1, erp=GEAR_ERP, max_force=GEAR_FORCE)
+        self.body = world.add_hand(panda(), _PARKED[:3, 3])
         self.park()
 
     @property
     def opening(self) -> float:
         """Metres between the fingers."""
-        return self.fingers[0].position + self.fingers[1].position
+        return self.body.opening
 
     def park(self) -> None:
         """Put the open hand where it touches nothing and no camera sees it."""
@@ -218,12 +196,7 @@ class Gripper:
     def place(self, T_world_hand: Matrix) -> None:
         """Put the open hand there at once, at rest."""
         T_world_com = T_world_hand @ T_HAND_HANDCOM
-        pose = T_world_com[:3, 3], quaternion_xyzw(T_world_com)
-        self.body.set_pose(*pose)
-        self._anchor.move(*pose)
-        for finger in self.fingers:
-            finger.reset(0.5 * MAX_OPENING)
-            finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
+        self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
         """Drag the hand in a straight line, `step_length` metres in each time step.
@@ -239,7 +212,7 @@ class Gripper:
         steps = max(1, int(distance / step_length))
         for _ in range(steps):
             position = position + way / steps
-            self._anchor.move(position, quaternion)
+            self.body.move(position, quaternion)
             self.world.step()
             yield
 
@@ -250,8 +223,28 @@ class Gripper:
 
     def close(self) -> None:
         """Drive the fingers together with full force."""
-        for finger in self.fingers:
-            finger.drive_to(0.0, FINGER_FORCE)
+        self.body.close_fingers()
+
+
+@cache
+def panda() -> HandModel:
+    """The Panda's hand, of the convex hulls of its meshes."""
+    shapes = dict(read_obj(SHAPES))
+    x, y, z = T_HAND_HANDCOM[:3, 3].tolist()
+    return HandModel(
+        palm=shapes["palm"].points,
+        finger=shapes["finger"].points,
+        finger_base=FINGER_BASE,
+        centre=(x, y, z),
+        mass=HAND_MASS,
+        friction=HAND_FRICTION,
+        finger_mass=FINGER_MASS,
+        finger_friction=FINGER_FRICTION,
+        finger_spinning_friction=FINGER_SPINNING_FRICTION,
+        finger_force=FINGER_FORCE,
+        max_opening=MAX_OPENING,
+        tool_force=TOOL_FORCE,
+    )
 
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:

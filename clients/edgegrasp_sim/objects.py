@@ -21,7 +21,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.engine import ASSETS
+import pybullet_data
+ASSETS=Path(pybullet_data.getDataPath())
 
 OBJECT_MASS = 0.5  # kg
 OBJECT_FRICTION = 1.0
