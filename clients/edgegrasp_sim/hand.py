@@ -288,12 +288,15 @@ class _Watch:
     def __init__(self, gripper: Gripper, objects: Mapping[int, SceneObject]) -> None:
         self._gripper, self._objects = gripper, objects
         self._empty_steps = self._held_steps = 0
+        self._opening = gripper.opening
         self._offset: Matrix | None = None
 
     def is_clear(self) -> bool:
         """Whether the fingers hold nothing any more, or one object that rests on nothing else."""
         touched = _touched(self._gripper, self._objects)
-        self._empty_steps = 0 if touched else self._empty_steps + 1
+        before, self._opening = self._opening, self._gripper.opening
+        closing = abs(self._opening - before) >= STILL  # and may yet catch something
+        self._empty_steps = 0 if touched or closing else self._empty_steps + 1
         if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
             return True
         held = len(touched) == 1 and self._hangs_still(touched[0].body)

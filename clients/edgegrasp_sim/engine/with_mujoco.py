@@ -193,6 +193,8 @@ class MujocoWorld(World):
                 limited=True,
                 range=(0.0, 0.5 * model.max_opening),
                 damping=model.finger_force / FINGER_SPEED,
+                solref_limit=(CONTACT_SECONDS, 1.0),
+                solimp_limit=IMPEDANCE,
             )
             self._add_hull(
                 finger,
@@ -214,6 +216,7 @@ class MujocoWorld(World):
             name2=other,
             data=[0.0, 1.0] + 10 * [0.0],
             solref=(CONTACT_SECONDS, 1.0),
+            solimp=IMPEDANCE,
         )
         self._hand = MujocoHand(self, body, palm, model)
         self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
