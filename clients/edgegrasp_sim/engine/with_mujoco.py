@@ -44,7 +44,6 @@ CONSTANTS = {
 }
 _OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
 _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class MujocoWorld(World):
@@ -65,7 +64,7 @@ class MujocoWorld(World):
         self._data: Any = mujoco.MjData(self._model)
         self._changed = False
         self._bodies = 0
-        self._states: dict[int, NDArray[np.float64]] = {}
+        self._states: dict[int, Any] = {}
         self._hand: MujocoHand | None = None
         self._uid_of_geom = np.empty(0, np.int64)
 
@@ -105,19 +104,17 @@ class MujocoWorld(World):
         return hits
 
     def detect_collisions(self) -> None:
-        mujoco.mj_fwdPosition(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
 
     def save_state(self) -> int:
-        model, data = self.model, self.data
-        kept = np.empty(mujoco.mj_stateSize(model, _STATE))
-        mujoco.mj_getState(model, data, kept, _STATE)
+        kept = mujoco.MjData(self.model)
+        mujoco.mj_copyData(kept, self.model, self.data)
         number = max(self._states, default=0) + 1
         self._states[number] = kept
         return number
 
     def restore_state(self, state: int) -> None:
-        mujoco.mj_setState(self.model, self.data, self._states[state], _STATE)
-        self.detect_collisions()
+        mujoco.mj_copyData(self.data, self.model, self._states[state])
 
     def remove_state(self, state: int) -> None:
         del self._states[state]
@@ -480,6 +477,7 @@ def _empty() -> Any:
     option.timestep = TIME_STEP / SUBSTEPS
     option.gravity = (0.0, 0.0, -GRAVITY)
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = FRICTION_IMPEDANCE
     spec.default.geom.solref = (CONTACT_SECONDS, 1.0)
