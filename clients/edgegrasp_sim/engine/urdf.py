@@ -1,5 +1,7 @@
 """Reading the shapes of an object's URDF file and its OBJ meshes."""
 
+import re
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -72,29 +74,41 @@ def read_obj(path: Path) -> list[tuple[str, Surface]]:
         FileNotFoundError: there is no such file.
         ValueError: it cannot be read.
     """
-    points: list[list[float]] = []
-    parts: list[tuple[str, int, list[list[int]]]] = [("", 0, [])]  # name, first point, triangles
-    for line in path.read_text(errors="replace").splitlines():
-        match line.split():
-            case ["v", *numbers]:
-                points.append([float(number) for number in numbers[:3]])
-            case ["o" | "g", *names]:
-                parts.append((" ".join(names), len(points), []))
-            case ["f", *corners]:
-                rows = [int(corner.split("/")[0]) for corner in corners]
-                rows = [row - 1 if row > 0 else len(points) + row for row in rows]
-                fan = zip(rows[1:-1], rows[2:], strict=True)
-                parts[-1][2].extend([rows[0], second, third] for second, third in fan)
-    whole = np.array(points, dtype=np.float64).reshape(-1, 3)
+    return _read_obj(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=256)
+def _read_obj(path: Path, _changed: int) -> list[tuple[str, Surface]]:
+    points: list[str] = []
+    parts: list[tuple[str, int, list[str]]] = [("", 0, [])]  # name, first point, lines of faces
+    # Only points count, not the normals and texture places behind their slashes.
+    for line in re.sub(r"/\S*", "", path.read_text(errors="replace")).splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word == "v":
+            points.append(rest)
+        elif word == "f":
+            parts[-1][2].append(rest)
+        elif word in ("o", "g"):
+            parts.append((rest, len(points), []))
+    whole = np.array([line.split()[:3] for line in points], dtype=np.float64).reshape(-1, 3)
     ends = [start for _, start, _ in parts[1:]] + [len(whole)]
     found = []
-    for (name, start, faces), end in zip(parts, ends, strict=True):
-        if faces:
-            used, rows = np.unique(np.array(faces), return_inverse=True)
+    for (name, start, lines), end in zip(parts, ends, strict=True):
+        if lines:
+            used, rows = np.unique(_triangles(lines, end), return_inverse=True)
             found.append((name, Surface(whole[used], rows.reshape(-1, 3).astype(np.int32))))
-        elif name and start < end and not any(faces for _, _, faces in parts):
+        elif name and start < end and not any(lines for _, _, lines in parts):
             found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int32))))
     return found
+
+
+def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
+    """The triangles (F, 3) of lines of faces, which count points from 1, or back from the last."""
+    rows = [list(map(int, line.split())) for line in lines]
+    if any(len(row) != 3 for row in rows):
+        rows = [[r[0], *two] for r in rows for two in zip(r[1:-1], r[2:], strict=True)]
+    triangles = np.array(rows)
+    return np.where(triangles > 0, triangles - 1, known + triangles)
 
 
 def convex_hull(points: Matrix) -> Surface | None:

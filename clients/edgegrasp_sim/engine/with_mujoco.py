@@ -25,13 +25,15 @@ from edgegrasp_sim.engine import (
 from edgegrasp_sim.engine.urdf import Surface, read_urdf
 from edgegrasp_sim.poses import Matrix
 
-SUBSTEPS = 5  # of 2.5 ms in each time step
-CONTACT_SECONDS = 0.005  # in which a contact pushes bodies apart; no less than two substeps
+SUBSTEPS = 4  # of 3.125 ms in each time step
+CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
-FINGER_SPEED = 0.2  # m/s, at which a finger closes in the air
+FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
+FINGER_INERTIA = 0.3  # kg, of a finger's drive
+FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
 CONSTANTS = {
     "time_step": TIME_STEP,
     "substeps": SUBSTEPS,
@@ -41,6 +43,7 @@ CONSTANTS = {
     "arm_inertia": ARM_INERTIA,
     "arm_stiffness": ARM_STIFFNESS,
     "finger_speed": FINGER_SPEED,
+    "finger_inertia": FINGER_INERTIA,
 }
 _OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
 _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
@@ -189,7 +192,7 @@ class MujocoWorld(World):
                 axis=(0.0, side, 0.0),
                 limited=True,
                 range=(0.0, 0.5 * model.max_opening),
-                damping=model.finger_force / FINGER_SPEED,
+                armature=FINGER_INERTIA,
                 solref_limit=(CONTACT_SECONDS, 1.0),
                 solimp_limit=IMPEDANCE,
             )
@@ -203,7 +206,14 @@ class MujocoWorld(World):
                 contype=_HAND,
             )
             self.spec.add_actuator(
-                name=finger.name, target=finger.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+                name=finger.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=finger.name,
+                gainprm=[FINGER_DAMPING] + 9 * [0.0],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0.0, 0.0, -FINGER_DAMPING] + 7 * [0.0],
+                forcelimited=True,
+                forcerange=(-model.finger_force, model.finger_force),
             )
         self._drag(body, model.tool_force)
         one, other = (joint.name for joint in body.find_all("joint")[1:])
@@ -381,7 +391,7 @@ class MujocoHand(MujocoBody, Hand):
         data, start = self.world.data, self._fingers.start
         data.qpos[start : start + 2] = 0.5 * self.hand.max_opening
         data.qvel[start - 1 : start + 1] = 0.0
-        data.ctrl[:2] = self.hand.finger_force
+        data.ctrl[:2] = FINGER_SPEED
         self.move(position, quaternion_xyzw)
         data.mocap_pos[0] = self._target
 
@@ -391,7 +401,7 @@ class MujocoHand(MujocoBody, Hand):
         self.world.data.mocap_quat[0] = (w, x, y, z)
 
     def close_fingers(self) -> None:
-        self.world.data.ctrl[:2] = -self.hand.finger_force
+        self.world.data.ctrl[:2] = -FINGER_SPEED
 
 
 class _Images:
