@@ -24,7 +24,6 @@ HAND_MASS = 0.5  # kg
 HAND_FRICTION = 1.0
 FINGER_MASS = 0.1  # kg
 FINGER_FRICTION = 0.75
-FINGER_SPINNING_FRICTION = 0.05
 FINGER_FORCE = 20.0  # N
 FINGER_BASE = 0.0584  # metres ahead of the link
 TOOL_FORCE = 300.0  # N
@@ -240,7 +239,6 @@ def panda() -> HandModel:
         friction=HAND_FRICTION,
         finger_mass=FINGER_MASS,
         finger_friction=FINGER_FRICTION,
-        finger_spinning_friction=FINGER_SPINNING_FRICTION,
         finger_force=FINGER_FORCE,
         max_opening=MAX_OPENING,
         tool_force=TOOL_FORCE,

@@ -30,6 +30,7 @@ from edgegrasp_model.options import (
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_sim.camera import Observation, ViewRange
+from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
@@ -37,7 +38,7 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
-from edgegrasp_training.views import LabelledView, support_as_array
+from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
@@ -104,6 +105,7 @@ class GenerationOptions:
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
     kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
+    engine: str | None = None  # see `choose_engine`
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
@@ -130,8 +132,18 @@ def generate(
 
     Yields:
         For each finished scene its index, the grasps tried in it and those that held.
+
+    Raises:
+        ValueError: The folder holds views of another engine.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    options = replace(options, engine=choose_engine(options.engine).name)
+    known = {engine_of(path) for path in folder.glob("*.npz")}
+    if other := known - {options.engine}:
+        raise ValueError(
+            f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
+            "choose another folder"
+        )
     missing = missing_scenes(folder, options)
     if workers == 1:
         for index in missing:
@@ -182,7 +194,8 @@ def generate_scene(
             drawn = ObjectSet.from_folder(objects, source, "train")
             if streams[SHAPE_STREAM].random() < VARIED_SHARE:
                 drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
-        with ClutterSimulation(None if drawn is None else {kind: drawn}) as simulation:
+        sets = None if drawn is None else {kind: drawn}
+        with ClutterSimulation(sets, engine=options.engine) as simulation:
             hard = _make_scene(simulation, kind, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
@@ -190,7 +203,8 @@ def generate_scene(
                 query = hard if hard and number == 0 else _ask(simulation, kind, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
-                view = replace(view, objects=names, object_digests=digests)
+                engine = simulation.world.name
+                view = replace(view, engine=engine, objects=names, object_digests=digests)
                 view.save(view_path(folder, index, number, options))
                 tried += len(view.tried())
                 held += int((view.success == 1).sum())

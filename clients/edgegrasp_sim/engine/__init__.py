@@ -122,7 +122,6 @@ class HandModel:
         friction: of the palm.
         finger_mass: kg.
         finger_friction: lateral.
-        finger_spinning_friction: torque about the normal of a contact, by its force, metres.
         finger_force: with which each finger closes and opens, N.
         max_opening: metres between the fingers.
         tool_force: with which the hand is moved at most, N.
@@ -136,7 +135,6 @@ class HandModel:
     friction: float
     finger_mass: float
     finger_friction: float
-    finger_spinning_friction: float
     finger_force: float
     max_opening: float
     tool_force: float
@@ -217,7 +215,7 @@ class World(ABC):
         """Add a box that never moves, turned about z; `size` is its full extent in metres."""
 
     @abstractmethod
-    def add_hand(self, model: HandModel, position: Sequence[float]) -> "Hand":
+    def add_hand(self, model: HandModel, position: Matrix) -> "Hand":
         """Add an open hand with its centre of mass there; a world may have one."""
 
     @abstractmethod

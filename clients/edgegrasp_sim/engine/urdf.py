@@ -2,6 +2,7 @@
 
 import re
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -21,7 +22,7 @@ class Surface(NamedTuple):
     """Triangles: points (P, 3), metres, and rows of them, (F, 3)."""
 
     points: Matrix
-    faces: NDArray[np.int32]
+    faces: NDArray[np.int64]
 
 
 class Shape(NamedTuple):
@@ -96,9 +97,9 @@ def _read_obj(path: Path, _changed: int) -> list[tuple[str, Surface]]:
     for (name, start, lines), end in zip(parts, ends, strict=True):
         if lines:
             used, rows = np.unique(_triangles(lines, end), return_inverse=True)
-            found.append((name, Surface(whole[used], rows.reshape(-1, 3).astype(np.int32))))
+            found.append((name, Surface(whole[used], rows.reshape(-1, 3))))
         elif name and start < end and not any(lines for _, _, lines in parts):
-            found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int32))))
+            found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int64))))
     return found
 
 
@@ -106,20 +107,23 @@ def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
     """The triangles (F, 3) of lines of faces, which count points from 1, or back from the last."""
     rows = [list(map(int, line.split())) for line in lines]
     if any(len(row) != 3 for row in rows):
-        rows = [[r[0], *two] for r in rows for two in zip(r[1:-1], r[2:], strict=True)]
+        rows = [[r[0], *two] for r in rows for two in pairwise(r[1:])]
     triangles = np.array(rows)
     return np.where(triangles > 0, triangles - 1, known + triangles)
 
 
 def convex_hull(points: Matrix) -> Surface | None:
-    """The convex hull of points (P, 3), None if it has no volume."""
+    """The convex hull of points (P, 3), faces outwards; None if it has no volume."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
         return None
-    rows = np.full(len(points), -1, np.int32)
+    a, b, c = points[hull.simplices].transpose(1, 0, 2)
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
+    faces = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    rows = np.full(len(points), -1, np.int64)
     rows[hull.vertices] = np.arange(len(hull.vertices))
-    return Surface(points[hull.vertices], rows[hull.simplices])
+    return Surface(points[hull.vertices], rows[faces])
 
 
 def _parts(element: ElementTree.Element, urdf: Path, scale: float) -> list[Surface]:

@@ -31,6 +31,9 @@ IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
+# Metres: the torque about a contact's normal, by its force. A pad of 1 cm's radius turns against
+# two thirds of that times its friction.
+FINGER_SPINNING_FRICTION = 0.005
 FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
@@ -42,6 +45,7 @@ CONSTANTS = {
     "friction_impedance": FRICTION_IMPEDANCE,
     "arm_inertia": ARM_INERTIA,
     "arm_stiffness": ARM_STIFFNESS,
+    "finger_spinning_friction": FINGER_SPINNING_FRICTION,
     "finger_speed": FINGER_SPEED,
     "finger_inertia": FINGER_INERTIA,
 }
@@ -171,7 +175,7 @@ class MujocoWorld(World):
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
         return MujocoBody(self, body, signs * half)
 
-    def add_hand(self, model: HandModel, position: Sequence[float]) -> "MujocoHand":
+    def add_hand(self, model: HandModel, position: Matrix) -> "MujocoHand":
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
         joint = body.add_freejoint()
         joint.armature = ARM_INERTIA
@@ -200,7 +204,7 @@ class MujocoWorld(World):
                 finger,
                 finger.name,
                 turned,
-                friction=(model.finger_friction, model.finger_spinning_friction, 0),
+                friction=(model.finger_friction, FINGER_SPINNING_FRICTION, 0),
                 condim=4,
                 priority=2,
                 contype=_HAND,
@@ -244,7 +248,7 @@ class MujocoWorld(World):
         self.spec.add_mesh(
             name=name,
             uservert=surface.points.ravel(),
-            userface=surface.faces.ravel(),
+            userface=surface.faces.ravel().astype(np.int32),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
         kind = mujoco.mjtGeom.mjGEOM_MESH
@@ -370,8 +374,9 @@ class MujocoHand(MujocoBody, Hand):
 
     def way(self, steps: int) -> Matrix:
         """The target's places in the substeps of the next time step, (steps, 3)."""
-        here = self.world.data.mocap_pos[0]
-        return here + np.arange(1, steps + 1)[:, None] / steps * (self._target - here)
+        here: Matrix = self.world.data.mocap_pos[0]
+        shares = np.arange(1, steps + 1)[:, None] / steps
+        return np.asarray(here + shares * (self._target - here))
 
     @property
     def _fingers(self) -> slice:

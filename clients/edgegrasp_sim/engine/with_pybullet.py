@@ -21,6 +21,7 @@ from edgegrasp_sim.engine import (
 from edgegrasp_sim.poses import Matrix
 
 SOLVER_ITERATIONS = 100
+FINGER_SPINNING_FRICTION = 0.05  # metres: torque about a contact's normal, by its force
 FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
 GEAR_FORCE = 30.0  # N, which keeps the fingers at one opening
@@ -29,6 +30,7 @@ CONSTANTS = {
     "time_step": TIME_STEP,
     "solver_iterations": SOLVER_ITERATIONS,
     "gravity": GRAVITY,
+    "finger_spinning_friction": FINGER_SPINNING_FRICTION,
     "gear_force": GEAR_FORCE,
 }
 # The meshes whose corners a hand's model has: what was published came of them, to the last bit.
@@ -135,7 +137,7 @@ class PybulletWorld(World):
         body.change(-1, lateralFriction=friction)
         return body
 
-    def add_hand(self, model: HandModel, position: Sequence[float]) -> "PybulletHand":
+    def add_hand(self, model: HandModel, position: Matrix) -> "PybulletHand":
         return PybulletHand(self.client, model, position)
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
@@ -204,7 +206,7 @@ class PybulletBody(Body):
 class PybulletHand(PybulletBody, Hand):
     """A hand whose fingers are its links 0 and 1; a fixed constraint drags its palm."""
 
-    def __init__(self, client: int, model: HandModel, position: Sequence[float]) -> None:
+    def __init__(self, client: int, model: HandModel, position: Matrix) -> None:
         self.model = model
         fingers = [_hull(client, "finger.obj", each) for each in (_STRAIGHT, _HALF_TURN)]
         uid = pybullet.createMultiBody(
@@ -230,7 +232,7 @@ class PybulletHand(PybulletBody, Hand):
             self.change(
                 finger,
                 lateralFriction=model.finger_friction,
-                spinningFriction=model.finger_spinning_friction,
+                spinningFriction=FINGER_SPINNING_FRICTION,
                 contactStiffness=FINGER_STIFFNESS,
                 contactDamping=FINGER_DAMPING,
                 frictionAnchor=1,
