@@ -28,7 +28,6 @@ FINGER_FORCE = 20.0  # N
 FINGER_BASE = 0.0584  # metres ahead of the link
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
-COLLISION_DEPTH = 0.001  # metres; a finger sliding along an object overlaps it by less
 
 # Far above the table and out of the cameras' sight.
 _PARKED = translation(0.15, 0.15, 5.0)
@@ -326,8 +325,8 @@ def _holds_when_shaken(
 
 def _cut_into(gripper: Gripper) -> set[int]:
     """Ids of the bodies that the hand overlaps."""
-    contacts = gripper.body.contacts()
-    return {each.other_uid for each in contacts if each.distance < -COLLISION_DEPTH}
+    contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
+    return {each.other_uid for each in contacts if each.distance < -depth}
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

@@ -288,6 +288,7 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
         FileNotFoundError: there is no such file.
         ValueError: it is no summary, or one of another scene or protocol.
     """
+    summary = FIRST_ENGINE | summary
     try:
         committed = FIRST_ENGINE | json.loads(gate.read_text())
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}

@@ -144,6 +144,7 @@ class World(ABC):
     """A physics world; a process may have several. Bodies that are removed are gone for good."""
 
     name: ClassVar[str]  # of the engine
+    collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
 
     def __enter__(self) -> Self:
         return self

@@ -28,6 +28,7 @@ from edgegrasp_sim.poses import Matrix
 SUBSTEPS = 4  # of 3.125 ms in each time step
 CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
+COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
@@ -41,6 +42,7 @@ CONSTANTS = {
     "time_step": TIME_STEP,
     "substeps": SUBSTEPS,
     "gravity": GRAVITY,
+    "collision_depth": COLLISION_DEPTH,
     "contact_seconds": CONTACT_SECONDS,
     "friction_impedance": FRICTION_IMPEDANCE,
     "arm_inertia": ARM_INERTIA,
@@ -57,6 +59,7 @@ class MujocoWorld(World):
     """A model that is compiled anew when a body came or went, and its state."""
 
     name = "mujoco"
+    collision_depth = COLLISION_DEPTH
 
     def __init__(self) -> None:
         self._images = _Images()

@@ -21,6 +21,7 @@ from edgegrasp_sim.engine import (
 from edgegrasp_sim.poses import Matrix
 
 SOLVER_ITERATIONS = 100
+COLLISION_DEPTH = 0.001  # metres
 FINGER_SPINNING_FRICTION = 0.05  # metres: torque about a contact's normal, by its force
 FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
@@ -30,6 +31,7 @@ CONSTANTS = {
     "time_step": TIME_STEP,
     "solver_iterations": SOLVER_ITERATIONS,
     "gravity": GRAVITY,
+    "collision_depth": COLLISION_DEPTH,
     "finger_spinning_friction": FINGER_SPINNING_FRICTION,
     "gear_force": GEAR_FORCE,
 }
@@ -46,6 +48,7 @@ class PybulletWorld(World):
     """
 
     name = "pybullet"
+    collision_depth = COLLISION_DEPTH
 
     def __init__(self) -> None:
         self.client: int = pybullet.connect(pybullet.DIRECT)
