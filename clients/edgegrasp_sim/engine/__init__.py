@@ -45,12 +45,12 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> EngineChoice:
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
     if asked:
-        if not _installed(asked):
+        if not installed(asked):
             raise RuntimeError(f"engine {asked} is not installed: pip install {asked}")
         return EngineChoice(asked, "as asked for")
-    if protocol and _installed(protocol):
+    if protocol and installed(protocol):
         return EngineChoice(protocol, "the protocol's")
-    there = next((name for name in ENGINES if _installed(name)), None)
+    there = next((name for name in ENGINES if installed(name)), None)
     if there is None:
         raise RuntimeError("no physics engine is installed: pip install 'edgegrasp[sim]'")
     without = protocol or (ENGINES[0] if there != ENGINES[0] else "")
@@ -58,6 +58,14 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> EngineChoice:
         whose = "the protocol's " if protocol else ""
         return EngineChoice(there, f"because {whose}{without} is not installed")
     return EngineChoice(there, "the default")
+
+
+def installed(engine: str) -> bool:
+    """Whether an engine can be used here."""
+    try:
+        return importlib.util.find_spec(engine) is not None
+    except ValueError:  # something stands in its place
+        return False
 
 
 def make_world(engine: str | None = None) -> "World":
@@ -288,10 +296,3 @@ class Hand(Body):
     @abstractmethod
     def close_fingers(self) -> None:
         """Drive the fingers together with full force from now on."""
-
-
-def _installed(engine: str) -> bool:
-    try:
-        return importlib.util.find_spec(engine) is not None
-    except ValueError:  # something stands in its place
-        return False
