@@ -51,6 +51,7 @@ CONSTANTS = {
     "finger_speed": FINGER_SPEED,
     "finger_inertia": FINGER_INERTIA,
 }
+_SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
 _OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
 _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
 
@@ -77,15 +78,17 @@ class MujocoWorld(World):
         self._states: dict[int, Any] = {}
         self._hand: MujocoHand | None = None
         self._uid_of_geom = np.empty(0, np.int64)
+        self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     @property
     def data(self) -> Any:
         """The state, of a model that has all bodies."""
         if self._changed:
+            self._changed = False
             self._model, self._data = self.spec.recompile(self._model, self._data)
             names = [self._model.body(body).name for body in self._model.geom_bodyid]
             self._uid_of_geom = np.array([int(name.split()[0]) for name in names])
-            self._changed = False
+            self._places.clear()
         return self._data
 
     @property
@@ -93,15 +96,28 @@ class MujocoWorld(World):
         """The model, with all bodies."""
         return self.data.model
 
+    def places(self, uid: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and velocities of a body's joints and its links': views of the state."""
+        data = self.data
+        if uid not in self._places:
+            model = self._model
+            tree = model.body_treeid[model.body(str(uid)).id]
+            first, last = model.tree_dofadr[tree], model.tree_dofadr[tree] + model.tree_dofnum[tree]
+            start = model.jnt_qposadr[model.dof_jntid[first]]
+            # Of a body, place and quaternion wxyz; behind it its links' joints.
+            self._places[uid] = (data.qpos[start : start + last - first + 1], data.qvel[first:last])
+        return self._places[uid]
+
     def step(self, steps: int = 1) -> None:
-        model, data = self.model, self.data
+        model, data, hand = self.model, self.data, self._hand
         for _ in range(steps):
-            if self._hand is None or not self._hand.moves:
+            if hand is None or hand.way is None:
                 mujoco.mj_step(model, data, SUBSTEPS)
                 continue
-            for place in self._hand.way(SUBSTEPS):
+            for place in hand.way:
                 data.mocap_pos[0] = place
                 mujoco.mj_step(model, data)
+            hand.way = None
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
         model, data = self.model, self.data
@@ -125,6 +141,8 @@ class MujocoWorld(World):
 
     def restore_state(self, state: int) -> None:
         mujoco.mj_copyData(self.data, self.model, self._states[state])
+        if self._hand is not None:
+            self._hand.way = None
 
     def remove_state(self, state: int) -> None:
         del self._states[state]
@@ -312,46 +330,32 @@ class MujocoBody(Body):
         self.world.remove(self._body)
 
     @property
-    def _qpos(self) -> NDArray[np.float64]:
-        """Place and quaternion wxyz: a view of the state."""
-        model = self.world.model
-        start = model.jnt_qposadr[model.body_jntadr[self._body.id]]
-        view: NDArray[np.float64] = self.world.data.qpos[start : start + 7]
-        return view
-
-    @property
-    def _qvel(self) -> NDArray[np.float64]:
-        model = self.world.model
-        start = model.jnt_dofadr[model.body_jntadr[self._body.id]]
-        view: NDArray[np.float64] = self.world.data.qvel[start : start + 6]
-        return view
-
-    @property
     def position(self) -> Matrix:
-        return self._qpos[:3].copy()
+        return self.world.places(self.uid)[0][:3].copy()
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
-        w, x, y, z = self._qpos[3:].tolist()
+        w, x, y, z = self.world.places(self.uid)[0][3:7].tolist()
         return x, y, z, w
 
     @property
     def rotation(self) -> Matrix:
         """Its axes in the world, (3, 3)."""
         matrix = np.empty(9)
-        mujoco.mju_quat2Mat(matrix, self._qpos[3:])
+        mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
         return matrix.reshape(3, 3)
 
     def set_pose(
         self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
     ) -> None:
         x, y, z, w = quaternion_xyzw
-        self._qpos[:] = (*position, w, x, y, z)
-        self._qvel[:] = 0.0
+        qpos, qvel = self.world.places(self.uid)
+        qpos[:7] = (*position, w, x, y, z)
+        qvel[:] = 0.0
 
     @property
     def speed(self) -> float:
-        return float(np.linalg.norm(self._qvel))
+        return float(np.linalg.norm(self.world.places(self.uid)[1]))
 
     @property
     def bounds(self) -> Matrix:
@@ -368,45 +372,30 @@ class MujocoHand(MujocoBody, Hand):
     def __init__(self, world: MujocoWorld, body: Any, points: Matrix, model: HandModel) -> None:
         super().__init__(world, body, points)
         self.hand = model
-        self._target = np.zeros(3)
-
-    @property
-    def moves(self) -> bool:
-        """Whether its target does."""
-        return not np.array_equal(self._target, self.world.data.mocap_pos[0])
-
-    def way(self, steps: int) -> Matrix:
-        """The target's places in the substeps of the next time step, (steps, 3)."""
-        here: Matrix = self.world.data.mocap_pos[0]
-        shares = np.arange(1, steps + 1)[:, None] / steps
-        return np.asarray(here + shares * (self._target - here))
-
-    @property
-    def _fingers(self) -> slice:
-        """Where the fingers are in the state of the joints, behind the palm's."""
-        model = self.world.model
-        start = int(model.jnt_qposadr[model.body_jntadr[self._body.id]]) + 7
-        return slice(start, start + 2)
+        self.way: Matrix | None = None  # (SUBSTEPS, 3) of its target in the next time step
 
     @property
     def opening(self) -> float:
-        return float(self.world.data.qpos[self._fingers].sum())
+        one, other = self.world.places(self.uid)[0][7:].tolist()
+        return float(one + other)
 
     def set_pose(
         self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
     ) -> None:
         super().set_pose(position, quaternion_xyzw)
-        data, start = self.world.data, self._fingers.start
-        data.qpos[start : start + 2] = 0.5 * self.hand.max_opening
-        data.qvel[start - 1 : start + 1] = 0.0
+        data = self.world.data
+        self.world.places(self.uid)[0][7:] = 0.5 * self.hand.max_opening
         data.ctrl[:2] = FINGER_SPEED
+        data.mocap_pos[0] = position
         self.move(position, quaternion_xyzw)
-        data.mocap_pos[0] = self._target
+        self.way = None
 
     def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
         x, y, z, w = quaternion_xyzw
-        self._target = np.array(position, dtype=np.float64)
-        self.world.data.mocap_quat[0] = (w, x, y, z)
+        data = self.world.data
+        here = data.mocap_pos[0]
+        self.way = here + _SHARES * (np.asarray(position) - here)
+        data.mocap_quat[0] = (w, x, y, z)
 
     def close_fingers(self) -> None:
         self.world.data.ctrl[:2] = -FINGER_SPEED
