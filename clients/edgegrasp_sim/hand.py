@@ -47,7 +47,6 @@ HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves
 SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
 LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
 SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
-SHAKE_STEP = 0.0125  # metres in each time step: 1.0 m/s
 # Metres along the hand's z at which to look for the object between the fingers, best first.
 _TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
 
@@ -319,7 +318,8 @@ def _holds_when_shaken(
     gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
     for along in np.eye(3)[:2]:
         for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
-            gripper.move_to(T_world_lifted @ translation(*(way * along)), step_length=SHAKE_STEP)
+            aside = T_world_lifted @ translation(*(way * along))
+            gripper.move_to(aside, step_length=gripper.world.shake_step)
     return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
 
 

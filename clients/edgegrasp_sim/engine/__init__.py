@@ -153,6 +153,7 @@ class World(ABC):
 
     name: ClassVar[str]  # of the engine
     collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
+    shake_step: ClassVar[float]  # metres in each time step, with which a held object is shaken
 
     def __enter__(self) -> Self:
         return self
