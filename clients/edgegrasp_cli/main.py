@@ -17,6 +17,8 @@ COMMANDS = {
     "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
     "detect": ("detect", "service", "Find grasps in a cloud or a depth image."),
     "models": ("detect", "service", "List the weights that can be used."),
+    "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),
+    "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
     "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
     "experiment": ("experiment", "train", "Run benchmarks that differ in one thing each."),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,7 @@ class Drawable(Protocol):
 
 
 def draw_grasps(
-    path: Path,
+    path: Path | BinaryIO,
     cloud: ArrayLike,
     grasps: Sequence[Drawable],
     *,
@@ -50,7 +50,7 @@ def draw_grasps(
     surface, and the inner faces of the fingers at the opening they start from.
 
     Args:
-        path: `.png` or `.jpg` file to write; its folder must exist.
+        path: `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
         cloud: (N, 3) metres.
         grasps: best first; coloured by score, the best one edged in red.
         camera_position: (3,) metres, cloud frame; the first view looks from there.
