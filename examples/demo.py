@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
 from edgegrasp_sim.camera import Observation, crop
+from edgegrasp_sim.engine import ENGINES, choose_engine
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.simulation import ClutterSimulation
 
@@ -24,10 +25,12 @@ LISTED = 12
 TIMEOUT = 120.0  # seconds; a slow machine is no reason to fail
 
 
-def main(seed: int, output: Path) -> None:
+def main(seed: int, output: Path, engine: str | None = None) -> None:
     """Run the demo; exits with a message if the server does not start or finds too little."""
+    chosen = choose_engine(engine)
+    print(chosen)
     scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
-    with ClutterSimulation() as simulation:
+    with ClutterSimulation(engine=chosen.name) as simulation:
         placed = simulation.reset("pile", scene, num_objects=6)
         seen = simulation.observe(camera, noise, table="auto")
         print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
@@ -117,8 +120,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="A scene, its grasps, one executed, a picture.")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder to write to")
+    parser.add_argument("--engine", choices=ENGINES, help="by default the first there is")
     arguments = parser.parse_args()
     try:
-        main(arguments.seed, arguments.output)
+        main(arguments.seed, arguments.output, arguments.engine)
     except GraspClientError as error:
         sys.exit(f"error: {error}")

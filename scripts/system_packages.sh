@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Make sure the system has what pip cannot install: Python's venv module, and the shared libraries
-# that Open3D loads on import. Installs them where it may (root, with apt-get), and otherwise names
+# that Open3D and MuJoCo load. Installs them where it may (root, with apt-get), and otherwise names
 # the command to run.
 #
 # usage: scripts/system_packages.sh [python]
@@ -50,7 +50,8 @@ echo "missing system packages (names as on Debian): ${missing[*]}"
 
 if ! command -v apt-get >/dev/null; then
     echo "warning: no apt-get here; install them with this system's own tool. Without the" \
-        "libraries, Open3D (reading .ply and .pcd files) does not import." >&2
+        "libraries, Open3D (reading .ply and .pcd files) does not import, and MuJoCo draws no" \
+        "images." >&2
     exit 0
 fi
 

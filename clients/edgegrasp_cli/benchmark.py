@@ -33,6 +33,9 @@ Objects = Annotated[
     Path | None,
     Option(help="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects."),
 ]
+Engine = Annotated[
+    str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
+]
 Split = Annotated[str, Option(help="Which of its objects: test or train.")]
 Workers = Annotated[
     int | None, Option(help="Processes that simulate; else one for each core. Same results.")
@@ -62,6 +65,7 @@ def benchmark(
     seeds: Seeds = None,
     objects: Objects = None,
     split: Split = "test",
+    engine: Engine = None,
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
@@ -93,12 +97,15 @@ def benchmark(
     """
     from edgegrasp_cli.planners.choice import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig
+    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
     from edgegrasp_sim.results import ResultFolder, below_gate, summarise
 
     with interruptible("benchmark", resumes=output is not None):
         rules = load_protocol(protocol)
+        chosen = choose_engine(engine, rules.engine)
+        print(chosen)
         choice = PlannerChoice(
             planner,
             model,
@@ -115,12 +122,18 @@ def benchmark(
             objects.resolve() if objects is not None else None,
             split,
             patience,
+            chosen.name,
         )
         own_server = planner == "server" and server is None
         processes = _processes(workers, ray=ray, own_server=own_server)
         folder = ResultFolder(output) if output is not None else None
         done, title = run_rounds(config, choice, folder, workers=processes, ray=ray)
-    summary = {"scene": scene, "protocol": rules.name, "protocol_version": rules.version}
+    summary = {
+        "scene": scene,
+        "engine": chosen.name,
+        "protocol": rules.name,
+        "protocol_version": rules.version,
+    }
     summary |= summarise(done)
     if folder is not None:
         folder.finish(done)

@@ -11,6 +11,7 @@ import typer
 
 from edgegrasp_cli.benchmark import (
     DECIDED,
+    Engine,
     Objects,
     Ray,
     Seeds,
@@ -50,6 +51,7 @@ def experiment(
     ] = None,
     objects: Objects = None,
     split: Split = "test",
+    engine: Engine = None,
     workers: Workers = None,
     ray: Ray = None,
     *,
@@ -61,6 +63,7 @@ def experiment(
     not varied there are 32 approach points and 2,000 candidates, unless flags say otherwise.
     """
     from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores
+    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.experiments import cases_of
     from edgegrasp_sim.objects import CLUTTER, SceneKind
     from edgegrasp_sim.protocol import load_protocol
@@ -69,7 +72,10 @@ def experiment(
     with interruptible("experiment", resumes=True):
         scenes = [SceneKind(each) for each in scene or CLUTTER]
         asked = SAMPLES | parse_option_flags(options)
-        cases = cases_of(name, load_protocol(protocol), scenes, model or [""], output)
+        rules = load_protocol(protocol)
+        chosen = choose_engine(engine, rules.engine)
+        print(chosen)
+        cases = cases_of(name, rules, scenes, model or [""], output)
         done: list[dict[str, Any]] = []
         for number, case in enumerate(cases, 1):
             print(f"{number}/{len(cases)}: {case.name}", flush=True)
@@ -80,6 +86,7 @@ def experiment(
                 case.protocol,
                 case.objects or (objects.resolve() if objects else None),
                 split,
+                engine=chosen.name,
             )
             folder = ResultFolder(output / "cases" / case.name)
             finished, _ = run_rounds(

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from edgegrasp_cli.benchmark import Engine
+
 Option = typer.Option
 
 
@@ -29,6 +31,7 @@ def generate_data(
         Path | None,
         Option(help="Network that chooses half of the grasps: its best, and its least certain."),
     ] = None,
+    engine: Engine = None,
     workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
@@ -37,13 +40,16 @@ def generate_data(
     """
     from rich.progress import track
 
+    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
     from edgegrasp_training.views import find_views, write_data_card
 
     kind = None if scene is None else SceneKind(scene)
+    chosen = choose_engine(engine)
+    print(chosen)
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed=seed, weights=weights, kind=kind
+        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0

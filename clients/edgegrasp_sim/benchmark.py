@@ -15,7 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from edgegrasp_sim import engine, hand, objects, scene, surroundings, trial
+from edgegrasp_sim import hand, objects, scene, surroundings, trial
+from edgegrasp_sim.engine import choose_engine, engine_constants
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
@@ -27,14 +28,13 @@ PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
 MAX_CRASHES = 3  # in a row, without a finished round between them
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "torch", "open3d-cpu")
+PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3d-cpu")
 CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module, for the manifest
-    (engine, ("time_step", "solver_iterations", "gravity")),
     (surroundings, ("table_friction",)),
     (scene, ("packed_attempts", "pile_drop_height", "rest_speed")),
     (objects, ("object_mass", "object_friction")),
-    (hand, ("max_opening", "hand_mass", "finger_friction", "finger_spinning_friction")),
-    (hand, ("finger_force", "gear_force", "tool_force", "close_seconds", "collision_depth")),
+    (hand, ("max_opening", "hand_mass", "finger_friction")),
+    (hand, ("finger_force", "tool_force", "close_seconds")),
     (hand, ("pregrasp_distance", "retreat_distance", "side_grasp_angle", "step_length")),
     (hand, ("min_opening",)),
     (trial, ("min_points",)),
@@ -54,6 +54,7 @@ class BenchmarkConfig:
         objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
         split: of that folder.
         patience: seconds to keep asking a planner that is unavailable.
+        engine: to simulate with; by default see `choose_engine`, with the protocol's.
     """
 
     scene: SceneKind
@@ -63,6 +64,7 @@ class BenchmarkConfig:
     objects: Path | None = None
     split: str = "test"
     patience: float = PATIENCE
+    engine: str = ""
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -71,6 +73,8 @@ class BenchmarkConfig:
             raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds is {self.seeds}; pass each seed once")
+        chosen = choose_engine(self.engine, self.protocol.engine).name
+        object.__setattr__(self, "engine", chosen)
 
     def object_set(self) -> ObjectSet:
         """The objects to draw scenes from.
@@ -153,7 +157,8 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
             "protocol": config.protocol.to_json(),
             "objects": {"name": drawn.name, "models": len(drawn.models), "digest": drawn.digest},
             "planner": planner,
-            "constants": constants(),
+            "engine": config.engine,
+            "constants": constants(config.engine),
         },
         "rounds": config.rounds,
         "seeds": list(config.seeds),
@@ -169,9 +174,11 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
     }
 
 
-def constants() -> dict[str, float]:
+def constants(engine: str) -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
-    return {name: getattr(module, name.upper()) for module, names in CONSTANTS for name in names}
+    return engine_constants(engine) | {
+        name: getattr(module, name.upper()) for module, names in CONSTANTS for name in names
+    }
 
 
 def available_cores() -> int:
@@ -208,7 +215,7 @@ class RoundRunner:
             )
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: objects})
+        self.simulation = ClutterSimulation({config.scene: objects}, engine=config.engine)
 
     def run(self, task: Task) -> Round:
         """Run the round of a seed and an index."""

@@ -3,14 +3,17 @@
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
-from edgegrasp_sim.engine import ASSETS, TIME_STEP, Body, Joint, World, WorldAnchor, couple_joints
+from edgegrasp_sim.engine import TIME_STEP, Body, HandModel, World
+from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
-MESHES = ASSETS / "franka_panda" / "meshes" / "collision"
+SHAPES = Path(__file__).parent / "panda_hand.obj"
 MAX_OPENING = 0.08  # metres between the fingers
 FINGERTIP = 0.1122  # metres ahead of the link
 # The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
@@ -21,16 +24,10 @@ HAND_MASS = 0.5  # kg
 HAND_FRICTION = 1.0
 FINGER_MASS = 0.1  # kg
 FINGER_FRICTION = 0.75
-FINGER_SPINNING_FRICTION = 0.05
-FINGER_STIFFNESS = 30000.0  # N/m at a contact
-FINGER_DAMPING = 1000.0  # N s/m at a contact
 FINGER_FORCE = 20.0  # N
 FINGER_BASE = 0.0584  # metres ahead of the link
-GEAR_FORCE = 30.0  # N
-GEAR_ERP = 0.1
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
-COLLISION_DEPTH = 0.001  # metres; a finger sliding along an object overlaps it by less
 
 # Far above the table and out of the cameras' sight.
 _PARKED = translation(0.15, 0.15, 5.0)
@@ -50,7 +47,6 @@ HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves
 SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
 LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
 SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
-SHAKE_STEP = 0.0125  # metres in each time step: 1.0 m/s
 # Metres along the hand's z at which to look for the object between the fingers, best first.
 _TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
 
@@ -182,34 +178,13 @@ class Gripper:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.body = world.add_hand(
-            MESHES / "hand.obj",
-            MESHES / "finger.obj",
-            palm_mass=HAND_MASS,
-            palm_centre=T_HAND_HANDCOM[:3, 3].tolist(),
-            finger_mass=FINGER_MASS,
-            finger_base=FINGER_BASE,
-            position=_PARKED[:3, 3].tolist(),
-        )
-        self.body.set_dynamics(mass=HAND_MASS, friction=HAND_FRICTION)
-        self.fingers = (Joint(self.body, 0), Joint(self.body, 1))
-        for finger in self.fingers:
-            self.body.set_finger(
-                finger.index,
-                friction=FINGER_FRICTION,
-                spinning_friction=FINGER_SPINNING_FRICTION,
-                stiffness=FINGER_STIFFNESS,
-                damping=FINGER_DAMPING,
-                max_position=0.5 * MAX_OPENING,
-            )
-        self._anchor = WorldAnchor(self.body, _PARKED[:3, 3].tolist(), TOOL_FORCE)
-        couple_joints(self.body, 0, 1, erp=GEAR_ERP, max_force=GEAR_FORCE)
+        self.body = world.add_hand(panda(), _PARKED[:3, 3])
         self.park()
 
     @property
     def opening(self) -> float:
         """Metres between the fingers."""
-        return self.fingers[0].position + self.fingers[1].position
+        return self.body.opening
 
     def park(self) -> None:
         """Put the open hand where it touches nothing and no camera sees it."""
@@ -218,12 +193,7 @@ class Gripper:
     def place(self, T_world_hand: Matrix) -> None:
         """Put the open hand there at once, at rest."""
         T_world_com = T_world_hand @ T_HAND_HANDCOM
-        pose = T_world_com[:3, 3], quaternion_xyzw(T_world_com)
-        self.body.set_pose(*pose)
-        self._anchor.move(*pose)
-        for finger in self.fingers:
-            finger.reset(0.5 * MAX_OPENING)
-            finger.drive_to(0.5 * MAX_OPENING, FINGER_FORCE)
+        self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
         """Drag the hand in a straight line, `step_length` metres in each time step.
@@ -239,7 +209,7 @@ class Gripper:
         steps = max(1, int(distance / step_length))
         for _ in range(steps):
             position = position + way / steps
-            self._anchor.move(position, quaternion)
+            self.body.move(position, quaternion)
             self.world.step()
             yield
 
@@ -250,8 +220,27 @@ class Gripper:
 
     def close(self) -> None:
         """Drive the fingers together with full force."""
-        for finger in self.fingers:
-            finger.drive_to(0.0, FINGER_FORCE)
+        self.body.close_fingers()
+
+
+@cache
+def panda() -> HandModel:
+    """The Panda's hand, of the convex hulls of its meshes."""
+    shapes = dict(read_obj(SHAPES))
+    x, y, z = T_HAND_HANDCOM[:3, 3].tolist()
+    return HandModel(
+        palm=shapes["palm"].points,
+        finger=shapes["finger"].points,
+        finger_base=FINGER_BASE,
+        centre=(x, y, z),
+        mass=HAND_MASS,
+        friction=HAND_FRICTION,
+        finger_mass=FINGER_MASS,
+        finger_friction=FINGER_FRICTION,
+        finger_force=FINGER_FORCE,
+        max_opening=MAX_OPENING,
+        tool_force=TOOL_FORCE,
+    )
 
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
@@ -295,12 +284,15 @@ class _Watch:
     def __init__(self, gripper: Gripper, objects: Mapping[int, SceneObject]) -> None:
         self._gripper, self._objects = gripper, objects
         self._empty_steps = self._held_steps = 0
+        self._opening = gripper.opening
         self._offset: Matrix | None = None
 
     def is_clear(self) -> bool:
         """Whether the fingers hold nothing any more, or one object that rests on nothing else."""
         touched = _touched(self._gripper, self._objects)
-        self._empty_steps = 0 if touched else self._empty_steps + 1
+        before, self._opening = self._opening, self._gripper.opening
+        closing = abs(self._opening - before) >= STILL  # and may yet catch something
+        self._empty_steps = 0 if touched or closing else self._empty_steps + 1
         if self._gripper.opening <= MIN_OPENING or self._empty_steps >= EMPTY_STEPS:
             return True
         held = len(touched) == 1 and self._hangs_still(touched[0].body)
@@ -326,14 +318,15 @@ def _holds_when_shaken(
     gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
     for along in np.eye(3)[:2]:
         for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
-            gripper.move_to(T_world_lifted @ translation(*(way * along)), step_length=SHAKE_STEP)
+            aside = T_world_lifted @ translation(*(way * along))
+            gripper.move_to(aside, step_length=gripper.world.shake_step)
     return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
 
 
 def _cut_into(gripper: Gripper) -> set[int]:
     """Ids of the bodies that the hand overlaps."""
-    contacts = gripper.body.contacts()
-    return {each.other_uid for each in contacts if each.distance < -COLLISION_DEPTH}
+    contacts, depth = gripper.body.contacts(), gripper.world.collision_depth
+    return {each.other_uid for each in contacts if each.distance < -depth}
 
 
 def _touched(gripper: Gripper, objects: Mapping[int, SceneObject]) -> list[SceneObject]:

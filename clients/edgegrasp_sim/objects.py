@@ -10,7 +10,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import version
@@ -21,12 +21,12 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.engine import ASSETS
+from edgegrasp_sim.engine.urdf import convex_hull
 
 OBJECT_MASS = 0.5  # kg
 OBJECT_FRICTION = 1.0
 MESH_SUFFIXES = (".obj", ".stl")
-LAYOUT = 1  # of a cached object; raised whenever what is written changes
+LAYOUT = 1  # of cached objects; raised whenever what is written changes
 SHORTEST_SIDE = 0.06  # metres, of the box around an object; fits between the fingers
 LONGEST_SIDE = 0.15  # metres; five such objects fit into the workspace
 # How closely convex parts follow a concave surface, as a share of its size (coacd's threshold).
@@ -160,22 +160,25 @@ class ObjectSet:
 
     @classmethod
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
-        """Graspable objects that ship with the engine, scaled to the hand."""
-        known = [
-            (ObjectModel(name, ASSETS / file, scale), stands)
-            for name, file, scale, stands in _BUILTIN
-        ]
-        for blobs, stands in ((_STANDING_BLOBS, True), (_OTHER_BLOBS, False)):
-            known += [(blob(number, scale), stands) for number, scale in blobs.items()]
-        lying = scene.objects is SceneKind.PILE
-        models = tuple(model for model, stands in known if stands or lying)
+        """Graspable objects that need no files: boxes and cans, and for piles random shapes too."""
+        folder = _kept_in(f"builtin-{LAYOUT}", _write_builtin)
+        names = [f"{family}-{k}" for family in _STANDING for k in range(len(FAMILIES[family]))]
+        if scene.objects is SceneKind.PILE:
+            names += [f"blob_{number:03d}" for number in range(_BLOBS)]
+        models = tuple(ObjectModel(name, folder / f"{name}.urdf") for name in names)
         return cls(f"builtin/{scene}", models)
 
 
-def blob(number: int, scale: float) -> ObjectModel:
-    """An object of random shape that ships with the engine, by its number below 1000."""
-    name = f"{number:03d}"
-    return ObjectModel(f"blob_{name}", ASSETS / "random_urdfs" / name / f"{name}.urdf", scale)
+def blob(number: int, folder: Path, scale: float = 1.0) -> ObjectModel:
+    """Write a convex object of random shape, always the same for its number, into a folder."""
+    rng = np.random.default_rng(number)
+    directions = rng.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    half = rng.uniform((0.018, 0.025, 0.03), (0.035, 0.05, 0.065))
+    hull = convex_hull(directions * half * rng.uniform(0.75, 1.0, size=(30, 1)))
+    assert hull is not None
+    name = f"blob_{number:03d}"
+    return ObjectModel(name, write_object(name, as_obj([hull]), folder), scale)
 
 
 def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
@@ -198,20 +201,11 @@ def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
         RuntimeError: coacd or trimesh is not installed.
     """
     _require_packages()
-    folder = (cache or cache_folder()) / _digest(mesh)
-    urdf = folder / "object.urdf"
-    if urdf.is_file():
-        return urdf
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
-    try:
-        parts = _write_object(mesh, unfinished)
-        with contextlib.suppress(OSError):  # another process was faster, with the same result
-            unfinished.rename(folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-    logger.info("%s: %d convex parts", mesh.name, parts)
-    return urdf
+
+    def write(folder: Path) -> None:
+        logger.info("%s: %d convex parts", mesh.name, _write_object(mesh, folder))
+
+    return _kept_in(_digest(mesh), write, cache) / "object.urdf"
 
 
 def cache_folder() -> Path:
@@ -302,22 +296,6 @@ class Prism:
         return as_obj([(corners, np.array(faces))])
 
 
-# Name, file among the engine's assets, scale, and whether it stands upright in a packed scene.
-_BUILTIN: tuple[tuple[str, str, float, bool], ...] = (
-    ("cube", "cube_small.urdf", 1.2, True),
-    ("brick", "lego/lego.urdf", 2.0, True),
-    ("mug", "objects/mug.urdf", 0.8, True),
-    ("domino", "domino/domino.urdf", 2.4, True),
-    ("jenga", "jenga/jenga.urdf", 0.9, False),
-    ("block", "block.urdf", 1.5, False),
-    ("duck", "duck_vhacd.urdf", 1.0, False),
-    ("teddy", "teddy_vhacd.urdf", 1.0, False),
-)
-# Scales of objects of random shape, by number: those that stand upright, and others.
-_STANDING_BLOBS = {3: 1.0, 8: 0.8, 21: 1.0, 36: 1.1, 41: 0.8, 45: 1.0, 51: 1.0, 61: 1.0}
-_OTHER_BLOBS = {0: 0.75, 2: 0.75, 9: 1.2, 14: 1.1, 16: 0.8, 39: 0.75, 59: 0.8, 66: 0.8}
-
-
 def _boxes(*sizes: Size) -> tuple[Prism, ...]:
     return tuple(Prism(4, size) for size in sizes)
 
@@ -345,6 +323,33 @@ FAMILIES: dict[str, tuple[Prism, ...]] = {
     "large": _boxes((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07))
     + _cans((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
 }
+
+
+_STANDING = ("regular", "large")  # families that the built-in sets hold
+_BLOBS = 12  # that those of piles hold besides
+
+
+def _write_builtin(folder: Path) -> None:
+    for family in _STANDING:
+        write_family(family, folder)
+    for number in range(_BLOBS):
+        blob(number, folder)
+
+
+def _kept_in(name: str, write: Callable[[Path], None], cache: Path | None = None) -> Path:
+    """A folder in the cache, written when it is first asked for."""
+    folder = (cache or cache_folder()) / name
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = Path(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
+    try:
+        write(unfinished)
+        with contextlib.suppress(OSError):  # another process was faster, with the same result
+            unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return folder
 
 
 def _require_packages() -> None:

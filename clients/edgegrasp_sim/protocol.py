@@ -168,6 +168,7 @@ class Protocol:
         camera: where the camera stands.
         noise: of what it sees.
         planning: what a planner is given.
+        engine: the physics engine that its figures are of; empty: any.
     """
 
     name: str
@@ -180,14 +181,16 @@ class Protocol:
     camera: CameraRules
     noise: NoiseRules
     planning: PlanningRules
+    engine: str = ""
 
     def num_objects(self, index: int) -> int:
         """How many objects to try to place in a round."""
         return self.scene.num_objects[index % len(self.scene.num_objects)]
 
     def to_json(self) -> dict[str, Any]:
-        """All constants, ready for JSON."""
+        """All constants but the engine, which a result names by itself; ready for JSON."""
         table = asdict(self)
+        del table["engine"]
         if self.camera.surface_voxel == 0:  # so that earlier results can be resumed
             del table["camera"]["surface_voxel"]
         if not self.noise.sensor:

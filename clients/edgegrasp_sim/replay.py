@@ -41,7 +41,7 @@ class Replay:
                 "pass the folder it was run with"
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
-        self.simulation = ClutterSimulation({self.scene: models})
+        self.simulation = ClutterSimulation({self.scene: models}, engine=run["engine"])
 
     def __enter__(self) -> Self:
         return self

@@ -24,10 +24,17 @@ CSV_COLUMNS = (
     *(name for name in Attempt.__dataclass_fields__ if name != "T_world_hand"),
     "T_world_hand",
 )
-PAIRED = ("scene", "protocol", "objects", "constants")  # of the manifest, equal in paired runs
+PAIRED = (
+    "scene",
+    "engine",
+    "protocol",
+    "objects",
+    "constants",
+)  # of the manifest, equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
-GATED = ("scene", "protocol", "protocol_version")
+GATED = ("scene", "engine", "protocol", "protocol_version")
+FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
 
@@ -54,7 +61,7 @@ class ResultFolder:
         known = self.path / "manifest.json"
         manifest = json.loads(json.dumps(manifest))  # tuples become lists, as in the file
         if known.is_file():
-            before = json.loads(known.read_text())["run"]
+            before = self.manifest()["run"]
             changed = [key for key in manifest["run"] if before.get(key) != manifest["run"][key]]
             if changed:
                 raise ValueError(
@@ -93,13 +100,14 @@ class ResultFolder:
         if not file.is_file():
             raise FileNotFoundError(f"{self.path} holds no benchmark: manifest.json is missing")
         table: dict[str, Any] = json.loads(file.read_text())
-        return table
+        return table | {"run": FIRST_ENGINE | table["run"]}
 
     def finish(self, rounds: Sequence[Round]) -> dict[str, Any]:
         """Write `attempts.csv` and `summary.json`; returns the summary."""
         manifest = self.manifest()
         summary = {
             "scene": manifest["run"]["scene"],
+            "engine": manifest["run"]["engine"],
             "protocol": manifest["run"]["protocol"]["name"],
             "protocol_version": manifest["run"]["protocol"]["version"],
             **summarise(rounds),
@@ -205,6 +213,7 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
     names = ("attempts", "successes", *RATE_LABELS, "failures", "attempts_digest")
     return {
         "scene": run["scene"],
+        "engine": run["engine"],
         "protocol": {name: run["protocol"][name] for name in ("name", "version")},
         "planner": run["planner"],
         "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
@@ -279,8 +288,9 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
         FileNotFoundError: there is no such file.
         ValueError: it is no summary, or one of another scene or protocol.
     """
+    summary = FIRST_ENGINE | summary
     try:
-        committed = json.loads(gate.read_text())
+        committed = FIRST_ENGINE | json.loads(gate.read_text())
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
         differing = [name for name in GATED if committed[name] != summary[name]]
     except (json.JSONDecodeError, KeyError, TypeError) as error:

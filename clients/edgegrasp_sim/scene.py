@@ -65,8 +65,14 @@ def load_object(
         FileNotFoundError: the model's file is missing.
         ValueError: the engine cannot read it.
     """
-    body = world.load_urdf(model.urdf, position, quaternion_xyzw, scale * model.scale)
-    body.set_dynamics(mass=OBJECT_MASS, friction=OBJECT_FRICTION)
+    body = world.load_urdf(
+        model.urdf,
+        position,
+        quaternion_xyzw,
+        scale * model.scale,
+        mass=OBJECT_MASS,
+        friction=OBJECT_FRICTION,
+    )
     return SceneObject(model, scale, body)
 
 

@@ -20,7 +20,7 @@ from edgegrasp_sim.camera import (
     resample_surfaces,
     seen_box,
 )
-from edgegrasp_sim.engine import World
+from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.poses import Matrix, require_pose
@@ -96,6 +96,7 @@ class ClutterSimulation:
             at its start pose. The reference simulator asks for contacts there before the engine
             has looked for any, so that it never fails a grasp for this and lets the engine push
             hand and objects apart; off by default, to agree with it.
+        engine: see `choose_engine`.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class ClutterSimulation:
         objects: Mapping[SceneKind, ObjectSet] | None = None,
         *,
         start_contact_fails: bool = False,
+        engine: str | None = None,
     ) -> None:
         self.object_sets = (
             dict(objects)
@@ -111,7 +113,7 @@ class ClutterSimulation:
         )
         self.start_contact_fails = start_contact_fails
         self.surroundings = OPEN_TABLE
-        self.world = World()
+        self.world = make_world(engine)
         self._objects: list[SceneObject] = []
         self._obstacles: frozenset[int] = frozenset()
         self._gripper: Gripper | None = None
@@ -126,7 +128,7 @@ class ClutterSimulation:
         self.close()
 
     def close(self) -> None:
-        """Stop the physics server. Safe to call twice."""
+        """Close its worlds. Safe to call twice."""
         self.world.close()
         if self._copy is not None:
             self._copy.close()
@@ -332,7 +334,7 @@ class ClutterSimulation:
             ValueError: `T_world_hand` is no rigid transform.
         """
         if self._copy is None:
-            self._copy = ClutterSimulation(self.object_sets)
+            self._copy = ClutterSimulation(self.object_sets, engine=self.world.name)
         placements = self.placements
         if self._copied != placements:
             self._copy.reset_from_poses(placements, self.surroundings)

@@ -11,13 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from edgegrasp_sim.engine import ENGINES
 from edgegrasp_sim.hand import T_HANDCOM_HAND
 from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 
 
 def measure_agreement(
-    shared: Path, kind: SceneKind, *, most: int | None = None, to_the_end: bool = False
+    shared: Path,
+    kind: SceneKind,
+    *,
+    most: int | None = None,
+    to_the_end: bool = False,
+    engine: str | None = None,
 ) -> list[tuple[int, int]]:
     """Repeat the grasps of `<shared>/reference/grasp_outcomes/<kind>.json`.
 
@@ -26,6 +32,7 @@ def measure_agreement(
         kind: of the scenes.
         most: only the first so many grasps of each scene.
         to_the_end: see `ClutterSimulation.try_grasp`.
+        engine: see `choose_engine`; the reference simulator is PyBullet.
 
     Returns:
         For each scene how many grasps succeeded or failed as in the reference, and were tried.
@@ -35,7 +42,7 @@ def measure_agreement(
     """
     path = shared / "reference" / "grasp_outcomes" / f"{kind}.json"
     counts = []
-    with ClutterSimulation() as simulation:
+    with ClutterSimulation(engine=engine) as simulation:
         for scene in json.loads(path.read_text())["scenes"]:
             simulation.reset_from_poses(
                 [
@@ -64,10 +71,13 @@ def main() -> None:
         action="store_true",
         help="simulate every step of every grasp, even once its outcome is clear",
     )
+    parser.add_argument("--engine", choices=ENGINES, help="by default the first there is")
     given = parser.parse_args()
     for kind in CLUTTER:
         started = time.process_time()
-        counts = measure_agreement(given.shared, kind, to_the_end=given.to_the_end)
+        counts = measure_agreement(
+            given.shared, kind, to_the_end=given.to_the_end, engine=given.engine
+        )
         seconds = time.process_time() - started
         agreed, tried = np.sum(counts, axis=0)
         scenes = ", ".join(f"{same}/{all_}" for same, all_ in counts)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import load_gripper
@@ -28,8 +29,9 @@ from edgegrasp_model.options import (
     Workspace,
 )
 from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_model.scene.scene import build_scene, select_points
+from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
 from edgegrasp_sim.camera import Observation, ViewRange
+from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
@@ -37,7 +39,7 @@ from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
-from edgegrasp_training.views import LabelledView, support_as_array
+from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
@@ -104,6 +106,7 @@ class GenerationOptions:
     seed: int = 1
     weights: Path | None = None  # of the network that guides the choice
     kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
+    engine: str | None = None  # see `choose_engine`
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
@@ -115,6 +118,15 @@ class Query(NamedTuple):
 
     observation: Observation
     request: DetectOptions
+
+
+class Chosen(NamedTuple):
+    """The grasps to try in a view, and what they were sampled from."""
+
+    selected: SelectedPoints
+    scene: Scene
+    candidates: Candidates
+    T_world_hand: NDArray[np.float32]  # (E, 4, 4)
 
 
 def generate(
@@ -130,8 +142,18 @@ def generate(
 
     Yields:
         For each finished scene its index, the grasps tried in it and those that held.
+
+    Raises:
+        ValueError: The folder holds views of another engine.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    options = replace(options, engine=choose_engine(options.engine).name)
+    known = {engine_of(path) for path in folder.glob("*.npz")}
+    if other := known - {options.engine}:
+        raise ValueError(
+            f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
+            "choose another folder"
+        )
     missing = missing_scenes(folder, options)
     if workers == 1:
         for index in missing:
@@ -182,15 +204,17 @@ def generate_scene(
             drawn = ObjectSet.from_folder(objects, source, "train")
             if streams[SHAPE_STREAM].random() < VARIED_SHARE:
                 drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
-        with ClutterSimulation(None if drawn is None else {kind: drawn}) as simulation:
+        sets = None if drawn is None else {kind: drawn}
+        with ClutterSimulation(sets, engine=options.engine) as simulation:
             hard = _make_scene(simulation, kind, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             for number in range(options.views_per_scene):
-                query = hard if hard and number == 0 else _ask(simulation, kind, streams)
+                query = hard if hard and number == 0 else ask(simulation, kind, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
-                view = replace(view, objects=names, object_digests=digests)
+                engine = simulation.world.name
+                view = replace(view, engine=engine, objects=names, object_digests=digests)
                 view.save(view_path(folder, index, number, options))
                 tried += len(view.tried())
                 held += int((view.success == 1).sum())
@@ -229,7 +253,7 @@ def _hard_view(
     Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
-        query = _ask(simulation, kind, streams)
+        query = ask(simulation, kind, streams)
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
@@ -243,7 +267,7 @@ def _hard_view(
     return None
 
 
-def _ask(
+def ask(
     simulation: ClutterSimulation, kind: SceneKind, streams: list[np.random.Generator]
 ) -> Query:
     """Look at the scene, and request grasps as a benchmark does, around fewer points.
@@ -327,24 +351,11 @@ def label(
         rng: Chooses among the candidates.
         hard: Whether the scene is known to be hard, even where the best grasp is sure.
     """
-    observation, request = query
-    if len(observation.cloud) == 0:
+    observation = query.observation
+    found = choose_grasps(query, options, rng, hard=hard)
+    if found is None:
         return _empty(observation)
-    guide = None if options.weights is None else detector(options.weights)
-    selected = sample = score = None
-    if guide is None:
-        selected = select_points(check_cloud(observation.cloud), request, {}, [])
-        scene = build_scene(selected, request, VOXEL_SIZE, {})
-        if scene is not None and scene.approach_allowed.any():
-            sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
-    else:
-        prepared = guide.prepare(observation.cloud, request)
-        selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
-        score = None if prepared.batch is None else guide.run(prepared.batch)
-    if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
-        return _empty(observation)
-    candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
-    T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
+    selected, scene, candidates, T_world_hand = found
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # What is far from every grasp says nothing about any.
     far = cKDTree(T_world_hand[:, :3, 3]).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
@@ -362,6 +373,37 @@ def label(
         at_side=None if scene.at_side is None else scene.at_side[kept],
         object_of_point=scene.object_of_point[kept].astype(np.int16),
     )
+
+
+def choose_grasps(
+    query: Query, options: GenerationOptions, rng: np.random.Generator, *, hard: bool
+) -> Chosen | None:
+    """Sample candidates of a view as the detector does and choose some; None without any.
+
+    Args:
+        query: A view and the request.
+        options: How many to choose, and the weights that guide the choice.
+        rng: Chooses among the candidates.
+        hard: See `label`.
+    """
+    observation, request = query
+    if len(observation.cloud) == 0:
+        return None
+    guide = None if options.weights is None else detector(options.weights)
+    selected = sample = score = None
+    if guide is None:
+        selected = select_points(check_cloud(observation.cloud), request, {}, [])
+        scene = build_scene(selected, request, VOXEL_SIZE, {})
+        if scene is not None and scene.approach_allowed.any():
+            sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
+    else:
+        prepared = guide.prepare(observation.cloud, request)
+        selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
+        score = None if prepared.batch is None else guide.run(prepared.batch)
+    if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
+        return None
+    candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
+    return Chosen(selected, scene, candidates, scene.frame.poses_in_cloud(candidates.T_cloud_hand))
 
 
 @lru_cache(maxsize=1)

@@ -17,7 +17,7 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_ob
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
-BLOB_SHARE = 0.15  # of them that come with the engine
+BLOB_SHARE = 0.15  # of them that are convex
 TRAINING_BLOBS = (100, 1000)  # their numbers; the built-in object sets have lower ones
 BLOB_SCALE = (0.6, 1.1)
 SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
@@ -54,7 +54,7 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
         if draw < MADE_SHARE:
             model = any_made_object(folder / "made", rng)
         elif draw < MADE_SHARE + BLOB_SHARE:
-            model = any_blob(rng)
+            model = any_blob(folder / "made", rng)
         else:
             model = objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
@@ -104,9 +104,9 @@ def any_made_object(folder: Path, rng: np.random.Generator) -> ObjectModel:
     return made_object(names[int(rng.integers(len(names)))], folder)
 
 
-def any_blob(rng: np.random.Generator) -> ObjectModel:
-    """Draw one of the objects of random shape that come with the engine."""
-    return blob(int(rng.integers(*TRAINING_BLOBS)), float(rng.uniform(*BLOB_SCALE)))
+def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
+    """Draw a convex object of random shape and write it into a folder."""
+    return blob(int(rng.integers(*TRAINING_BLOBS)), folder, float(rng.uniform(*BLOB_SCALE)))
 
 
 def made_object(name: str, folder: Path) -> ObjectModel:

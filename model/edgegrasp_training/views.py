@@ -39,6 +39,7 @@ class LabelledView:
     support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
     at_side: NDArray[np.bool_] | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
+    engine: str = "pybullet"  # that simulated the labels
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
 
@@ -51,6 +52,7 @@ class LabelledView:
             "approach_index": self.approach_index.astype(np.uint16),
             "contact_index": self.contact_index.astype(np.uint16),
             "success": self.success,
+            "engine": np.array(self.engine),
         }
         for name in OPTIONAL:
             if (array := getattr(self, name)) is not None:
@@ -108,9 +110,16 @@ def load_view(path: Path) -> LabelledView:
             contact_index=arrays["contact_index"].astype(np.int64),
             success=arrays["success"].astype(np.int8),
             **{name: arrays.get(name) for name in OPTIONAL},
+            engine=str(arrays.get("engine", LabelledView.engine)),
             objects=tuple(map(str, arrays.get("objects", ()))),
             object_digests=tuple(map(str, arrays.get("object_digests", ()))),
         )
+
+
+def engine_of(path: Path) -> str:
+    """The engine that simulated the labels of a view."""
+    with np.load(path, allow_pickle=False) as arrays:
+        return str(arrays.get("engine", LabelledView.engine))
 
 
 def find_views(folders: list[Path]) -> list[Path]:
@@ -217,6 +226,7 @@ def _facts(views: dict[Path, LabelledView]) -> dict[str, str]:
     return {
         "scenes": str(len({scene_of(path) for path in views})),
         "views": str(len(views)),
+        "engine": ", ".join(sorted({view.engine for view in views.values()})),
         "grasps tried": str(tried),
         "held after the lift": _share(held, tried),
         "of those, held after shaking too": _share(firm, shaken_held),

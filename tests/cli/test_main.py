@@ -13,7 +13,17 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_cli import main
 from edgegrasp_service.worker.job import Answer, Facts, Job
 
-HEAVY = {"torch", "open3d", "grpc", "pybullet", "fastapi", "uvicorn", "matplotlib", "httpx"}
+HEAVY = {
+    "torch",
+    "open3d",
+    "grpc",
+    "pybullet",
+    "mujoco",
+    "fastapi",
+    "uvicorn",
+    "matplotlib",
+    "httpx",
+}
 
 
 def loaded_by(*arguments: str) -> tuple[str, set[str]]:

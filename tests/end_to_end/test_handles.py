@@ -13,9 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, ModelCatalogue
 from edgegrasp_model.options import DetectOptions
-
-pytest.importorskip("pybullet")
-
 from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 

@@ -3,14 +3,23 @@ from dataclasses import replace
 
 import pytest
 
-from edgegrasp_sim.engine import World
+from edgegrasp_sim.engine import ENGINES, World, choose_engine, make_world
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 
 
+@pytest.fixture(scope="session", params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> str:
+    """Each engine that is installed."""
+    try:
+        return choose_engine(request.param).name
+    except RuntimeError as error:
+        pytest.skip(str(error))
+
+
 @pytest.fixture(scope="session")
-def _simulation() -> Iterator[ClutterSimulation]:
-    with ClutterSimulation() as simulation:
+def _simulation(engine: str) -> Iterator[ClutterSimulation]:
+    with ClutterSimulation(engine=engine) as simulation:
         yield simulation
 
 
@@ -22,8 +31,8 @@ def simulation(_simulation: ClutterSimulation) -> ClutterSimulation:
 
 
 @pytest.fixture
-def world() -> Iterator[World]:
-    with World() as world:
+def world(engine: str) -> Iterator[World]:
+    with make_world(engine) as world:
         yield world
 
 

@@ -66,15 +66,16 @@ def test_rounds_of_a_crashed_worker_are_run_again_and_workers_change_nothing(
     assert attempts_digest(rounds) == digest
 
 
-def test_the_manifest_holds_what_decides_the_figures() -> None:
-    config = BenchmarkConfig(SceneKind.PACKED, 2, protocol=TWO_OBJECTS)
+def test_the_manifest_holds_what_decides_the_figures(engine: str) -> None:
+    config = BenchmarkConfig(SceneKind.PACKED, 2, protocol=TWO_OBJECTS, engine=engine)
     facts = json.loads(json.dumps(manifest(config, {"name": "top-down"})))
     run = facts["run"]
     assert run["protocol"]["camera"]["polar_degrees"] == [45.0, 60.0]
     assert run["protocol"]["version"] == 2
-    assert run["constants"]["solver_iterations"] == 100
+    assert run["engine"] == engine
+    assert run["constants"]["gravity"] == 9.81
     assert len(run["objects"]["digest"]) == 64
-    assert facts["versions"]["pybullet"]
+    assert facts["versions"][engine]
     assert facts["host"]["platform"]
 
 

@@ -22,7 +22,9 @@ def test_variants_differ_from_the_paper_s_protocol_in_one_thing() -> None:
 def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)
-        assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == protocol
+        assert protocol_from(json.loads(json.dumps(protocol.to_json()))) == replace(
+            protocol, engine=""
+        )
     # A manifest from before a constant was known is read.
     table = load_protocol("edgegrasp").to_json()
     assert "surface_voxel" not in table["camera"]

@@ -11,6 +11,7 @@ from edgegrasp_sim.results import (
     ResultFolder,
     attempts_digest,
     below_gate,
+    compare,
     paired_difference,
     round_from_json,
     summarise,
@@ -89,6 +90,24 @@ def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
     assert [row["cause"] for row in rows[:3]] == ["", "missed", ""]
     assert json.loads(rows[0]["T_world_hand"]) == HELD.T_world_hand
     assert not list(folder.path.rglob("*.tmp"))
+
+
+def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
+    run = {"scene": "pile", "protocol": {"name": "edgegrasp", "version": 2}, "planner": {}}
+    run |= {"objects": {}, "constants": {}}
+    folders = ResultFolder(tmp_path / "before"), ResultFolder(tmp_path / "after")
+    folders[0].open({"run": run})  # from when there was one engine
+    folders[1].open({"run": run | {"engine": "mujoco"}})
+    for folder in folders:
+        folder.add(ROUNDS[0])
+    folders[0].open({"run": run | {"engine": "pybullet"}})
+    with pytest.raises(ValueError, match=r"different engine"):
+        folders[0].open({"run": run | {"engine": "mujoco"}})
+    with pytest.raises(ValueError, match=r"differ in engine"):
+        compare(*folders)
+    gate = gate_file(tmp_path, 90, 100)
+    with pytest.raises(ValueError, match="engine 'pybullet', not 'mujoco'"):
+        below_gate(folders[1].finish(ROUNDS), gate)
 
 
 def test_wilson_intervals_are_the_known_ones() -> None:

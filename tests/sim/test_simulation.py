@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.camera import look_at
-from edgegrasp_sim.engine import ASSETS, World
+from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind, write_family
 from edgegrasp_sim.poses import require_pose, translation
@@ -13,11 +13,17 @@ from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, WORKSPACE
 from edgegrasp_sim.validate import measure_agreement
 
-CUBE = ASSETS / "cube_small.urdf"  # 0.05 m
+CUBE = Path(__file__).parent / "cube.urdf"  # 0.05 m
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 FRONT = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))  # T_world_camera
 # The reference agrees with itself in 92 to 100 % of packed and 85 to 95 % of pile labels.
-LEAST_AGREEMENT = {SceneKind.PACKED: 0.90, SceneKind.PILE: 0.82}
+# MuJoCo differs where a hand runs into things; half of the grasps do.
+LEAST_AGREEMENT = {
+    ("pybullet", SceneKind.PACKED): 0.90,
+    ("pybullet", SceneKind.PILE): 0.82,
+    ("mujoco", SceneKind.PACKED): 0.75,
+    ("mujoco", SceneKind.PILE): 0.75,
+}
 
 
 def cube_at(x: float, y: float, z: float = 0.075) -> ObjectPlacement:
@@ -59,7 +65,7 @@ def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
     assert result.opening == pytest.approx(0.05, abs=0.003)
     assert not result.start_contact
     assert result.held is not None
-    assert result.held.model.name == "cube_small"
+    assert result.held.model.name == "cube"
 
 
 def test_an_object_pressed_into_the_table_comes_out_on_top(world: World) -> None:
@@ -69,26 +75,26 @@ def test_an_object_pressed_into_the_table_comes_out_on_top(world: World) -> None
     assert cube.body.position[2] == pytest.approx(TABLE_HEIGHT + 0.025, abs=0.002)
 
 
-def test_thin_things_that_are_dropped_stay_on_the_table(tmp_path: Path) -> None:
+def test_thin_things_that_are_dropped_stay_on_the_table(engine: str, tmp_path: Path) -> None:
     sticks = ObjectSet.from_folder(write_family("thin", tmp_path / "thin"), SceneKind.PILE)
-    with ClutterSimulation({SceneKind.PILE: sticks}) as simulation:
+    with ClutterSimulation({SceneKind.PILE: sticks}, engine=engine) as simulation:
         left = [
             simulation.reset(SceneKind.PILE, np.random.default_rng(seed), 5) for seed in range(2)
         ]
     assert sum(left) >= 6  # of 10; some roll away
 
 
-def test_contact_at_the_start_pose() -> None:
+def test_contact_at_the_start_pose(engine: str) -> None:
     # The hand starts 5 cm higher, with a finger inside the taller stack of cubes.
     stack = [cube_at(0.15, 0.10, 0.075 + 0.05 * level) for level in range(3)]
-    with ClutterSimulation(start_contact_fails=True) as strict:
+    with ClutterSimulation(start_contact_fails=True, engine=engine) as strict:
         strict.reset_from_poses([cube_at(0.15, 0.15), *stack])
         result = strict.try_grasp(top_down(0.15, 0.15, 0.06))
         assert result.outcome is GraspOutcome.PREGRASP
         assert result.start_contact
         assert strict.execute_grasp(top_down(0.15, 0.15, 0.06)).outcome is GraspOutcome.PREGRASP
         assert strict.num_objects == 4
-    with ClutterSimulation() as lenient:
+    with ClutterSimulation(engine=engine) as lenient:
         lenient.reset_from_poses([cube_at(0.15, 0.15), *stack])
         result = lenient.try_grasp(top_down(0.15, 0.15, 0.06))
         assert result.outcome is not GraspOutcome.PREGRASP
@@ -124,7 +130,7 @@ def test_outcomes_do_not_depend_on_what_was_tried_before(simulation: ClutterSimu
 
 def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation, monkeypatch) -> None:
     simulation.reset("pile", np.random.default_rng(5))
-    steps, step = 0, World.step
+    steps, step = 0, type(simulation.world).step
 
     def count(world: World, more: int = 1) -> None:
         nonlocal steps
@@ -132,7 +138,7 @@ def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation, mo
         step(world, more)
 
     grasps = grasps_near(simulation, 3)
-    monkeypatch.setattr(World, "step", count)
+    monkeypatch.setattr(type(simulation.world), "step", count)
     whole = [simulation.try_grasp(grasp, to_the_end=True).success for grasp in grasps]
     whole_steps, steps = steps, 0
     early = [simulation.try_grasp(grasp).success for grasp in grasps]
@@ -143,7 +149,7 @@ def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation, mo
 
 
 @pytest.mark.parametrize("scene", SceneKind)
-def test_equal_seeds_make_equal_scenes(scene: SceneKind) -> None:
+def test_equal_seeds_make_equal_scenes(engine: str, scene: SceneKind) -> None:
     def run(simulation: ClutterSimulation, seed: int) -> tuple[object, np.ndarray]:
         simulation.reset(scene, np.random.default_rng(seed), 3)
         x, y, z = simulation.placements[0].position
@@ -151,7 +157,7 @@ def test_equal_seeds_make_equal_scenes(scene: SceneKind) -> None:
         cloud = simulation.observe(np.random.default_rng(1), np.random.default_rng(2)).cloud
         return simulation.placements, cloud
 
-    with ClutterSimulation() as first, ClutterSimulation() as second:
+    with ClutterSimulation(engine=engine) as first, ClutterSimulation(engine=engine) as second:
         run(first, 8)
         placements, cloud = run(first, 0)
         again, cloud_again = run(second, 0)
@@ -246,10 +252,10 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
 @pytest.mark.parametrize(
     ("kind", "to_the_end"), [(SceneKind.PACKED, True), (SceneKind.PILE, False)]
 )
-def test_outcomes_agree_with_the_reference_simulator(shared_dir, kind, to_the_end) -> None:
-    counts = measure_agreement(shared_dir, kind, most=20, to_the_end=to_the_end)
+def test_outcomes_agree_with_the_reference_simulator(shared_dir, engine, kind, to_the_end) -> None:
+    counts = measure_agreement(shared_dir, kind, most=20, to_the_end=to_the_end, engine=engine)
     assert [tried for _, tried in counts] == [20] * 4
-    assert sum(agreed for agreed, _ in counts) / 80 >= LEAST_AGREEMENT[kind]
+    assert sum(agreed for agreed, _ in counts) / 80 >= LEAST_AGREEMENT[engine, kind]
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from edgegrasp_sim.camera import ViewRange, look_at
-from edgegrasp_sim.engine import ASSETS
 from edgegrasp_sim.hand import FINGERTIP, FailureCause
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
@@ -53,13 +54,14 @@ def test_a_bin_has_a_floor_and_walls_around_it() -> None:
     assert len(heights) == 8
 
 
-def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it() -> None:
+def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it(engine: str) -> None:
     carton = Box((0.1, 0.2, 0.15), (MIDDLE, MIDDLE, TABLE_HEIGHT + 0.075), yaw=0.3)
     around = Surroundings((*OPEN_TABLE.boxes, carton), OPEN_TABLE.workspace, OPEN_TABLE.bounds)
     T_world_hand = np.diag([1.0, -1.0, -1.0, 1.0])
     T_world_hand[:3, 3] = (MIDDLE, MIDDLE, 0.17 + FINGERTIP)  # 3 cm deep in it
-    cube = ObjectPlacement(ASSETS / "cube_small.urdf", 1.0, (0.03, 0.03, 0.075), (0, 0, 0, 1))
-    with ClutterSimulation() as simulation:
+    urdf = Path(__file__).parent / "cube.urdf"
+    cube = ObjectPlacement(urdf, 1.0, (0.03, 0.03, 0.075), (0, 0, 0, 1))
+    with ClutterSimulation(engine=engine) as simulation:
         simulation.reset_from_poses([cube], around)
         before = seen_from_above(simulation)
         result = simulation.execute_grasp(T_world_hand)

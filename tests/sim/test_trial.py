@@ -1,6 +1,7 @@
 """A round of clutter removal, and what a person sees of it."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 from edgegrasp_sim import trial
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause, GraspOutcome, GraspResult
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import attempts_digest
 from edgegrasp_sim.simulation import ClutterSimulation
@@ -49,10 +50,9 @@ def run(simulation: ClutterSimulation, paper_with: MakeProtocol) -> Callable[...
 
 
 @pytest.fixture(scope="module")
-def cubes() -> Iterator[ClutterSimulation]:
-    with ClutterSimulation(
-        {PACKED: ObjectSet("cubes", ObjectSet.builtin(PACKED).models[:1])}
-    ) as simulation:
+def cubes(engine: str) -> Iterator[ClutterSimulation]:
+    cube = ObjectModel("cube", Path(__file__).parent / "cube.urdf", 1.2)
+    with ClutterSimulation({PACKED: ObjectSet("cubes", (cube,))}, engine=engine) as simulation:
         yield simulation
 
 
@@ -86,7 +86,7 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert len(set(clouds)) == 3  # a new view every time
 
 
-def test_scenes_and_views_do_not_depend_on_the_planner(run, paper_with) -> None:
+def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) -> None:
     first_clouds = []
 
     def keep_first(seen: Observation, seed: int) -> PlannedGrasp:
@@ -95,7 +95,7 @@ def test_scenes_and_views_do_not_depend_on_the_planner(run, paper_with) -> None:
 
     run(plan_top_down, PILE, 2, seed=4, index=0)
     run(keep_first, PILE, 2, seed=4, index=1)
-    with ClutterSimulation() as other:
+    with ClutterSimulation(engine=engine) as other:
         run_round(other, keep_first, PILE, paper_with(2), seed=4, index=1)
     assert np.array_equal(first_clouds[0], first_clouds[2])
 

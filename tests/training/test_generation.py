@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_sim.engine import ENGINES, choose_engine, installed
 from edgegrasp_sim.objects import SceneKind, blob
 from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
 from edgegrasp_training.shapes import made_object
@@ -46,6 +47,15 @@ def test_nothing_is_made_twice_and_a_lost_view_is_made_again_the_same(data: Path
     assert lost.read_bytes() == before
 
 
+def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
+    engine = load_view(find_views([data])[0]).engine
+    assert engine == choose_engine().name
+    for other in set(ENGINES) - {engine}:
+        if installed(other):
+            with pytest.raises(ValueError, match=f"holds labels of {engine}, not of {other}"):
+                list(generate(data, None, replace(SMALL, scenes=5, engine=other)))
+
+
 def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
     list(generate(tmp_path, None, replace(SMALL, scenes=2), workers=2))
     assert len(find_views([tmp_path])) == 2
@@ -69,7 +79,7 @@ def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) ->
     for view in views:
         for name, digest in zip(view.objects, view.object_digests, strict=True):
             if name.startswith("blob_"):
-                model = blob(int(name.removeprefix("blob_")), 1.0)
+                model = blob(int(name.removeprefix("blob_")), tmp_path / "again")
             else:
                 model = models.get(name) or made_object(name, tmp_path / "again")
             assert digest == model.digest

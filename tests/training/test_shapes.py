@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim.engine import World
+from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.objects import ObjectModel, ObjectSet
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.shapes import (
@@ -80,7 +80,7 @@ def shapes(tmp_path: Path) -> tuple[ObjectModel, ...]:
 
 
 def _extents(model: ObjectModel) -> np.ndarray:
-    with World() as world:
+    with make_world() as world:
         body = load_object(world, model, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), 1.0).body
         low, high = body.bounds
         return high - low

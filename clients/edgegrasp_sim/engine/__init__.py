@@ -1,0 +1,299 @@
+"""The physics engine behind one interface: a world, its bodies, a hand and depth images.
+
+Two engines implement it, a file each; nothing else knows which one runs.
+"""
+
+import importlib.util
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_sim.poses import Matrix
+
+TIME_STEP = 1.0 / 80.0  # seconds
+GRAVITY = 9.81  # m/s²
+ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
+
+
+class EngineChoice(NamedTuple):
+    """The engine to use, and why it is this one, in words."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"engine: {self.name}, {self.reason}"
+
+
+def choose_engine(asked: str | None = None, protocol: str = "") -> EngineChoice:
+    """The engine asked for, else the protocol's, else the first there is.
+
+    Args:
+        asked: one of `ENGINES`.
+        protocol: the engine that a protocol names; another takes its place where it is missing.
+
+    Raises:
+        ValueError: there is no such engine.
+        RuntimeError: the engine asked for is not installed, or none is.
+    """
+    for name in filter(None, (asked, protocol)):
+        if name not in ENGINES:
+            raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
+    if asked:
+        if not installed(asked):
+            raise RuntimeError(f"engine {asked} is not installed: pip install {asked}")
+        return EngineChoice(asked, "as asked for")
+    if protocol and installed(protocol):
+        return EngineChoice(protocol, "the protocol's")
+    there = next((name for name in ENGINES if installed(name)), None)
+    if there is None:
+        raise RuntimeError("no physics engine is installed: pip install 'edgegrasp[sim]'")
+    without = protocol or (ENGINES[0] if there != ENGINES[0] else "")
+    if without:
+        whose = "the protocol's " if protocol else ""
+        return EngineChoice(there, f"because {whose}{without} is not installed")
+    return EngineChoice(there, "the default")
+
+
+def installed(engine: str) -> bool:
+    """Whether an engine can be used here."""
+    try:
+        return importlib.util.find_spec(engine) is not None
+    except ValueError:  # something stands in its place
+        return False
+
+
+def make_world(engine: str | None = None) -> "World":
+    """An empty world of an engine, see `choose_engine` for the default and errors."""
+    match choose_engine(engine).name:
+        case "mujoco":
+            from edgegrasp_sim.engine.with_mujoco import MujocoWorld
+
+            return MujocoWorld()
+        case _:
+            from edgegrasp_sim.engine.with_pybullet import PybulletWorld
+
+            return PybulletWorld()
+
+
+def engine_constants(engine: str) -> dict[str, float]:
+    """The constants of an engine, for the record of a result."""
+    if engine == "mujoco":
+        from edgegrasp_sim.engine import with_mujoco
+
+        return with_mujoco.CONSTANTS
+    from edgegrasp_sim.engine import with_pybullet
+
+    return with_pybullet.CONSTANTS
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole camera; lengths in pixels, clipping distances in metres."""
+
+    width: int = 640
+    height: int = 480
+    focal_length: float = 540.0
+    centre_x: float = 320.0
+    centre_y: float = 240.0
+    near: float = 0.1
+    far: float = 2.0
+
+
+class Contact(NamedTuple):
+    """One contact point of a body.
+
+    Attributes:
+        other_uid: the body that is touched.
+        distance: metres; negative where the two overlap.
+    """
+
+    other_uid: int
+    distance: float
+
+
+@dataclass(frozen=True, slots=True)
+class HandModel:
+    """A floating hand with two coupled fingers that slide apart along y.
+
+    Attributes:
+        palm: points whose convex hull it is, hand frame, (P, 3) metres.
+        finger: the same of the finger at y > 0, in its own frame; the other is it turned about z.
+        finger_base: metres along the hand's z to the fingers' frames.
+        centre: the palm's centre of mass, hand frame, metres.
+        mass: of the palm, kg.
+        friction: of the palm.
+        finger_mass: kg.
+        finger_friction: lateral.
+        finger_force: with which each finger closes and opens, N.
+        max_opening: metres between the fingers.
+        tool_force: with which the hand is moved at most, N.
+    """
+
+    palm: Matrix
+    finger: Matrix
+    finger_base: float
+    centre: tuple[float, float, float]
+    mass: float
+    friction: float
+    finger_mass: float
+    finger_friction: float
+    finger_force: float
+    max_opening: float
+    tool_force: float
+
+
+class World(ABC):
+    """A physics world; a process may have several. Bodies that are removed are gone for good."""
+
+    name: ClassVar[str]  # of the engine
+    collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
+    shake_step: ClassVar[float]  # metres in each time step, with which a held object is shaken
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release what it holds. Safe to call twice."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Remove every body."""
+
+    @abstractmethod
+    def step(self, steps: int = 1) -> None:
+        """Advance the world by `steps` time steps of 1/80 s."""
+
+    @abstractmethod
+    def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+        """The body that each ray meets first, -1 for none; (R, 3) metres each, world frame."""
+
+    @abstractmethod
+    def detect_collisions(self) -> None:
+        """Refresh the contact points without advancing time."""
+
+    @abstractmethod
+    def save_state(self) -> int:
+        """Keep the present state in memory; valid for the bodies that are there now."""
+
+    @abstractmethod
+    def restore_state(self, state: int) -> None:
+        """Return to a kept state."""
+
+    @abstractmethod
+    def remove_state(self, state: int) -> None:
+        """Forget a kept state."""
+
+    @abstractmethod
+    def load_urdf(
+        self,
+        path: Path,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+        scale: float,
+        *,
+        mass: float,
+        friction: float,
+    ) -> "Body":
+        """Load a body from a URDF file, with its link frame there.
+
+        Its mass and friction are those given, its inertia that of its collision shape.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the engine cannot read it.
+        """
+
+    @abstractmethod
+    def add_box(
+        self,
+        size: Sequence[float],
+        centre: Sequence[float],
+        *,
+        friction: float,
+        yaw: float = 0.0,
+    ) -> "Body":
+        """Add a box that never moves, turned about z; `size` is its full extent in metres."""
+
+    @abstractmethod
+    def add_hand(self, model: HandModel, position: Matrix) -> "Hand":
+        """Add an open hand with its centre of mass there; a world may have one."""
+
+    @abstractmethod
+    def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+        """Distance along the line of sight for every pixel: (height, width) metres.
+
+        Pixels that show nothing read `far`. A pixel is sampled at its lower left corner.
+        """
+
+
+class Body(ABC):
+    """One body of a world. Its pose is that of its centre of mass."""
+
+    uid: int
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Take the body out of its world."""
+
+    @property
+    @abstractmethod
+    def position(self) -> Matrix:
+        """Centre of mass, world frame, metres: (3,)."""
+
+    @property
+    @abstractmethod
+    def quaternion_xyzw(self) -> tuple[float, float, float, float]:
+        """Orientation in the world."""
+
+    @abstractmethod
+    def set_pose(
+        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
+    ) -> None:
+        """Put the centre of mass there, at rest."""
+
+    @property
+    @abstractmethod
+    def speed(self) -> float:
+        """Length of linear (m/s) and angular (rad/s) velocity taken together."""
+
+    @property
+    @abstractmethod
+    def bounds(self) -> Matrix:
+        """Lowest and highest corner of the axis-aligned box around it: (2, 3) metres."""
+
+    @abstractmethod
+    def contacts(self) -> list[Contact]:
+        """The contact points found by the last step or collision detection."""
+
+
+class Hand(Body):
+    """A hand: a body, its palm, that is moved with limited force, and two fingers."""
+
+    @property
+    @abstractmethod
+    def opening(self) -> float:
+        """Metres between the fingers."""
+
+    @abstractmethod
+    def set_pose(
+        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
+    ) -> None:
+        """Put the hand there at once, at rest and open, and hold it there."""
+
+    @abstractmethod
+    def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
+        """Pull the centre of mass there in the next step."""
+
+    @abstractmethod
+    def close_fingers(self) -> None:
+        """Drive the fingers together with full force from now on."""

@@ -1,0 +1,174 @@
+"""Reading the shapes of an object's URDF file and its OBJ meshes."""
+
+import re
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_sim.poses import Matrix
+
+SIDES = 32  # of the prism that stands for a cylinder
+BALL = 300  # points of the hull that stands for a sphere
+
+
+class Surface(NamedTuple):
+    """Triangles: points (P, 3), metres, and rows of them, (F, 3)."""
+
+    points: Matrix
+    faces: NDArray[np.int64]
+
+
+class Shape(NamedTuple):
+    """An object, in the frame of its centre of mass, with the axes of its link.
+
+    Attributes:
+        centre: the centre of mass in the link's frame, (3,) metres.
+        visible: what a camera sees.
+        hulls: the convex parts that contacts use.
+    """
+
+    centre: Matrix
+    visible: list[Surface]
+    hulls: list[Surface]
+
+
+def read_urdf(path: Path, scale: float) -> Shape:
+    """The shape of the first link of a URDF file, `scale` times as large.
+
+    Each object of an OBJ file is one convex part.
+
+    Raises:
+        FileNotFoundError: there is no such file, or none of a mesh.
+        ValueError: it cannot be read, or holds no solid shape.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no object file at {path}; check the object folder")
+    try:
+        link = ElementTree.parse(path).getroot().find("link")
+        if link is None:
+            raise ValueError("it has no link")
+        inertial = link.find("inertial")
+        centre = scale * (np.zeros(3) if inertial is None else _origin(inertial)[0])
+        visible = [part for each in link.iter("visual") for part in _parts(each, path, scale)]
+        solid = [part for each in link.iter("collision") for part in _parts(each, path, scale)]
+    except (ElementTree.ParseError, ValueError, IndexError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    hulls = [hull for part in solid if (hull := convex_hull(part.points - centre)) is not None]
+    if not hulls:
+        raise ValueError(f"{path} has no solid collision shape")
+    return Shape(centre, [Surface(part.points - centre, part.faces) for part in visible], hulls)
+
+
+def read_obj(path: Path) -> list[tuple[str, Surface]]:
+    """The objects of an OBJ file and their names, each with the points that its triangles use.
+
+    In a file without triangles an object has all the points that follow its name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read.
+    """
+    return _read_obj(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=256)
+def _read_obj(path: Path, _changed: int) -> list[tuple[str, Surface]]:
+    points: list[str] = []
+    parts: list[tuple[str, int, list[str]]] = [("", 0, [])]  # name, first point, lines of faces
+    # Only points count, not the normals and texture places behind their slashes.
+    for line in re.sub(r"/\S*", "", path.read_text(errors="replace")).splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word == "v":
+            points.append(rest)
+        elif word == "f":
+            parts[-1][2].append(rest)
+        elif word in ("o", "g"):
+            parts.append((rest, len(points), []))
+    whole = np.array([line.split()[:3] for line in points], dtype=np.float64).reshape(-1, 3)
+    ends = [start for _, start, _ in parts[1:]] + [len(whole)]
+    found = []
+    for (name, start, lines), end in zip(parts, ends, strict=True):
+        if lines:
+            used, rows = np.unique(_triangles(lines, end), return_inverse=True)
+            found.append((name, Surface(whole[used], rows.reshape(-1, 3))))
+        elif name and start < end and not any(lines for _, _, lines in parts):
+            found.append((name, Surface(whole[start:end], np.empty((0, 3), np.int64))))
+    return found
+
+
+def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
+    """The triangles (F, 3) of lines of faces, which count points from 1, or back from the last."""
+    rows = [list(map(int, line.split())) for line in lines]
+    if any(len(row) != 3 for row in rows):
+        rows = [[r[0], *two] for r in rows for two in pairwise(r[1:])]
+    triangles = np.array(rows)
+    return np.where(triangles > 0, triangles - 1, known + triangles)
+
+
+def convex_hull(points: Matrix) -> Surface | None:
+    """The convex hull of points (P, 3), faces outwards; None if it has no volume."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return None
+    a, b, c = points[hull.simplices].transpose(1, 0, 2)
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0.0
+    faces = np.where(inwards[:, None], hull.simplices[:, ::-1], hull.simplices)
+    rows = np.full(len(points), -1, np.int64)
+    rows[hull.vertices] = np.arange(len(hull.vertices))
+    return Surface(points[hull.vertices], rows[faces])
+
+
+def _parts(element: ElementTree.Element, urdf: Path, scale: float) -> list[Surface]:
+    """The surfaces of a visual or collision element, in the link's frame."""
+    move, turn = _origin(element)
+    shape = element.find("geometry/*")
+    if shape is None:
+        raise ValueError("it has an element without a geometry")
+    size = np.ones(3)
+    if shape.tag == "mesh":
+        file = urdf.parent / shape.get("filename", "")
+        if file.suffix.lower() != ".obj":
+            raise ValueError(f"its mesh {file.name} is no OBJ file; convert it")
+        parts = [part for _, part in read_obj(file)]
+        size = _numbers(shape, "scale", "1 1 1")
+    elif shape.tag == "box":
+        signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3), axis=-1).reshape(-1, 3)
+        parts = _hulls(signs * _numbers(shape, "size"))
+    elif shape.tag == "cylinder":
+        angle = 2 * np.pi / SIDES * np.arange(SIDES)
+        ring = _numbers(shape, "radius") * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        half = 0.5 * float(_numbers(shape, "length")[0])
+        parts = _hulls(np.concatenate([np.insert(ring, 2, end, axis=1) for end in (-half, half)]))
+    elif shape.tag == "sphere":
+        z = np.linspace(-1.0, 1.0, BALL)
+        angle = np.pi * (1 + 5**0.5) * np.arange(BALL)
+        around = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1 - z * z)
+        parts = _hulls(_numbers(shape, "radius") * np.stack([*around, z], axis=1))
+    else:
+        raise ValueError(f"its shape {shape.tag} is unknown; use box, cylinder, sphere or mesh")
+    return [Surface(scale * (turn.apply(size * p) + move), faces) for p, faces in parts]
+
+
+def _hulls(points: Matrix) -> list[Surface]:
+    return [hull for hull in [convex_hull(points)] if hull is not None]
+
+
+def _origin(element: ElementTree.Element) -> tuple[Matrix, Rotation]:
+    """Place and turn of an element in its link."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.zeros(3), Rotation.identity()
+    turn = Rotation.from_euler("xyz", _numbers(origin, "rpy", "0 0 0"))
+    return _numbers(origin, "xyz", "0 0 0"), turn
+
+
+def _numbers(element: ElementTree.Element, name: str, default: str = "") -> Matrix:
+    return np.array([float(word) for word in element.get(name, default).split()])

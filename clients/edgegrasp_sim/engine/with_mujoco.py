@@ -1,0 +1,505 @@
+"""MuJoCo: maintained, with wheels for every current Python, and an image in milliseconds."""
+
+import os
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # read on import; images need no display
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_sim.engine import (
+    GRAVITY,
+    TIME_STEP,
+    Body,
+    Contact,
+    Hand,
+    HandModel,
+    Intrinsics,
+    World,
+)
+from edgegrasp_sim.engine.urdf import Surface, read_urdf
+from edgegrasp_sim.poses import Matrix
+
+SUBSTEPS = 4  # of 3.125 ms in each time step
+CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
+IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
+COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
+SHAKE_STEP = 0.003125  # metres in each time step, 0.25 m/s: the hand follows, and turns sharply
+FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
+ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
+ARM_STIFFNESS = 30000.0  # N/m and N m/rad
+# Metres: the torque about a contact's normal, by its force. A pad of 1 cm's radius turns against
+# two thirds of that times its friction.
+FINGER_SPINNING_FRICTION = 0.005
+FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
+FINGER_INERTIA = 0.3  # kg, of a finger's drive
+FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
+CONSTANTS = {
+    "time_step": TIME_STEP,
+    "substeps": SUBSTEPS,
+    "gravity": GRAVITY,
+    "collision_depth": COLLISION_DEPTH,
+    "contact_seconds": CONTACT_SECONDS,
+    "friction_impedance": FRICTION_IMPEDANCE,
+    "arm_inertia": ARM_INERTIA,
+    "arm_stiffness": ARM_STIFFNESS,
+    "finger_spinning_friction": FINGER_SPINNING_FRICTION,
+    "finger_speed": FINGER_SPEED,
+    "finger_inertia": FINGER_INERTIA,
+}
+_SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
+_OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
+_VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
+
+
+class MujocoWorld(World):
+    """A model that is compiled anew when a body came or went, and its state."""
+
+    name = "mujoco"
+    collision_depth = COLLISION_DEPTH
+    shake_step = SHAKE_STEP
+
+    def __init__(self) -> None:
+        self._images = _Images()
+        self.reset()
+
+    def close(self) -> None:
+        self._images.close()
+
+    def reset(self) -> None:
+        self.spec = _empty()
+        self._model: Any = self.spec.compile()
+        self._data: Any = mujoco.MjData(self._model)
+        self._changed = False
+        self._bodies = 0
+        self._states: dict[int, Any] = {}
+        self._hand: MujocoHand | None = None
+        self._uid_of_geom = np.empty(0, np.int64)
+        self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+
+    @property
+    def data(self) -> Any:
+        """The state, of a model that has all bodies."""
+        if self._changed:
+            self._changed = False
+            self._model, self._data = self.spec.recompile(self._model, self._data)
+            names = [self._model.body(body).name for body in self._model.geom_bodyid]
+            self._uid_of_geom = np.array([int(name.split()[0]) for name in names])
+            self._places.clear()
+        return self._data
+
+    @property
+    def model(self) -> Any:
+        """The model, with all bodies."""
+        return self.data.model
+
+    def places(self, uid: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and velocities of a body's joints and its links': views of the state."""
+        data = self.data
+        if uid not in self._places:
+            model = self._model
+            tree = model.body_treeid[model.body(str(uid)).id]
+            first, last = model.tree_dofadr[tree], model.tree_dofadr[tree] + model.tree_dofnum[tree]
+            start = model.jnt_qposadr[model.dof_jntid[first]]
+            # Of a body, place and quaternion wxyz; behind it its links' joints.
+            self._places[uid] = (data.qpos[start : start + last - first + 1], data.qvel[first:last])
+        return self._places[uid]
+
+    def step(self, steps: int = 1) -> None:
+        model, data, hand = self.model, self.data, self._hand
+        for _ in range(steps):
+            if hand is None or hand.way is None:
+                mujoco.mj_step(model, data, SUBSTEPS)
+                continue
+            for place in hand.way:
+                data.mocap_pos[0] = place
+                mujoco.mj_step(model, data)
+            hand.way = None
+
+    def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
+        model, data = self.model, self.data
+        solid = np.arange(6) == _SOLID
+        hits, geom = [], np.empty(1, np.int32)
+        for start, end in zip(starts, ends, strict=True):
+            way = end - start
+            share = mujoco.mj_ray(model, data, start, way, solid, 1, -1, geom)
+            hits.append(int(self._uid_of_geom[geom[0]]) if 0 <= share <= 1 else -1)
+        return hits
+
+    def detect_collisions(self) -> None:
+        mujoco.mj_forward(self.model, self.data)
+
+    def save_state(self) -> int:
+        kept = mujoco.MjData(self.model)
+        mujoco.mj_copyData(kept, self.model, self.data)
+        number = max(self._states, default=0) + 1
+        self._states[number] = kept
+        return number
+
+    def restore_state(self, state: int) -> None:
+        mujoco.mj_copyData(self.data, self.model, self._states[state])
+        if self._hand is not None:
+            self._hand.way = None
+
+    def remove_state(self, state: int) -> None:
+        del self._states[state]
+
+    def load_urdf(
+        self,
+        path: Path,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+        scale: float,
+        *,
+        mass: float,
+        friction: float,
+    ) -> "MujocoBody":
+        shape = read_urdf(path, scale)
+        body = self._add(np.asarray(position), quaternion_xyzw)
+        body.add_freejoint()
+        corners = np.concatenate([hull.points for hull in shape.hulls])
+        _weigh(body, mass, corners)
+        for number, surface in enumerate(shape.visible):
+            self._add_surface(body, f"{body.name} visible {number}", surface)
+        for number, hull in enumerate(shape.hulls):
+            self._add_hull(body, f"{body.name} {number}", hull.points, friction=(friction, 0, 0))
+        added = MujocoBody(self, body, corners)
+        added.set_pose(position, quaternion_xyzw)
+        centre = added.rotation @ shape.centre
+        added.set_pose(np.asarray(position) + centre, quaternion_xyzw)
+        return added
+
+    def add_box(
+        self,
+        size: Sequence[float],
+        centre: Sequence[float],
+        *,
+        friction: float,
+        yaw: float = 0.0,
+    ) -> "MujocoBody":
+        half = 0.5 * np.asarray(size)
+        turn = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+        body = self._add(np.asarray(centre), turn)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=half,
+            friction=(friction, 0, 0),
+            priority=1,  # its friction counts, not the object's
+            group=_SOLID,
+        )
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=half, contype=0, conaffinity=0, group=_VISIBLE
+        )
+        signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+        return MujocoBody(self, body, signs * half)
+
+    def add_hand(self, model: HandModel, position: Matrix) -> "MujocoHand":
+        body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
+        joint = body.add_freejoint()
+        joint.armature = ARM_INERTIA
+        body.gravcomp = 1.0
+        palm = model.palm - model.centre
+        _weigh(body, model.mass, palm)
+        self._add_hull(
+            body, f"{body.name} palm", palm, friction=(model.friction, 0, 0), contype=_HAND
+        )
+        for side in (1.0, -1.0):
+            turned = model.finger * (side, side, 1.0)
+            base = np.array([0.0, 0.0, model.finger_base]) - model.centre
+            finger = body.add_body(name=f"{body.name} finger {side:+.0f}", pos=base, gravcomp=1.0)
+            _weigh(finger, model.finger_mass, turned)
+            finger.add_joint(
+                name=finger.name,
+                type=mujoco.mjtJoint.mjJNT_SLIDE,
+                axis=(0.0, side, 0.0),
+                limited=True,
+                range=(0.0, 0.5 * model.max_opening),
+                armature=FINGER_INERTIA,
+                solref_limit=(CONTACT_SECONDS, 1.0),
+                solimp_limit=IMPEDANCE,
+            )
+            self._add_hull(
+                finger,
+                finger.name,
+                turned,
+                friction=(model.finger_friction, FINGER_SPINNING_FRICTION, 0),
+                condim=4,
+                priority=2,
+                contype=_HAND,
+            )
+            self.spec.add_actuator(
+                name=finger.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=finger.name,
+                gainprm=[FINGER_DAMPING] + 9 * [0.0],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0.0, 0.0, -FINGER_DAMPING] + 7 * [0.0],
+                forcelimited=True,
+                forcerange=(-model.finger_force, model.finger_force),
+            )
+        self._drag(body, model.tool_force)
+        one, other = (joint.name for joint in body.find_all("joint")[1:])
+        self.spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            name1=one,
+            name2=other,
+            data=[0.0, 1.0] + 10 * [0.0],
+            solref=(CONTACT_SECONDS, 1.0),
+            solimp=IMPEDANCE,
+        )
+        self._hand = MujocoHand(self, body, palm, model)
+        self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
+        return self._hand
+
+    def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+        return self._images.depth(self.model, self.data, T_world_camera, camera)
+
+    def _add(self, position: Matrix, quaternion_xyzw: Sequence[float]) -> Any:
+        x, y, z, w = quaternion_xyzw
+        name = str(self._bodies)
+        self._bodies += 1
+        self._changed = True
+        return self.spec.worldbody.add_body(name=name, pos=position, quat=(w, x, y, z))
+
+    def _add_surface(self, body: Any, name: str, surface: Surface) -> None:
+        """Add what the camera sees, which touches nothing."""
+        self.spec.add_mesh(
+            name=name,
+            uservert=surface.points.ravel(),
+            userface=surface.faces.ravel().astype(np.int32),
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )
+        kind = mujoco.mjtGeom.mjGEOM_MESH
+        body.add_geom(type=kind, meshname=name, contype=0, conaffinity=0, group=_VISIBLE)
+
+    def _add_hull(self, body: Any, name: str, points: Matrix, **contact: Any) -> None:
+        """Add the convex hull of points (P, 3) for contacts."""
+        self.spec.add_mesh(name=name, uservert=points.ravel())
+        kind = mujoco.mjtGeom.mjGEOM_MESH
+        body.add_geom(type=kind, meshname=name, group=_SOLID, **contact)
+
+    def _drag(self, body: Any, force: float) -> None:
+        """Pull a body to the pose of a target, by springs of limited force along all six axes."""
+        target = self.spec.worldbody.add_body(name="-1 target", mocap=True)
+        target.add_site(name="target")
+        body.add_site(name="hand")
+        inertia = ARM_INERTIA + body.mass
+        damping = 2.0 * (ARM_STIFFNESS * inertia) ** 0.5
+        for axis in range(6):
+            self.spec.add_actuator(
+                name=f"arm {axis}",
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                target="hand",
+                refsite="target",
+                gear=np.eye(6)[axis],
+                gainprm=[ARM_STIFFNESS] + 9 * [0.0],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0.0, -ARM_STIFFNESS, -damping] + 7 * [0.0],
+                forcelimited=True,
+                forcerange=(-force, force),
+            )
+
+    def remove(self, body: Any) -> None:
+        """Take a body and its meshes away."""
+        names = [geom.meshname for geom in body.geoms if geom.meshname]
+        self.spec.delete(body)
+        for name in names:
+            self.spec.delete(self.spec.mesh(name))
+        self._changed = True
+
+    def contacts(self, uid: int) -> list[Contact]:
+        """The contact points of a body."""
+        found = self.data.contact
+        pairs = self._uid_of_geom[found.geom]
+        rows, side = np.nonzero(pairs == uid)
+        others, distances = pairs[rows, 1 - side].tolist(), found.dist[rows].tolist()
+        return [Contact(other, distance) for other, distance in zip(others, distances, strict=True)]
+
+
+class MujocoBody(Body):
+    """A body of a model; its frame is that of its centre of mass."""
+
+    def __init__(self, world: MujocoWorld, body: Any, points: Matrix) -> None:
+        self.world, self.points, self._body = world, points, body
+        self.uid = int(body.name)
+
+    def remove(self) -> None:
+        self.world.remove(self._body)
+
+    @property
+    def position(self) -> Matrix:
+        return self.world.places(self.uid)[0][:3].copy()
+
+    @property
+    def quaternion_xyzw(self) -> tuple[float, float, float, float]:
+        w, x, y, z = self.world.places(self.uid)[0][3:7].tolist()
+        return x, y, z, w
+
+    @property
+    def rotation(self) -> Matrix:
+        """Its axes in the world, (3, 3)."""
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
+        return matrix.reshape(3, 3)
+
+    def set_pose(
+        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
+    ) -> None:
+        x, y, z, w = quaternion_xyzw
+        qpos, qvel = self.world.places(self.uid)
+        qpos[:7] = (*position, w, x, y, z)
+        qvel[:] = 0.0
+
+    @property
+    def speed(self) -> float:
+        return float(np.linalg.norm(self.world.places(self.uid)[1]))
+
+    @property
+    def bounds(self) -> Matrix:
+        corners = self.points @ self.rotation.T + self.position
+        return np.stack((corners.min(axis=0), corners.max(axis=0)))
+
+    def contacts(self) -> list[Contact]:
+        return self.world.contacts(self.uid)
+
+
+class MujocoHand(MujocoBody, Hand):
+    """A hand that springs pull to a target, and motors at its fingers."""
+
+    def __init__(self, world: MujocoWorld, body: Any, points: Matrix, model: HandModel) -> None:
+        super().__init__(world, body, points)
+        self.hand = model
+        self.way: Matrix | None = None  # (SUBSTEPS, 3) of its target in the next time step
+
+    @property
+    def opening(self) -> float:
+        one, other = self.world.places(self.uid)[0][7:].tolist()
+        return float(one + other)
+
+    def set_pose(
+        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
+    ) -> None:
+        super().set_pose(position, quaternion_xyzw)
+        data = self.world.data
+        self.world.places(self.uid)[0][7:] = 0.5 * self.hand.max_opening
+        data.ctrl[:2] = FINGER_SPEED
+        data.mocap_pos[0] = position
+        self.move(position, quaternion_xyzw)
+        self.way = None
+
+    def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
+        x, y, z, w = quaternion_xyzw
+        data = self.world.data
+        here = data.mocap_pos[0]
+        self.way = here + _SHARES * (np.asarray(position) - here)
+        data.mocap_quat[0] = (w, x, y, z)
+
+    def close_fingers(self) -> None:
+        self.world.data.ctrl[:2] = -FINGER_SPEED
+
+
+class _Images:
+    """Depth images of a model, made when first asked for."""
+
+    def __init__(self) -> None:
+        self._model: Any = None
+        self._scene: Any = None
+        self._context: Any = None
+
+    def depth(
+        self, model: Any, data: Any, T_world_camera: Matrix, camera: Intrinsics
+    ) -> NDArray[np.float64]:
+        _gl_context(camera.width, camera.height)
+        if self._model is not model:
+            self.close()
+            self._model = model
+            self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 1)
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+            self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL.value
+        option, free = mujoco.MjvOption(), mujoco.MjvCamera()
+        option.geomgroup[:] = np.arange(len(option.geomgroup)) == _VISIBLE
+        mujoco.mj_kinematics(model, data)
+        mujoco.mjv_updateScene(model, data, option, None, free, everything, scene)
+        scene.flags[:] = 0  # no lights, and both sides of every surface
+        scene.flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = 1
+        for eye in scene.camera:
+            _look(eye, T_world_camera, camera)
+        image = np.empty((camera.height, camera.width), np.float32)
+        frame = mujoco.MjrRect(0, 0, camera.width, camera.height)
+        mujoco.mjr_render(frame, scene, self._context)
+        mujoco.mjr_readPixels(None, image, frame, self._context)
+        near, far = camera.near, camera.far
+        # Rows go up; depths from 1, near, to 0, far or nothing.
+        return near * far / (near + (far - near) * image[::-1].astype(np.float64))
+
+    def close(self) -> None:
+        if self._context is not None:
+            self._context.free()
+        self._model = self._scene = self._context = None
+
+
+@cache
+def _gl_context(width: int, height: int) -> Any:
+    """What this process draws with; made once."""
+    try:
+        from mujoco.gl_context import GLContext
+
+        context = GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # ctypes, OpenGL and EGL raise whatever they stumble over
+        raise RuntimeError(
+            f"MuJoCo cannot draw images with MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; on "
+            "Debian and Ubuntu: apt-get install libegl1 libgl1"
+        ) from error
+    return context
+
+
+def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
+    """Put OpenGL's camera where the pinhole camera is.
+
+    OpenGL samples a pixel at its middle; the image is moved so that this is the corner meant.
+    """
+    per_pixel = camera.near / camera.focal_length
+    eye.pos = T_world_camera[:3, 3]
+    eye.forward = T_world_camera[:3, 2]
+    eye.up = -T_world_camera[:3, 1]
+    centre_x, centre_y = camera.centre_x + 0.5, camera.centre_y - 0.5
+    eye.frustum_center = (0.5 * camera.width - centre_x) * per_pixel
+    eye.frustum_width = 0.5 * camera.width * per_pixel
+    eye.frustum_top = centre_y * per_pixel
+    eye.frustum_bottom = (centre_y - camera.height) * per_pixel
+    eye.frustum_near, eye.frustum_far = camera.near, camera.far
+    eye.orthographic = 0
+
+
+def _empty() -> Any:
+    """A model without bodies, and with the engine's settings."""
+    spec = mujoco.MjSpec()
+    option, visual = spec.option, spec.visual
+    option.timestep = TIME_STEP / SUBSTEPS
+    option.gravity = (0.0, 0.0, -GRAVITY)
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP  # what rests costs nothing
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = FRICTION_IMPEDANCE
+    spec.default.geom.solref = (CONTACT_SECONDS, 1.0)
+    spec.default.geom.solimp = IMPEDANCE
+    visual.quality.offsamples = 0
+    visual.quality.shadowsize = 0
+    spec.stat.extent = 1.0
+    return spec
+
+
+def _weigh(body: Any, mass: float, corners: Matrix) -> None:
+    """Give a body the inertia of the box around its points (P, 3), as PyBullet does."""
+    x, y, z = np.square(np.ptp(corners, axis=0))
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, np.zeros(3)
+    body.inertia = mass / 12.0 * np.array([y + z, x + z, x + y])
