@@ -34,6 +34,16 @@ Weights = Annotated[
 Grippers = Annotated[
     list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
 ]
+Cloud = Annotated[
+    Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+]
+Depth = Annotated[
+    Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
+]
+DepthScale = Annotated[
+    float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
+]
+Color = Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")]
 Intrinsics = Annotated[
     str | None,
     Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
@@ -43,17 +53,11 @@ Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is n
 
 @takes_flags(connection=CONNECTION, options=option_flags())
 def detect(
-    file: Annotated[
-        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
-    ] = None,
-    depth: Annotated[
-        Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
-    ] = None,
+    file: Cloud = None,
+    depth: Depth = None,
     intrinsics: Intrinsics = None,
-    depth_scale: Annotated[
-        float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
-    ] = None,
-    color: Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")] = None,
+    depth_scale: DepthScale = None,
+    color: Color = None,
     mask: Annotated[
         Path | None, Option(help="Grasp only where this is not 0: .png or .npy, same pixels.")
     ] = None,

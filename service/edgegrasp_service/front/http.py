@@ -119,6 +119,7 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         metrics: What /metrics shows.
         reloader: What reloads.
     """
+    settings = service.settings
     app: FastAPI = FastAPIOffline(
         title="EdgeGrasp", redoc_url=None, static_url=ASSETS, redirect_slashes=False
     )
@@ -161,10 +162,9 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
     async def index() -> Response:
         return RedirectResponse(PLAYGROUND if settings.playground else "/docs")
 
-    settings = service.settings
     if settings.playground:
-        names = (*gripper_names(), *settings.grippers)
-        grippers = {Path(name).stem: load_gripper(name) for name in names}
+        grippers = {name: load_gripper(name) for name in gripper_names()}
+        grippers |= {file.stem: load_gripper(file) for file in settings.grippers}
 
         @app.get(f"{PLAYGROUND}grippers.json")
         async def show_grippers() -> dict[str, Any]:

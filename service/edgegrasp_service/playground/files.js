@@ -88,11 +88,10 @@ async function readImages(images, files, camera) {
 
 /** The fields of a Scene that a depth image (H, W) has. */
 function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
-  const numbers = intrinsics.split(",").map(Number);
-  if (numbers.length !== 4 || !numbers.every(Number.isFinite) || !numbers[0]) {
+  const [fx, fy, cx, cy] = fourOf(intrinsics.replace(/[[\]\s]/g, "").split(",").map(Number));
+  if (![fx, fy, cx, cy].every(Number.isFinite) || !fx || !fy) {
     throw new NeedsCamera(`${file.name}: give the camera's fx, fy, cx, cy in pixels.`);
   }
-  const [fx, fy, cx, cy] = numbers;
   const [height, width] = array.shape;
   const scale = Number(depth_scale) || (array.whole ? 0.001 : 1);
   const found = new Float32Array(3 * width * height);
@@ -103,8 +102,13 @@ function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
     found[3 * pixel + 2] = z;
   }
   const camera = { fx, fy, cx, cy, width, height };
-  return { points: found, colors, camera, cloud: null, note: "",
-    image: { depth: file, intrinsics, depth_scale } };
+  const image = { depth: file, intrinsics: [fx, fy, cx, cy].join(), depth_scale };
+  return { points: found, colors, camera, cloud: null, image, note: "" };
+}
+
+/** fx, fy, cx, cy of these four numbers, or of the nine of a matrix. */
+function fourOf(values) {
+  return values.length === 9 ? [0, 4, 2, 5].map((place) => values[place]) : values;
 }
 
 /** Intrinsics are missing or wrong. */
@@ -186,9 +190,8 @@ async function readArchive(file, buffer) {
   const alone = (name) => new File([members[name]], `${name}.npy`);
   const note = (name) => `${name}.npy is the array ${name} of ${file.name}`;
   if (arrays.depth && arrays.intrinsics) {
-    const values = [...arrays.intrinsics.values];
-    const intrinsics = values.length === 9 ? [0, 4, 2, 5].map((i) => values[i]) : values;
-    const camera = { intrinsics: intrinsics.map((v) => +v.toPrecision(9)).join(), depth_scale: "" };
+    const intrinsics = Array.from(arrays.intrinsics.values, (value) => +value.toPrecision(9)).join();
+    const camera = { intrinsics, depth_scale: "" };
     return { ...fromDepth(arrays.depth, alone("depth"), colors, camera), note: note("depth") };
   }
   const names = Object.keys(arrays);

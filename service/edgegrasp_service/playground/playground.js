@@ -4,6 +4,7 @@ import { NeedsCamera, readScene } from "./files.js";
 import { View, colorOf } from "./view.js";
 
 const API = new URL("..", import.meta.url).href.replace(/\/$/, ""); // the server's own address
+const MOST_REJECTED = 300; // shown; more would hide the cloud
 const REASONS = {
   direction: "moves in a way not allowed", support: "goes below the support", "not-checked": "left out, not checked",
   collision: "collides", "not-scored": "left out, not scored", "low-score": "scores too low",
@@ -277,7 +278,9 @@ function showReasons() {
     button.addEventListener("click", () => {
       const on = button.getAttribute("aria-pressed") === "false";
       for (const each of $("reasons").children) each.setAttribute("aria-pressed", String(on && each === button));
-      view.showRejected(on ? poses : []);
+      const step = Math.ceil(poses.length / MOST_REJECTED);
+      view.showRejected(on ? poses.filter((_, row) => row % step === 0) : []);
+      if (on && step > 1) say(`One of every ${step} is shown.`);
     });
     return button;
   }));
@@ -426,6 +429,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 async function take(files) {
   if (!files.length) return;
   for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = "";
+  $("sample").selectedIndex = -1;
   if (await open(files)) await ask();
 }
 

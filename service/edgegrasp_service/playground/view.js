@@ -8,7 +8,7 @@ import { TransformControls } from "./vendor/TransformControls.js";
 
 const UP = new THREE.Vector3(0, 0, 1);
 const MOST_POINTS = 500_000; // drawn; more would only hide each other
-const BAR = 0.005; // metres, thickness of a hand's outline
+const BAR = 0.004; // metres, thickness of a hand's outline
 const STEM = 0.04; // metres drawn behind the palm
 const NEAR = 14; // pixels from a hand within which a click means it
 const CONE = 0.12; // metres, length of the approach cone
@@ -18,6 +18,7 @@ const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725
 const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
 const BOX = new THREE.BoxGeometry(1, 1, 1);
 const EDGES = new THREE.EdgesGeometry(BOX);
+const RIM = new THREE.LineBasicMaterial({ color: "#10151d", transparent: true, opacity: 0.55 });
 
 /** The colour of a score from 0 to 1. */
 export function colorOf(score) {
@@ -218,6 +219,7 @@ export class View {
       const mesh = new THREE.Mesh(BOX, look);
       mesh.position.set(0, y, z);
       mesh.scale.set(BAR, dy, dz);
+      mesh.add(new THREE.LineSegments(EDGES, RIM));
       hand.add(mesh);
     };
     bar(0, palm - STEM / 2, BAR, STEM);
@@ -242,7 +244,7 @@ export class View {
 
   /** The gripper's own boxes at a grasp, as collisions are checked with. */
   _body(grasp, color) {
-    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.4, depthWrite: false });
+    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.2, depthWrite: false });
     const line = new THREE.LineBasicMaterial({ color });
     const hand = new THREE.Group();
     const add = ([low, high], y, z) => {
@@ -298,7 +300,7 @@ export class View {
     );
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(places, 3));
-    const look = { color: "#ff6b6b", transparent: true, opacity: 0.6 };
+    const look = { color: "#ff6b6b", transparent: true, opacity: 0.45 };
     this.groups.rejected.clear().add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look)));
     this.draw();
   }
