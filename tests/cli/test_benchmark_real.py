@@ -107,9 +107,9 @@ def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path)
     beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
     np.savez(tmp_path / "flat.npz", **flat, **beside)
     virtual = load_scene(tmp_path / "flat.npz")
-    column, row = virtual.camera.pixels(virtual.points).T
-    assert (column.min() >= 0) & (column.max() < virtual.shape[1])
-    assert (row.min() >= 0) & (row.max() < virtual.shape[0])
+    column, row = virtual.camera.project(virtual.points)[0].T
+    assert (column.min() >= 0) & (column.max() < virtual.camera.shape[1])
+    assert (row.min() >= 0) & (row.max() < virtual.camera.shape[0])
 
 
 def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
