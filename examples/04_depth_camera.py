@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from edgegrasp_client import GraspClient
+from edgegrasp_client import DepthImage, GraspClient
 from edgegrasp_client.local_server import local_server
 from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.sensor import SENSORS
@@ -45,7 +45,7 @@ def main() -> None:
     arguments = parser.parse_args()
     write_images(arguments.folder, arguments.sensor, arguments.seed)
     with local_server() as addresses, GraspClient(addresses.http_url) as client:
-        image = {"depth": arguments.folder / "depth.png", "intrinsics": INTRINSICS}
+        image: DepthImage = {"depth": arguments.folder / "depth.png", "intrinsics": INTRINSICS}
         detection = client.detect(depth_images=[image], top_k=5)
     for grasp in detection.grasps:
         print(f"score {grasp.score:.3f}  object {grasp.object}  TCP {grasp.T_cloud_tcp[:3, 3]}")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
-from edgegrasp_sim.camera import CAMERA, EVALUATION_VIEWS, Observation
+from edgegrasp_sim.camera import CAMERA, EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.picture import Picture, View
 from edgegrasp_sim.simulation import ClutterSimulation
 
@@ -31,7 +31,7 @@ def main(seed: int, output: Path) -> None:
         placed = simulation.reset("pile", scene, num_objects=6)
         pose = EVALUATION_VIEWS.sample(camera)[0]
         seen = simulation.observe_from([pose], noise, table="auto")
-        image = simulation.world.render_colors(pose, CAMERA)
+        colors = simulation.world.render_colors(pose, CAMERA).reshape(-1, 3)[seen.pixels]
         print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
 
         over_grpc, over_rest = detect_over_both(seen, seed)
@@ -49,11 +49,11 @@ def main(seed: int, output: Path) -> None:
         print(f"Executed the best one in the simulator: {verdict}.")
 
     output.mkdir(parents=True, exist_ok=True)
-    write_ply(output / "scene.ply", seen.cloud, image.reshape(-1, 3)[seen.pixels])
-    lens = CAMERA.focal_length, CAMERA.focal_length, CAMERA.centre_x, CAMERA.centre_y
+    write_ply(output / "scene.ply", seen.cloud, colors)
     drawn = over_grpc.grasps[:LISTED]
     title = f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}."
-    picture = Picture(View(image.shape[:2], *lens, pose), seen.cloud, image=image, title=title)
+    view = View.of(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)
+    picture = Picture(view, seen.cloud, colors, title=title)
     picture.grasps(drawn)
     picture.save(output / "grasps.png")
     print(f"In {output.name}/: grasps.png, the picture, and scene.ply, the cloud.")

@@ -23,9 +23,11 @@ BARS = (2.0, 7.0)  # points that this is at least and at most
 BEHIND = 0.006  # metres behind the cloud from which on a fork is drawn as hidden
 LABELLED = 5  # grasps that carry their rank
 SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
-SPREAD = 4  # pixels that gaps between points are closed by at most
+SMALLEST = 0.25  # metres across, of what such a picture shows
+SPREAD = 8  # pixels that gaps between points are closed by at most
 WIDTH, DPI = 10.0, 130  # inches, dots per inch
 FOOT = 0.75  # inches below the picture: title and scale
+SMOOTHED = 8  # times that depths are averaged with their neighbours before they are shaded
 LAMP = (-0.3, -0.6, -0.74)  # to it from a surface, camera frame: left, up, towards the camera
 MAP = "viridis"  # colours of scores from 0 to 1
 OUTLINE = "#10151d"
@@ -68,7 +70,7 @@ class View:
     def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
         """A camera at `eye` (3,) whose image holds most of the points (N, 3)."""
         seen = np.asarray(points, dtype=np.float64)
-        position, rows, columns = np.asarray(eye, dtype=np.float64), *SIZE
+        (rows, columns), position = SIZE, np.asarray(eye, dtype=np.float64)
         z = np.median(seen, axis=0) - position
         z /= np.linalg.norm(z)
         x = np.cross(z, np.asarray(up, dtype=np.float64))
@@ -78,7 +80,8 @@ class View:
         right, down, ahead = ((seen - position) @ T[:3, :3]).T
         ahead = np.maximum(ahead, 0.05)
         (left, right), (top, bottom) = (np.quantile(v / ahead, (0.01, 0.99)) for v in (right, down))
-        focal = 0.8 * min(columns / max(right - left, 1e-3), rows / max(bottom - top, 1e-3))
+        least = SMALLEST / float(np.median(ahead))
+        focal = 0.8 * min(columns / max(right - left, least), rows / max(bottom - top, least))
         middle = columns / 2 - focal * (left + right) / 2, rows / 2 - focal * (top + bottom) / 2
         return cls(SIZE, focal, focal, *middle, T)
 
@@ -96,9 +99,11 @@ class View:
         seen = np.flatnonzero(np.isfinite(pixels).all(axis=1) & (depth > 0.0))
         seen = seen[np.argsort(-depth[seen], kind="stable")]  # nearer ones over others
         rows, columns = self.shape
-        spread = int(np.clip(np.sqrt(rows * columns / max(len(seen), 1)) / 2, 0, SPREAD))
-        around = np.arange(-spread, spread + 1)
         column, row = np.clip(np.rint(pixels[seen]), -1e6, 1e6).astype(np.int64).T
+        within = ((row >= 0) & (row < rows) & (column >= 0) & (column < columns)).sum()
+        gap = np.sqrt(rows * columns / max(within, 1))  # pixels from point to point
+        spread = int(min(1.2 * gap - 0.6, SPREAD))
+        around = np.arange(-spread, spread + 1)
         column = np.add.outer(column, np.tile(around, len(around)))
         row = np.add.outer(row, np.repeat(around, len(around)))
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
@@ -152,7 +157,7 @@ class Picture:
         """(H, W, 3) the cloud in greys, as a lamp over the camera lights it."""
         rows, columns = self.view.shape
         depth = self._depth
-        for _ in range(3):  # over the noise of the camera
+        for _ in range(SMOOTHED):  # over the noise of the camera
             around = np.pad(depth, 1, mode="edge")
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
             near = [np.where(np.abs(part - depth) < BEHIND, part, depth) for part in parts]
