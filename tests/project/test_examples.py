@@ -118,6 +118,11 @@ def test_several_views(address: str) -> None:
     assert int(many) > 2 * int(few)
 
 
+def test_pick_and_place(address: str) -> None:
+    shown = example("06_pick_and_place.py", "--server", address, "--picks", 2)
+    assert "2 of 4 things in the tray" in shown
+
+
 def test_your_planner(tmp_path: Path) -> None:
     program = "from edgegrasp_cli.main import main; main()"
     asked = ("benchmark", "--planner", "07_your_planner:plan", "--scene", "packed", "--rounds", "2")
