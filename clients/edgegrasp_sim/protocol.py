@@ -136,7 +136,7 @@ class PlanningRules:
         num_candidates: candidates scored at most.
         selection: `best` score; the `highest` grasp among those of `min_score` and more; or
             `elsewhere`, the best score away from grasps that have failed in the round.
-        min_score: for `highest`.
+        min_score: for `highest`; with `best`, no grasp is made that scores less.
     """
 
     table: TableView

@@ -31,7 +31,7 @@ PILE_BOX_EXTENT = (0.26, 0.26, 0.13)  # metres
 PILE_BOX_WALL = 0.0039  # metres
 
 BIN_DROP_HEIGHT = 0.08  # metres above the walls
-BIN_DROP_MARGIN = 0.05  # metres from the walls
+BIN_DROP_SHARE = 0.25  # of a bin's length and width, beside which nothing is dropped: as poured in
 BIN_DROP_SECONDS = 0.5
 
 TABLE_ATTEMPTS = 4  # for each object
@@ -128,8 +128,9 @@ def make_bin(
 ) -> list[SceneObject]:
     """Drop objects into a bin one after another; those that do not fit in it are taken away."""
     low, high = np.asarray(surroundings.bounds)[:, :2]
+    margin = BIN_DROP_SHARE * (high - low)
     walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
-    where = low + BIN_DROP_MARGIN, high - BIN_DROP_MARGIN
+    where = low + margin, high - margin
     height = walls + BIN_DROP_HEIGHT
     dropped = _drop(world, objects, rng, num_objects, scales, where, height, BIN_DROP_SECONDS)
     return settle(world, dropped, surroundings)

@@ -23,8 +23,11 @@ WORKSPACE = (
 )
 MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
-BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.30, 0.45), (0.24, 0.35), (0.05, 0.12)  # metres, inside
-BIN_WALL = (0.003, 0.008)  # metres; its floor is as thick
+# Metres, inside. The palm of the Panda's hand is 20 cm wide and 5 cm above its fingertips: along
+# a higher wall it holds little.
+BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.40, 0.60), (0.30, 0.42), (0.03, 0.08)
+BIN_WALL = (0.008, 0.015)  # metres; its floor is as thick. Objects are pressed through thin ones.
+GROUND = 0.2  # metres that a bin's floor reaches down into what it stands on, for the same reason
 BIN_STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
 BIN_STAND = (0.1, 0.4)  # metres
 HEAP = 0.10  # metres that a heap may rise over a bin's walls
@@ -36,7 +39,7 @@ TABLE_OVER_FLOOR = (0.4, 0.8)  # metres
 LARGE_THINGS = (1, 3)  # on a table
 LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
 CARTON = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))  # metres; no hand would grasp a longer thing
-PANEL = ((0.42, 0.60), (0.02, 0.05), (0.25, 0.40))  # metres: monitors, walls, partitions
+PANEL = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # metres: monitors, walls, partitions
 KERB = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
 
 
@@ -111,10 +114,10 @@ def random_bin(rng: np.random.Generator) -> Surroundings:
     stand = rng.uniform(*BIN_STAND) if rng.random() < BIN_STAND_SHARE else 0.0
     half = np.array([length, width]) / 2
     outer = half + wall
-    # The floor reaches down to what the bin stands on: nothing can be pushed through it.
+    depth = wall + stand + GROUND
     floor = Box(
-        (2 * float(outer[0]), 2 * float(outer[1]), wall + stand),
-        (MIDDLE, MIDDLE, TABLE_HEIGHT - (wall + stand) / 2),
+        (2 * float(outer[0]), 2 * float(outer[1]), depth),
+        (MIDDLE, MIDDLE, TABLE_HEIGHT - depth / 2),
         friction=TABLE_FRICTION,
         obstacle=False,
     )

@@ -207,6 +207,7 @@ def request_options(
         "num_candidates": rules.num_candidates,
         "viewpoint": positions[0] if len(positions) == 1 else positions,
         "top_k": 1 if rules.selection == "best" else CHOICE,
+        "min_score": rules.min_score if rules.selection == "best" else 0.0,
     }
     if observation.table != "auto":  # there the detector finds out for itself
         options |= {"support": support, "workspace": {"min": low, "max": high}}

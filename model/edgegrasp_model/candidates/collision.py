@@ -5,23 +5,29 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import any_point_in_boxes, signed_distance_to_boxes
+from edgegrasp_model.hand_kernels import (
+    any_point_in_boxes,
+    points_in_hand_boxes,
+    signed_distance_to_boxes,
+)
 from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.things import FIXED
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
+MIN_FIXED = 8  # voxels of furniture between the fingers that keep them from closing
 TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet the cloud, the support plane or an obstacle.
+    """Which open hands meet the cloud, the support plane or an obstacle, or close on furniture.
 
     Checked at the grasp, on the straight way in and on the way out, with each box of the hand
     grown by the margin on every side.
@@ -40,7 +46,19 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
         hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
     if scene.obstacles is not None:
         hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+    free = np.flatnonzero(~hit)
+    hit[free] = closes_on_furniture(scene, T_cloud_hand[free], gripper)
     return hit
+
+
+def closes_on_furniture(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
+    """Which hands have a wall, a rim or another fixed thing between their fingers.  # (E,)."""
+    fixed = scene.cloud.points[scene.object_of_point == FIXED]
+    half, opening = gripper.pad_half_width, gripper.max_opening
+    low = np.array([-half, -opening / 2, gripper.palm_z], dtype=np.float32)
+    high = np.array([half, opening / 2, gripper.tip_z], dtype=np.float32)
+    hand, _, _ = points_in_hand_boxes(fixed, T_cloud_hand, low, high)
+    return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
 def reach_of_motion(gripper: Gripper, request: Collision) -> Reach:

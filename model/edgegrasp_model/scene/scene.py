@@ -36,6 +36,7 @@ from edgegrasp_model.scene.support import Seen, Support, find_support, measured
 from edgegrasp_model.scene.things import (
     CELL,
     FINE_CELL,
+    UNKNOWN,
     PlaneView,
     find_things,
     without_speckles,
@@ -53,7 +54,7 @@ MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
-WALL = 0.015  # metres inside a side of the workspace where a wall at it is seen
+WALL = 0.008  # metres, at least, inside a side of the workspace where a wall at it is seen
 ON = 10_000  # points of the support, at least, that tell its outline
 
 
@@ -67,7 +68,7 @@ class Scene:
     point_of_row: Int64  # (R,) point that each row of the cloud as sent went into; -1: none
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
-    object_of_point: Int64  # (V,) number of the object that each point is of; -1: of none
+    object_of_point: Int64  # (V,) number of the object that each point is of; FIXED; UNKNOWN
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
@@ -79,7 +80,7 @@ class SelectedPoints:
     """What is left of a cloud: M points of things and of what is around them."""
 
     sent: CheckedCloud  # M points
-    number: Int64  # (M,) the object that each is of; -1: an obstacle
+    number: Int64  # (M,) the object that each is of; FIXED: of furniture; UNKNOWN: of neither
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras
@@ -113,9 +114,8 @@ def select_points(
     up = _up(options, support)
     if support is None:
         counts["above_support"] = int(inside.sum())
-        return SelectedPoints(
-            sent, np.where(inside, _given_numbers(sent), -1), None, up, viewpoints
-        )
+        number = np.where(inside, _given_numbers(sent), UNKNOWN)
+        return SelectedPoints(sent, number, None, up, viewpoints)
     height, margin, thick = support.heights(seen)
     on, above = np.flatnonzero(np.abs(height) < thick), np.flatnonzero(height > margin)
     on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
@@ -245,7 +245,7 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
     """The segments (N,) that a caller sent, 0 and less none; else all points are one object."""
     if sent.segment_ids is None:
         return np.zeros(len(sent.points), dtype=np.int64)
-    return np.where(sent.segment_ids > 0, sent.segment_ids, -1)
+    return np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
 
 
 def _numbers(
@@ -256,52 +256,61 @@ def _numbers(
     options: DetectOptions,
     warnings: list[str],
 ) -> Int64:
-    """The object (M,) of each point over the support; -1: none.
+    """The object (M,) of each point over the support; FIXED: furniture; UNKNOWN: neither.
 
     What the caller says are objects are: segments, or regions by rows.
     """
     by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
     if sent.segment_ids is not None or by_rows or options.objects == "off":
-        return np.where(inside, _given_numbers(sent), -1)
-    sure = None if options.workspace is None else inside
-    inside = inside & ~beside_what_is_beyond(view.plan, sent.points, inside, options.workspace)
-    for cell in (CELL, FINE_CELL):  # things that touch furniture may be told from it more finely
-        number = np.where(inside, find_things(view, options.max_object_size, sure, cell), -1)
+        return np.where(inside, _given_numbers(sent), UNKNOWN)
+    if options.workspace is not None:
+        beyond = beyond_workspace(view, sent.points, options.workspace)
+        view = view._replace(beyond=beyond)
+    # Things that touch furniture may be told from it more finely.
+    for cell, strict in ((CELL, True), (FINE_CELL, True), (CELL, False)):
+        number = find_things(view, options.max_object_size, cell, strict)
+        number = np.where((number >= 0) & ~inside, UNKNOWN, number)
         if sent.image_size is not None:
             number = without_speckles(number, sent.row, sent.image_size, seen.distance())
         if (number >= 0).any() or not inside.any():
-            return number
-    warnings.append(
+            break
+    if strict:
+        return number
+    said = (
         "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
-        "by the image, or not on the plane): all that is over it is taken for things."
     )
-    return np.where(inside, 0, -1)
+    said += "cut off by the image, or not on the plane)"
+    if (number >= 0).any():
+        said += ": what is over it and not shaped like a box is taken for things"
+    warnings.append(f"{said}. Send objects: off to look for grasps on all that is over it.")
+    return number
 
 
-def beside_what_is_beyond(
-    plan: Float64, points: Float32, inside: Bools, box: Workspace | None
-) -> Bools:
-    """Which points are at a side of the workspace, beside something that goes on beyond it.
+def beyond_workspace(view: PlaneView, points: Float32, box: Workspace) -> Int64:
+    """Which side of the workspace points are beyond, or at, beside something beyond it.
 
-    The walls of a bin whose inside is the workspace are seen partly in it.
+    The walls of a bin whose inside is the workspace are seen partly in it: as far as their points
+    may lie off them.
 
     Args:
-        plan: (M, 2) along the support, metres.
+        view: M points.
         points: (M, 3) the same, cloud frame, metres.
-        inside: (M,) in the workspace.
         box: The workspace.
 
     Returns:
-        (M,)
+        (M,) number of the side, from 1; 0: in it.
     """
-    beside = np.zeros(len(points), dtype=bool)
-    if box is None or inside.all():
-        return beside
-    low, high = np.asarray(box.min) + WALL, np.asarray(box.max) - WALL
-    at_side = np.flatnonzero(inside & ((points < low) | (points > high)).any(axis=1))
-    apart, _ = cKDTree(plan[~inside]).query(plan[at_side], distance_upper_bound=WALL)
-    beside[at_side] = np.isfinite(apart)
-    return beside
+    low, high = np.asarray(box.min), np.asarray(box.max)
+    outside = np.concatenate([points < low, points > high], axis=1)  # (M, 6)
+    wall = np.maximum(view.margin, WALL)[:, None]
+    at_side = np.concatenate([points < low + wall, points > high - wall], axis=1)
+    inside = ~outside.any(axis=1)
+    beside = np.flatnonzero(inside & at_side.any(axis=1))
+    if not inside.all() and len(beside):
+        around = cKDTree(view.plan[~inside])
+        apart, _ = around.query(view.plan[beside], distance_upper_bound=2 * WALL)
+        outside[beside] = at_side[beside] & np.isfinite(apart)[:, None]
+    return np.where(outside.any(axis=1), outside.argmax(axis=1) + 1, 0)
 
 
 def near_things(plan: Float64, number: Int64) -> Bools:

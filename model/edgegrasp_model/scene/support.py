@@ -32,8 +32,9 @@ CELL = 0.02  # metres
 NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
 MAX_BELOW = 0.5  # share of what is seen at and right under a plane that lies under it
 MIN_AREA = 0.03  # square metres of a support that are seen: more than of an object's side
-BARE = 0.5  # share of the seen surface from which a plane is a support with nothing on it
+BARE = 0.5  # share of the seen surface from which a small plane is a support with nothing on it
 NOTHING_ON_IT = 0.02  # weight of a plane's own points beside those of things
+UNUSED = 0.3  # worth of a plane with nothing on it beside one with something
 ALIKE = 0.7  # share of the best plane's worth from which another one is a doubt
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 MIN_MARGIN, MAX_MARGIN = 0.004, 0.02  # metres over the plane that still belong to it
@@ -315,7 +316,7 @@ def _refined(seen: Seen, plane: _Plane) -> _Plane:
 
 
 def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
-    """How much a plane is stood on and seen, over its distance; 0 where it is no support."""
+    """How much a plane is stood on and seen, over squared distance; 0 where it is no support."""
     distance, height = seen.distance(), plane.heights(seen.points)
     thick = thickness(distance)
     on = np.abs(height) < thick
@@ -328,22 +329,24 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
     below = (height < -3 * thick) & (height > -NEAR_BELOW)
     axes = plan_axes(plane.normal, seen.viewpoint, seen.points)
     plan = seen.points @ axes.T
-    if _area(plan[on]) < MIN_AREA:
+    area = _area(plan[on])
+    if area < MIN_AREA:
         return 0.0
     near_below = _over_hull(plan[on], plan[below])
     if near_below > MAX_BELOW * (near_below + size):
         return 0.0
-    if size / far <= least:  # were everything on it a thing, it would not be worth more
+    if size / far**2 <= least:  # were everything on it a thing, it would not be worth more
         return 0.0
     out = np.flatnonzero(height > 2 * thick)
     border = None if seen.at_border is None else seen.at_border[out]
     view = PlaneView(plan[out], height[out], 2 * thick[out], plan[on], border)
     things = int((find_things(view, max_size) >= 0).sum())
-    if things == 0 and plane.share < BARE:
+    if things == 0 and plane.share < BARE and area < max_size**2 / 2:
         return 0.0
     through = _seen_through(seen, height, height < -3 * thick, plan[on], axes, plane)
-    worth = math.sqrt((min(things, size) + NOTHING_ON_IT * size) * size) / far
-    return max(worth * size / (size + near_below) - through / far, 0.0)
+    worth = math.sqrt((min(things, size) + NOTHING_ON_IT * size) * size) / far**2
+    worth *= 1.0 if things else UNUSED
+    return max(worth * size / (size + near_below) - through / far**2, 0.0)
 
 
 def _area(plan: Float64) -> float:

@@ -27,7 +27,10 @@ OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
 STANDS_OUT = 2.0  # margins over the plane that a thing rises at least
+FIXED, UNKNOWN = -1, -2  # in place of a thing's number: furniture; what may belong to one
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
+AROUND = 3  # sides of a workspace beyond which a cluster goes on where its inside is a box's
+BOX_SHARE = 0.75  # of points on the sides and the top of a box
 MIN_BOX = 0.25  # metres, longest side of the smallest open box that is told from a thing
 
 JUMP = 0.015  # share of the distance between neighbouring pixels that parts them
@@ -52,6 +55,7 @@ class PlaneView(NamedTuple):
     margin: NDArray[np.floating]  # (M,) metres over it that still belong to it
     on: Float64  # (K, 2) points that belong to it, metres along it
     at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
+    beyond: Int64 | None = None  # (M,) side of the workspace that each is beyond; 0: in it
 
 
 def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]) -> Float64:
@@ -67,25 +71,23 @@ def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.flo
     return np.stack([x, np.cross(normal, x)])
 
 
-def find_things(
-    view: PlaneView, max_size: float, sure: Bools | None = None, cell: float = CELL
-) -> Int64:
+def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bool = True) -> Int64:
     """The things that stand on a plane: clusters above it that are no furniture.
 
     A thing lies over the seen part of the plane, is not longer than `max_size` and is not cut
-    off by the image's border. Of an open box, the inside is one thing or several, however large;
-    its walls are none.
+    off by the image's border; or it lies in the caller's workspace. Of an open box, and of what
+    goes on around the workspace, the inside is one thing or several, however large.
 
     Args:
         view: M points.
         max_size: Longest side of a thing, metres.
-        sure: (M,) where the caller says that things are; what lies there is one.
         cell: Metres between points that still hang together.
+        strict: Otherwise all that is not shaped like a box is a thing.
 
     Returns:
-        (M,) number of each point's thing, from 0; -1: of none.
+        (M,) number of each point's thing, from 0; FIXED: of furniture; UNKNOWN: of neither.
     """
-    number = np.full(len(view.height), -1, dtype=np.int64)
+    number = np.full(len(view.height), UNKNOWN, dtype=np.int64)
     found = 0
     outline = support_outline(view.on)
     for mine in clusters(view.plan, view.height, cell):
@@ -93,17 +95,26 @@ def find_things(
         if np.percentile(view.height[some] / view.margin[some], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[some], view.height[some])
-        if (
-            length > MIN_BOX
-            and (inside := box_contents(view.plan[mine], view.height[mine])) is not None
-        ):
-            mine = mine[inside]
+        sides = np.zeros(0) if view.beyond is None else np.unique(view.beyond[mine])
+        if view.beyond is not None and (view.beyond[mine] == 0).mean() > SURE:
+            number[mine], found = found, found + 1
+            continue
+        contents: tuple[Bools, Bools] | None = None
+        if np.count_nonzero(sides) >= AROUND and view.beyond is not None:
+            contents = view.beyond[mine] == 0, view.beyond[mine] != 0
+        elif length > MIN_BOX:
+            contents = box_contents(view.plan[mine], view.height[mine])
+        if contents is not None:
+            inside, walls = contents
+            number[mine[walls]], mine = FIXED, mine[inside]
             for part in clusters(view.plan[mine], view.height[mine]):
                 number[mine[part]], found = found, found + 1
-        elif (sure is not None and sure[mine].mean() > SURE) or (
+        elif (
             length <= max_size and _whole(mine, view) and _over(outline, view.plan[some])
-        ):
+        ) or not (strict or _like_a_box(view.plan[some], view.height[some])):
             number[mine], found = found, found + 1
+        else:
+            number[mine] = FIXED
     return number
 
 
@@ -134,13 +145,13 @@ def without_speckles(
     A speck is a small piece of the image whose depths are not those of the pixels around it.
 
     Args:
-        number: (M,) the thing of each point; -1: none.
+        number: (M,) the thing of each point, FIXED or UNKNOWN.
         row: (M,) its pixel, row-major, ascending.
         image_size: (H, W).
         distance: (M,) metres from the camera.
 
     Returns:
-        (M,) numbers; -1 for specks.
+        (M,) numbers; UNKNOWN for specks.
     """
     height, width = image_size
     place = np.full(height * width, -1, dtype=np.int64)
@@ -156,8 +167,9 @@ def without_speckles(
     links = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(len(row), len(row)))
     _, piece = connected_components(links, directed=False)
     size = np.bincount(piece)[piece]
-    of_thing = np.bincount(number + 1)[number + 1]
-    return np.where((size < SPECK * height * width) & (size < SPECK_SHARE * of_thing), -1, number)
+    of_thing = np.bincount(number - UNKNOWN)[number - UNKNOWN]
+    speck = (size < SPECK * height * width) & (size < SPECK_SHARE * of_thing)
+    return np.where(speck, UNKNOWN, number)
 
 
 def support_outline(plan: Float64) -> Float64 | None:
@@ -179,11 +191,11 @@ def support_outline(plan: Float64) -> Float64 | None:
         return None
 
 
-def box_contents(plan: Float64, height: NDArray[np.floating]) -> Bools | None:
-    """Which points (M,) lie inside an open box; None where the points are none.
+def box_contents(plan: Float64, height: NDArray[np.floating]) -> tuple[Bools, Bools] | None:
+    """Which points (M,) lie inside an open box, and which are its walls; None where it is none.
 
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
-    is lower inside. The points at its walls and on its floor do not count.
+    is lower inside. The points on its floor are neither.
     """
     axes, low, size = smallest_rectangle(plan)
     place = plan @ axes.T - low
@@ -197,6 +209,7 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> Bools | None:
         rims.append(_rim(place[at, along], height[at], float(size[along])))
     levels = [rim for rim in rims if rim is not None]
     inside: Bools = np.min(from_side, axis=0) > WALL
+    walls = ~inside
     if len(levels) < 3 or inside.sum() < MIN_POINTS:
         return None
     if np.percentile(height[inside], 5) > np.median(levels) - HOLLOW:
@@ -204,7 +217,7 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> Bools | None:
     lowest = np.percentile(height[inside], 3)
     if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
         inside &= height > lowest + FLOOR
-    return inside
+    return inside, walls
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
@@ -234,6 +247,15 @@ def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float |
         return None
     level = float(np.median(top[seen]))
     return level if (np.abs(top - level) < LEVEL).mean() > FILLED else None
+
+
+def _like_a_box(plan: Float64, height: NDArray[np.floating]) -> bool:
+    """Whether points (M, 2), (M,) are mostly sides of a rectangle, and a level top."""
+    axes, low, size = smallest_rectangle(plan)
+    place = plan @ axes.T - low
+    side = np.minimum(place, size - place).min(axis=1) < STRIP
+    level = np.abs(height - np.percentile(height, 90)) < LEVEL
+    return bool((side | level).mean() > BOX_SHARE)
 
 
 def _length(plan: Float64, height: NDArray[np.floating]) -> float:
