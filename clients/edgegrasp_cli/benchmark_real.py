@@ -51,6 +51,9 @@ def benchmark_real(
     A request holds the image and its intrinsics, or the cloud and that the camera is at its
     origin, and the options given as flags; nothing else is said about a scene.
     """
+    from rich.console import Console
+    from rich.progress import track
+
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
@@ -59,7 +62,7 @@ def benchmark_real(
     model = ""
     with open_client(server, timeout, connection, weights, grippers, device) as client:
         client.detect(**loaded[0].request, **fields)  # what is loaded or compiled first takes time
-        for scene in loaded:
+        for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
             detection = client.detect(**scene.request, **fields)
             milliseconds = 1000 * (time.perf_counter() - start)

@@ -83,12 +83,15 @@ def detect(
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
+    from rich.console import Console
+
     fields = _options(options_file, options)
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
     if mask is not None:
         fields |= _on_mask(fields, _pixels(mask))
-    with open_client(server, timeout, connection, weights, grippers, device) as client:
+    waiting = Console(stderr=True).status("Looking for grasps…")
+    with waiting, open_client(server, timeout, connection, weights, grippers, device) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if picture is not None:
         draw(picture, detection, fields, file, images, colors)
@@ -115,7 +118,8 @@ def models(
     table = Table(
         "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
     )
-    with open_client(server, timeout, connection, weights) as client:
+    waiting = Console(stderr=True).status("Loading weights…")
+    with waiting, open_client(server, timeout, connection, weights) as client:
         found = client.models()
     for row in found:
         table.add_row(

@@ -212,7 +212,7 @@ export class View {
 
   /** A slim hand: stem, palm and the fingers at their opening. */
   _outline(grasp, color) {
-    const look = new THREE.MeshStandardMaterial({ color, roughness: 0.55, emissive: color, emissiveIntensity: 0.25 });
+    const look = new THREE.MeshStandardMaterial({ color, roughness: 0.55, emissive: color, emissiveIntensity: 0.45 });
     const [half, palm, tip] = this._reach(grasp.width);
     const hand = new THREE.Group();
     const bar = (y, z, dy, dz) => {
