@@ -28,7 +28,7 @@ def write_images(folder: Path, sensor: str, seed: int) -> None:
     with ClutterSimulation() as simulation:
         simulation.reset("table", scene, num_objects=7)
         depth = simulation.world.render_depth(T_world_camera, CAMERA)
-        colors = simulation.world.render_colors(T_world_camera, CAMERA)
+        colors = simulation.color_image(T_world_camera)
     seen = SENSORS[sensor].apply(depth, CAMERA, noise)
     millimetres = np.nan_to_num(1000 * seen).round().astype(np.uint16)  # 0: no reading
     folder.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
-from edgegrasp_sim.camera import CAMERA, EVALUATION_VIEWS, Observation, crop
+from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.picture import Picture, View
 from edgegrasp_sim.simulation import ClutterSimulation
 
@@ -31,7 +31,7 @@ def main(seed: int, output: Path) -> None:
         placed = simulation.reset("pile", scene, num_objects=6)
         pose = EVALUATION_VIEWS.sample(camera)[0]
         seen = simulation.observe_from([pose], noise, table="auto")
-        colors = simulation.world.render_colors(pose, CAMERA).reshape(-1, 3)[seen.pixels]
+        colors = simulation.color_image(pose).reshape(-1, 3)[seen.pixels]
         print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
 
         over_grpc, over_rest = detect_over_both(seen, seed)

@@ -47,7 +47,9 @@ def attempt(
         now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)
     if picture is not None:
-        draw_grasps(picture, seen.cloud, [before], eye=seen.camera_position, title=title)
+        draw_grasps(
+            picture, seen.cloud, [before], camera_position=seen.camera_position, title=title
+        )
     print(title)
     if any(
         getattr(now, name) != getattr(before, name)

@@ -6,7 +6,7 @@ PyBullet is named in this file alone.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 import pybullet
@@ -18,16 +18,6 @@ from edgegrasp_sim.poses import Matrix
 TIME_STEP = 1.0 / 80.0  # seconds
 SOLVER_ITERATIONS = 100
 GRAVITY = 9.81  # m/s²
-WOOD = (0.62, 0.52, 0.41, 1.0)  # of what never moves
-PAINTS = (
-    (0.85, 0.27, 0.22, 1.0),
-    (0.18, 0.49, 0.78, 1.0),
-    (0.95, 0.72, 0.19, 1.0),
-    (0.22, 0.64, 0.42, 1.0),
-    (0.93, 0.90, 0.84, 1.0),
-    (0.55, 0.34, 0.66, 1.0),
-    (0.15, 0.20, 0.27, 1.0),
-)  # of objects
 ASSETS = Path(pybullet_data.getDataPath())  # meshes and URDF files that come with the engine
 
 
@@ -213,26 +203,9 @@ class World:
 
         Pixels that show nothing read `far`. A pixel is sampled at its lower left corner.
         """
-        _, z_buffer = self._render(T_world_camera, camera)
-        z = np.asarray(z_buffer, dtype=np.float64).reshape(camera.height, camera.width)
-        return camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
-
-    def render_colors(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.uint8]:
-        """The same pixels in colour, the bodies painted for it: (height, width, 3)."""
-        for row in range(pybullet.getNumBodies(physicsClientId=self.client)):
-            uid = pybullet.getBodyUniqueId(row, physicsClientId=self.client)
-            mass = pybullet.getDynamicsInfo(uid, -1, physicsClientId=self.client)[0]
-            paint = PAINTS[uid % len(PAINTS)] if mass else WOOD
-            pybullet.changeVisualShape(uid, -1, rgbaColor=paint, physicsClientId=self.client)
-        pixels, _ = self._render(T_world_camera, camera)
-        rgba = np.asarray(pixels, dtype=np.uint8).reshape(camera.height, camera.width, 4)
-        return rgba[..., :3]
-
-    def _render(self, T_world_camera: Matrix, camera: Intrinsics) -> tuple[Any, Any]:
-        """Colours and depth buffer."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
-        _, _, pixels, z_buffer, _ = pybullet.getCameraImage(
+        _, _, _, z_buffer, _ = pybullet.getCameraImage(
             camera.width,
             camera.height,
             viewMatrix=view.flatten(order="F").tolist(),
@@ -241,7 +214,8 @@ class World:
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self.client,
         )
-        return pixels, z_buffer
+        z = np.asarray(z_buffer, dtype=np.float64).reshape(camera.height, camera.width)
+        return camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
 
     def _hull(self, mesh: Path, quaternion_xyzw: Sequence[float]) -> int:
         """A collision shape: the convex hull of a mesh, turned."""

@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -154,7 +154,7 @@ class Picture:
         self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
 
     def _shaded(self) -> Points:
-        """(H, W, 3) the cloud in greys, as a lamp over the camera lights it."""
+        """(H, W, 3) the cloud in greys."""
         rows, columns = self.view.shape
         depth = self._depth
         for _ in range(SMOOTHED):  # over the noise of the camera
@@ -162,12 +162,7 @@ class Picture:
             parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
             near = [np.where(np.abs(part - depth) < BEHIND, part, depth) for part in parts]
             depth = np.mean(near, axis=0)
-        down, right = np.gradient(depth)
-        x, y = right * abs(self.view.fx) / depth, down * self.view.fy / depth
-        # The surface's normal is (x, y, -1), not of unit length.
-        toward = (LAMP[0] * x + LAMP[1] * y - LAMP[2]) / np.sqrt(x**2 + y**2 + 1)
-        facing = np.nan_to_num(toward)
-        grey = 70 + 165 * np.clip(facing, 0.0, 1.0)
+        grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
         return np.repeat(grey[..., None], 3, axis=2)
 
     def lines(self, points: ArrayLike, color: str, width: float = 1.5) -> None:
@@ -241,20 +236,49 @@ class Picture:
         box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
         self._axes.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True)
 
-    def save(self, path: Path) -> None:
-        """Write it: `.png` or `.jpg`; its folder must exist."""
+    def save(self, path: Path | BinaryIO) -> None:
+        """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
         rows, columns = self.view.shape
         self._axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
         self._figure.savefig(path)
 
 
 def draw_grasps(
-    path: Path, cloud: ArrayLike, grasps: Sequence[Drawable], *, eye: ArrayLike, title: str
+    path: Path | BinaryIO,
+    cloud: ArrayLike,
+    grasps: Sequence[Drawable],
+    *,
+    camera_position: ArrayLike,
+    title: str,
 ) -> None:
-    """Write a picture of a cloud (N, 3) and grasps in it, best first, seen from `eye` (3,)."""
-    picture = Picture(View.of(cloud, eye), cloud, title=title)
+    """Write a picture of a cloud and of grasps in it, as `Picture.save` does.
+
+    Args:
+        path: where to.
+        cloud: (N, 3) metres.
+        grasps: best first.
+        camera_position: (3,) metres, cloud frame; the picture looks from there.
+        title: a line below it.
+    """
+    picture = Picture(View.of(cloud, camera_position), cloud, title=title)
     picture.grasps(grasps)
     picture.save(path)
+
+
+def lit(depth: NDArray[np.floating], fx: float, fy: float) -> Points:
+    """How bright a lamp over the camera makes what it sees, from 0 to 1: (H, W).
+
+    Args:
+        depth: (H, W) metres along the line of sight; NaN where there is nothing.
+        fx: pixels.
+        fy: pixels.
+    """
+    down, right = np.gradient(np.asarray(depth, dtype=np.float64))
+    x, y = right * fx / depth, down * fy / depth
+    # The surface's normal is (x, y, -1), not of unit length.
+    facing = (LAMP[0] * x + LAMP[1] * y - LAMP[2]) / np.sqrt(x**2 + y**2 + 1)
+    light: Points = np.clip(np.nan_to_num(facing), 0.0, 1.0)
+    return light
 
 
 def fork(T_cloud_hand: ArrayLike, width: float) -> Points:

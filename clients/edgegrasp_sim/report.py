@@ -220,5 +220,5 @@ def _failure_pictures(replay: Replay, rounds: Sequence[Round]) -> Iterator[str]:
         title = attempt_title(done, number)
         with tempfile.TemporaryDirectory() as folder:
             file, grasps = Path(folder) / "failure.jpg", [done.attempts[number]]
-            draw_grasps(file, seen.cloud, grasps, eye=seen.camera_position, title=title)
+            draw_grasps(file, seen.cloud, grasps, camera_position=seen.camera_position, title=title)
             yield image("jpeg", file.read_bytes(), title)
