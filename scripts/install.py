@@ -60,9 +60,9 @@ def main(constraints: str, *arguments: str) -> int:
         watcher.start()
         for line in pip.stdout:
             first, _, rest = line.strip().partition(" ")
-            if first == "Collecting":
+            if first in ("Collecting", "Processing"):
                 chosen.add(rest.split(" ")[0])
-                shown.show(f"downloading {rest.split(' ')[0]}", len(chosen), 0)
+                shown.show(f"choosing {rest.split(' ')[0]}", len(chosen), 0)
             elif line.startswith("Installing collected packages"):
                 unpacking.set()
         watcher.join()

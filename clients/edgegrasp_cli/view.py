@@ -43,7 +43,8 @@ def view(
                 shutil.copy(each, folder)
             (Path(folder) / "samples.json").write_text(json.dumps([sample]))
             flags = ["--samples", folder]
-        with Console(stderr=True).status("Loading weights…") as status, local_server(*flags) as own:
+        starting = "Starting a server; the first one compiles for a minute…"
+        with Console(stderr=True).status(starting) as status, local_server(*flags) as own:
             status.stop()
             print(f"{own.http_url}/playground/ (Ctrl-C ends it)", flush=True)
             if browser:
