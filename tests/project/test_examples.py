@@ -143,7 +143,7 @@ def test_training_on_your_objects(tmp_path: Path) -> None:
         folder.mkdir(parents=True)
         (folder / "block.obj").write_text(block)
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    words = (tmp_path / "objects", tmp_path / "out", 2, 2)
+    words = (tmp_path / "objects", tmp_path / "out", 1, 1)
     environment = os.environ | {"PATH": programs}
     done = run("bash", EXAMPLES / "08_train_on_your_objects.sh", *words, env=environment)
     assert done.returncode == 0, done.stderr
