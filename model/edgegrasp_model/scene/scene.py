@@ -281,7 +281,7 @@ def _numbers(
     )
     said += "cut off by the image, or not on the plane)"
     if (number >= 0).any():
-        said += ": what is over it and not shaped like a box is taken for things"
+        said += ": what the image cuts off is taken for things"
     warnings.append(f"{said}. Send objects: off to look for grasps on all that is over it.")
     return number
 

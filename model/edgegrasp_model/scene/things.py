@@ -31,6 +31,8 @@ FIXED, UNKNOWN = -1, -2  # in place of a thing's number: furniture; what may bel
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
 AROUND = 3  # sides of a workspace beyond which a cluster goes on where its inside is a box's
 BOX_SHARE = 0.75  # of points on the sides and the top of a box
+HEAP_HEIGHT = 0.25  # of the greatest length of a heap
+DEEP = 0.05  # share of what lies in an open box that is no part of its walls
 MIN_BOX = 0.25  # metres, longest side of the smallest open box that is told from a thing
 
 JUMP = 0.015  # share of the distance between neighbouring pixels that parts them
@@ -43,7 +45,8 @@ FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
 WALL = 0.02  # metres inside the outline that belong to a wall
-HOLLOW = 0.03  # metres that the inside is seen below the rim
+HOLLOW = 0.02  # metres that the inside is seen below the rim
+SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
 FLOOR, MIN_FLOOR = 0.012, 0.15  # metres over a box's floor; share of the inside at its level
 
 
@@ -74,15 +77,16 @@ def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.flo
 def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bool = True) -> Int64:
     """The things that stand on a plane: clusters above it that are no furniture.
 
-    A thing lies over the seen part of the plane, is not longer than `max_size` and is not cut
-    off by the image's border; or it lies in the caller's workspace. Of an open box, and of what
-    goes on around the workspace, the inside is one thing or several, however large.
+    A thing lies over the seen part of the plane, is not longer than `max_size`, or is a heap of
+    things that is at most twice as long, and is not cut off by the image's border; or it lies in
+    the caller's workspace. Of an open box, and of what goes on around the workspace, the inside is
+    one thing or several, however large.
 
     Args:
         view: M points.
         max_size: Longest side of a thing, metres.
         cell: Metres between points that still hang together.
-        strict: Otherwise all that is not shaped like a box is a thing.
+        strict: Otherwise things may be cut off.
 
     Returns:
         (M,) number of each point's thing, from 0; FIXED: of furniture; UNKNOWN: of neither.
@@ -99,19 +103,25 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
         if view.beyond is not None and (view.beyond[mine] == 0).mean() > SURE:
             number[mine], found = found, found + 1
             continue
-        contents: tuple[Bools, Bools] | None = None
+        contents: Contents | None = None
         if np.count_nonzero(sides) >= AROUND and view.beyond is not None:
-            contents = view.beyond[mine] == 0, view.beyond[mine] != 0
+            inside = view.beyond[mine] == 0
+            contents = Contents(inside, ~inside, inside)
         elif length > MIN_BOX:
             contents = box_contents(view.plan[mine], view.height[mine])
         if contents is not None:
-            inside, walls = contents
-            number[mine[walls]], mine = FIXED, mine[inside]
+            number[mine[contents.walls]] = FIXED
+            deep, mine = contents.deep[contents.inside], mine[contents.inside]
             for part in clusters(view.plan[mine], view.height[mine]):
-                number[mine[part]], found = found, found + 1
+                if deep[part].mean() < DEEP:
+                    number[mine[part]] = FIXED
+                else:
+                    number[mine[part]], found = found, found + 1
         elif (
-            length <= max_size and _whole(mine, view) and _over(outline, view.plan[some])
-        ) or not (strict or _like_a_box(view.plan[some], view.height[some])):
+            _over(outline, view.plan[some])
+            and (_whole(mine, view) or not strict)
+            and (length <= max_size or _is_heap(view.plan[some], view.height[some], 2 * max_size))
+        ):
             number[mine], found = found, found + 1
         else:
             number[mine] = FIXED
@@ -191,33 +201,45 @@ def support_outline(plan: Float64) -> Float64 | None:
         return None
 
 
-def box_contents(plan: Float64, height: NDArray[np.floating]) -> tuple[Bools, Bools] | None:
-    """Which points (M,) lie inside an open box, and which are its walls; None where it is none.
+class Contents(NamedTuple):
+    """Of M points of an open box. Those on its floor are neither inside nor walls."""
+
+    inside: Bools  # (M,)
+    walls: Bools  # (M,)
+    deep: Bools  # (M,) further in than noise takes a wall's points
+
+
+def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None:
+    """What lies in an open box of points (M, 2), (M,); None where it is none.
 
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
-    is lower inside. The points on its floor are neither.
+    is lower inside.
     """
-    axes, low, size = smallest_rectangle(plan)
-    place = plan @ axes.T - low
-    if size.min() < MIN_WIDTH:
+    from_side, levels = _rims(plan, height, plan)
+    if len(levels) < 3:
         return None
-    from_side = [place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]]
-    rims = []
-    for side, distance in enumerate(from_side):
-        at = distance < STRIP
-        along = 1 - side // 2
-        rims.append(_rim(place[at, along], height[at], float(size[along])))
-    levels = [rim for rim in rims if rim is not None]
-    inside: Bools = np.min(from_side, axis=0) > WALL
-    walls = ~inside
+    # Stray points beside the walls lie lower than the rim: again, around the rim alone.
+    level = np.median(levels)
+    rim = (np.abs(height - level) < LEVEL) & (from_side.min(axis=0) < 2 * STRIP)
+    from_side, levels = _rims(plan, height, plan[rim])
+    inside: Bools = from_side.min(axis=0) > WALL
+    walls, deep = ~inside, from_side.min(axis=0) > 2 * WALL
     if len(levels) < 3 or inside.sum() < MIN_POINTS:
         return None
-    if np.percentile(height[inside], 5) > np.median(levels) - HOLLOW:
+    if np.percentile(height[inside], 5) > level - HOLLOW:
         return None
     lowest = np.percentile(height[inside], 3)
     if (np.abs(height[inside] - lowest) < FLOOR).mean() > MIN_FLOOR:
         inside &= height > lowest + FLOOR
-    return inside, walls
+    return Contents(inside, walls, deep)
+
+
+def _dense(plan: Float64) -> Bools:
+    """Which points (M, 2) have about as many around them as the others."""
+    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    number = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    count = np.bincount(number)
+    return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
 
 
 def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
@@ -237,6 +259,24 @@ def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
     return axes[best], turned[best].min(axis=0), size[best]
 
 
+def _rims(
+    plan: Float64, height: NDArray[np.floating], around: Float64
+) -> tuple[Float64, list[float]]:
+    """Distance (4, M) of points (M, 2) from the sides of the smallest rectangle around some.
+
+    And the heights of the level rims along those sides; none of a small rectangle.
+    """
+    axes, low, size = smallest_rectangle(around[_dense(around)])
+    place = plan @ axes.T - low
+    from_side = np.stack([place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]])
+    levels = []
+    for side, distance in enumerate(from_side if size.min() > MIN_WIDTH else from_side[:0]):
+        at = distance < STRIP
+        along = 1 - side // 2
+        levels.append(_rim(place[at, along], height[at], float(size[along])))
+    return from_side, [level for level in levels if level is not None]
+
+
 def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
     """The height of a level rim along a side; None where there is none."""
     steps = max(int(np.ceil(length / STEP)), 1)
@@ -249,13 +289,17 @@ def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float |
     return level if (np.abs(top - level) < LEVEL).mean() > FILLED else None
 
 
-def _like_a_box(plan: Float64, height: NDArray[np.floating]) -> bool:
-    """Whether points (M, 2), (M,) are mostly sides of a rectangle, and a level top."""
+def _is_heap(plan: Float64, height: NDArray[np.floating], most: float) -> bool:
+    """Whether points (M, 2), (M,) are not longer than `most`, metres, lower, and no box.
+
+    Of a box, most points are on the sides of a rectangle, and on a level top.
+    """
     axes, low, size = smallest_rectangle(plan)
     place = plan @ axes.T - low
     side = np.minimum(place, size - place).min(axis=1) < STRIP
     level = np.abs(height - np.percentile(height, 90)) < LEVEL
-    return bool((side | level).mean() > BOX_SHARE)
+    flat = size.max() <= most and np.ptp(height) <= HEAP_HEIGHT * most
+    return bool(flat and (side | level).mean() < BOX_SHARE)
 
 
 def _length(plan: Float64, height: NDArray[np.floating]) -> float:
