@@ -6,7 +6,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-GENERATED := $(wildcard proto/edgegrasp/v1/*_pb2*) proto/edgegrasp/v1/contract.json \
+GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
 	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
 .DEFAULT_GOAL := help

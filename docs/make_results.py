@@ -31,6 +31,7 @@ DOCS = Path(__file__).parent
 PAGE = DOCS / "results.md"
 KEPT_CURVE_POINTS = 40
 SCENES = ("packed", "pile")
+CAMERA_SCENES = ("bin", "table")  # by protocols of the same name
 # Experiment: methods whose published figures stand beside it.
 EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "baselines": ("Edge-Sample",),
@@ -81,7 +82,7 @@ def blocks(kept: Path) -> dict[str, str]:
     records = _read(kept / "benchmarks.json").values()
     written = {
         scene: _benchmark_table([r for r in records if r["scene"] == scene], scene)
-        for scene in SCENES
+        for scene in SCENES + CAMERA_SCENES
     }
     written["commands"] = _console(sorted({command_of(record) for record in records}))
     for name, methods in EXPERIMENTS.items():

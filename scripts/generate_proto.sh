@@ -10,8 +10,9 @@ out=${1:-$root}
 PATH=$(dirname "$python"):$PATH # protoc looks there for the mypy plugins
 mkdir -p "$out/proto"
 "$python" "$root/scripts/generate_options.py" "$out"
-"$python" -m grpc_tools.protoc --proto_path="$out/proto" --python_out="$out/proto" \
+"$python" -m grpc_tools.protoc --proto_path="$out/proto" --proto_path="$root/proto" --python_out="$out/proto" \
     --grpc_python_out="$out/proto" --mypy_out="quiet:$out/proto" \
-    --mypy_grpc_out="quiet:$out/proto" "$out"/proto/edgegrasp/v1/*.proto
+    --mypy_grpc_out="quiet:$out/proto" "$out"/proto/edgegrasp/v1/*.proto \
+    "$root"/proto/edgegrasp/oip/*.proto
 "$python" "$root/scripts/contract.py" "$out/proto"
 "$python" "$root/scripts/openapi.py" "$out/proto"

@@ -89,7 +89,9 @@ def detect(
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
     if mask is not None:
-        fields |= _on_mask(fields, _pixels(mask))
+        from edgegrasp_client import on_mask
+
+        fields = dict(on_mask(_pixels(mask), fields))
     waiting = Console(stderr=True).status("Looking for grasps…")
     with waiting, open_client(server, timeout, connection, weights, grippers, device) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
@@ -295,17 +297,6 @@ def _pixels(file: Path) -> NDArray[Any]:
     from edgegrasp_service.worker.request_cloud import File, decode_array
 
     return decode_array(str(file), File(file.suffix[1:].lower(), file.read_bytes()), sys.maxsize)
-
-
-def _on_mask(options: Mapping[str, Any], mask: NDArray[Any]) -> dict[str, Any]:
-    """The regions of the options, without what lies where the mask is 0 in every channel."""
-    kept = mask[..., :3].any(axis=2) if mask.ndim == 3 else mask != 0
-    outside = {"kind": "mask", "mask": ~kept}
-    regions = {}
-    for name in ("approach_region", "contact_region"):
-        region = options.get(name) or {}
-        regions[name] = region | {"exclude": [*region.get("exclude", ()), outside]}
-    return regions
 
 
 def _print_detection(detection: Any) -> None:

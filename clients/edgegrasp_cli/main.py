@@ -18,6 +18,8 @@ COMMANDS = {
     "detect": ("detect", "service", "Find grasps in a cloud or a depth image."),
     "view": ("view", "service", "Look at a scene and its grasps in the browser."),
     "models": ("detect", "service", "List the weights that can be used."),
+    "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),
+    "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
     "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
     "experiment": ("experiment", "train", "Run benchmarks that differ in one thing each."),

@@ -57,7 +57,9 @@ def generate_data(
 
 
 def train(
-    data: Annotated[list[Path], typer.Argument(help="Folders of views from generate-data.")],
+    data: Annotated[
+        list[Path] | None, typer.Argument(help="Folders of views from generate-data.")
+    ] = None,
     model: Annotated[
         str, Option(help="edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp.")
     ] = "edgegrasp-plus",
@@ -89,6 +91,10 @@ def train(
         Path | None,
         Option(help="Weights to start from, of the same model; use a lower --learning-rate."),
     ] = None,
+    outcomes: Annotated[
+        Path | None,
+        Option(help="File of a server's /v1/outcomes: recalibrate --start-from on it, no more."),
+    ] = None,
     keep: Annotated[
         float, Option(help="Share of the weights of --start-from in the result.", min=0.0, max=1.0)
     ] = 0.0,
@@ -119,11 +125,19 @@ def train(
     """
     from rich.progress import Progress
 
+    from edgegrasp_training.outcomes import recalibrate
     from edgegrasp_training.recipes import recipe
     from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer, TrainingOptions
     from edgegrasp_training.views import find_views, part_of, split_by_scene
 
+    if outcomes is not None:
+        if start_from is None or data:
+            raise ValueError("--outcomes: name the weights that scored by --start-from, no data.")
+        print(recalibrate(start_from, outcomes, run))
+        return
+    if not data:
+        raise ValueError("data: got nothing. Name folders of views, or --outcomes.")
     options = TrainingOptions(
         steps=steps,
         views_per_step=views_per_step,

@@ -54,6 +54,7 @@ from edgegrasp_client.results import (
     Scoring,
     StreamAnswer,
 )
+from edgegrasp_client.targets import object_in_scene, on_mask
 
 __all__ = [
     "AccessDeniedError",
@@ -100,4 +101,6 @@ __all__ = [
     "Tls",
     "UnknownModelError",
     "Workspace",
+    "object_in_scene",
+    "on_mask",
 ]

@@ -2,7 +2,7 @@
 
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
 - `moveit_msgs/Grasp`, as a dictionary of its fields.
-- `isaac_grasp` YAML, the file format of Isaac Sim's Grasp Editor, version 1.0; needs the extra
+- `isaac_grasp` YAML 1.0, as Isaac Sim's Grasp Editor and as Isaac ROS have it; needs the extra
   `yaml`.
 
 Pictures of the frames stand in docs/frames.md.
@@ -11,7 +11,7 @@ Pictures of the frames stand in docs/frames.md.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,12 +120,18 @@ PANDA_JOINTS = FingerJoints(
 )
 """The Panda's two finger joints: metres from the middle, each half the opening."""
 
+PANDA_LINK8: Float64 = np.eye(4)
+"""T_hand_link of the link that carries the Panda hand in MoveIt's configuration, `panda_link8`."""
+PANDA_LINK8[:2, :2] = np.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]])  # 45 degrees about z
+PANDA_LINK8.setflags(write=False)
+
 
 def moveit_grasp(
     grasp: Grasp,
     frame_id: str,
     *,
     name: str = "",
+    stamp: Message | None = None,
     joints: FingerJoints = PANDA_JOINTS,
     T_hand_link: ArrayLike | None = None,
     approach_distance: float = 0.05,
@@ -140,9 +146,11 @@ def moveit_grasp(
         grasp: What the server answered.
         frame_id: Name of the cloud's frame.
         name: The message's `id`.
+        stamp: When the cloud was taken, `sec` and `nanosec`: a frame that moves with the hand is
+            somewhere else later; None: 0, which is the latest.
         joints: The gripper's joints.
         T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
-            MoveIt wants; None: it is the hand frame.
+            MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
         approach_distance: Metres of straight way in.
         retreat_distance: Metres of straight way out.
         retreat_direction: (3,) way out, cloud frame; None: back along the approach.
@@ -153,18 +161,19 @@ def moveit_grasp(
     approach = np.asarray(grasp.approach_direction, dtype=np.float64)
     retreat = -approach if retreat_direction is None else np.asarray(retreat_direction, np.float64)
     T_cloud_link = _matrix(grasp.T_cloud_hand) @ _matrix(T_hand_link)
+    header = {"stamp": stamp or {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     return {
         "id": name,
-        "pre_grasp_posture": _posture(joints, grasp.width, frame_id),
-        "grasp_posture": _posture(joints, 0.0, frame_id),
+        "pre_grasp_posture": _posture(joints, grasp.width, header),
+        "grasp_posture": _posture(joints, 0.0, header),
         "grasp_pose": {
-            "header": _header(frame_id),
+            "header": header,
             "pose": _pose(T_cloud_link),
         },
         "grasp_quality": float(grasp.score),
-        "pre_grasp_approach": _translation(approach, approach_distance, frame_id),
-        "post_grasp_retreat": _translation(retreat, retreat_distance, frame_id),
-        "post_place_retreat": _translation(-approach, retreat_distance, frame_id),
+        "pre_grasp_approach": _translation(approach, approach_distance, header),
+        "post_grasp_retreat": _translation(retreat, retreat_distance, header),
+        "post_place_retreat": _translation(-approach, retreat_distance, header),
         "max_contact_force": 0.0,
         "allowed_touch_objects": [],
     }
@@ -208,6 +217,7 @@ def isaac_grasps(
     T_object_cloud: ArrayLike | None = None,
     T_hand_gripper: ArrayLike | None = None,
     joints: FingerJoints = PANDA_JOINTS,
+    dialect: Literal["isaac-sim", "isaac-ros"] = "isaac-sim",
 ) -> str:
     """Grasps as the text of an `isaac_grasp` file.
 
@@ -218,6 +228,8 @@ def isaac_grasps(
         T_object_cloud: (4, 4) pose of the cloud's frame in the object's; None: they are the same.
         T_hand_gripper: (4, 4) pose of the gripper's frame in our hand frame; None: the same.
         joints: The gripper's joints.
+        dialect: What the frames are called: `object_frame_link` and `gripper_frame_link` in Isaac
+            Sim, `object_frame` and `gripper_frame` in Isaac ROS.
 
     Returns:
         YAML; orientations are w and xyz.
@@ -227,11 +239,12 @@ def isaac_grasps(
     """
     T_object_cloud = _matrix(T_object_cloud)
     T_hand_gripper = _matrix(T_hand_gripper)
+    link = {"isaac-sim": "_link", "isaac-ros": ""}[dialect]
     file = {
         "format": "isaac_grasp",
         "format_version": 1.0,
-        "object_frame_link": object_frame,
-        "gripper_frame_link": gripper_frame,
+        f"object_frame{link}": object_frame,
+        f"gripper_frame{link}": gripper_frame,
         "grasps": {
             f"grasp_{number}": _isaac_fields(
                 grasp, T_object_cloud @ _matrix(grasp.T_cloud_hand) @ T_hand_gripper, joints
@@ -243,7 +256,7 @@ def isaac_grasps(
 
 
 def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
-    """The grasps of an `isaac_grasp` file.
+    """The grasps of an `isaac_grasp` file of either dialect.
 
     Raises:
         ModuleNotFoundError: The extra `yaml` is not installed.
@@ -322,10 +335,6 @@ def _matrix(pose: ArrayLike | None) -> Float64:
     return np.eye(4) if pose is None else np.asarray(pose, dtype=np.float64)
 
 
-def _header(frame_id: str) -> Message:
-    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
-
-
 def _pose(T: Float64) -> Message:
     return {
         "position": _xyz(T[:3, 3]),
@@ -333,7 +342,7 @@ def _pose(T: Float64) -> Message:
     }
 
 
-def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
+def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
     point = {
         "positions": list(joints.at(opening).values()),
         "velocities": [],
@@ -342,16 +351,16 @@ def _posture(joints: FingerJoints, opening: float, frame_id: str) -> Message:
         "time_from_start": {"sec": 0, "nanosec": 0},
     }
     return {
-        "header": _header(frame_id),
+        "header": header,
         "joint_names": list(joints.names),
         "points": [point],
     }
 
 
-def _translation(direction: Float64, distance: float, frame_id: str) -> Message:
+def _translation(direction: Float64, distance: float, header: Message) -> Message:
     unit = direction / np.linalg.norm(direction)
     return {
-        "direction": {"header": _header(frame_id), "vector": _xyz(unit)},
+        "direction": {"header": header, "vector": _xyz(unit)},
         "desired_distance": float(distance),
         "min_distance": float(distance),
     }

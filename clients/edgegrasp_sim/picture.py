@@ -254,7 +254,7 @@ def draw_grasps(
     """Write a picture of a cloud and of grasps in it, as `Picture.save` does.
 
     Args:
-        path: where to.
+        path: `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
         cloud: (N, 3) metres.
         grasps: best first.
         camera_position: (3,) metres, cloud frame; the picture looks from there.

@@ -71,6 +71,9 @@ class Settings(BaseModel):
     min_bytes_per_second: Count = Field(50_000, description="slowest that bodies and answers go")
     record_folder: Path | None = Field(None, description="folder to record requests and answers in")
     record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
+    outcomes_file: Path | None = Field(
+        None, description="file that /v1/outcomes appends to, up to 64 MiB; none: no such path"
+    )
     max_header_bytes: int = Field(
         32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )

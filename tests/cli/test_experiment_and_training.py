@@ -36,6 +36,13 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data, run, tmp_p
     assert metadata.network == replace(recipe("edgegrasp-plus").network, crop_radius=0.06)
     assert (tmp_path / "edgegrasp-plus.md").is_file()
 
+    tried = {"digest": metadata.digest, "score": 0.9, "held": False}
+    outcomes = tmp_path / "outcomes.jsonl"
+    outcomes.write_text(json.dumps(tried) + "\n")
+    robot = ("--outcomes", outcomes, "--start-from", weights, "--run", tmp_path / "robot")
+    assert "1 outcomes, 0.00 held" in run("train", *robot)
+    assert (tmp_path / "robot" / "edgegrasp-plus-robot.safetensors").is_file()
+
     result = tmp_path / "result"
     own = ("--weights", weights, "--model", "edgegrasp-plus", "--num-candidates", 200)
     output = run("benchmark", *ONE_ROUND, *own, "--no-report", "--output", result)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_client import Grasp
 from edgegrasp_client.conversions import (
     CONTACT_GRASPNET,
+    PANDA_LINK8,
     VGN,
     FingerJoints,
     HandFrame,
@@ -127,6 +128,13 @@ def test_moveit_grasps_round_trip(pose: np.ndarray, T_hand_link: np.ndarray) -> 
     )
 
 
+def test_the_pandas_parent_link_is_turned_by_45_degrees_at_the_same_place() -> None:
+    """franka_description mounts panda_hand on panda_link8 with rpy="0 0 -pi/4"."""
+    T_link_hand = np.eye(4)
+    T_link_hand[:3, :3] = Rotation.from_euler("z", -np.pi / 4).as_matrix()
+    np.testing.assert_allclose(PANDA_LINK8 @ T_link_hand, np.eye(4), atol=1e-12)
+
+
 def test_a_moveit_grasp_is_laid_out_as_the_message() -> None:
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "table"}
 
@@ -210,6 +218,14 @@ def test_an_isaac_file_says_what_the_format_asks_for() -> None:
         "    cspace_position: {panda_finger_joint1: 0.0, panda_finger_joint2: 0.0}\n"
         "    pregrasp_cspace_position: {panda_finger_joint1: 0.03, panda_finger_joint2: 0.03}\n"
     )
+
+
+def test_isaac_ros_calls_the_frames_otherwise() -> None:
+    names = {"object_frame": "mug", "gripper_frame": "hand"}
+    text = isaac_grasps([grasp(UP)], **names, dialect="isaac-ros")
+    assert "\nobject_frame: mug\ngripper_frame: hand\ngrasps:\n" in text
+    (read,) = read_isaac_grasps(text)
+    np.testing.assert_allclose(read.T_object_gripper, UP, atol=1e-6)
 
 
 def test_isaac_files_say_which_extra_they_need(monkeypatch: pytest.MonkeyPatch) -> None:

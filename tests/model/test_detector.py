@@ -55,7 +55,7 @@ def test_no_grasp_is_an_answer_that_says_why() -> None:
     assert any("0 points are left beside the support" in warning for warning in nothing.warnings)
 
     apart = [[0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1], [0.1, 0.1, 0.2]]
-    alone = detect(np.float32(apart), num_approach_points=5)
+    alone = detect(np.float32(apart), num_approach_points=5, objects="off")
     assert alone.grasps == []
     assert alone.counts["kept"] == 5
     assert alone.counts["pairs"] == alone.counts["approach_points"]  # each alone in its ball

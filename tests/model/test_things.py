@@ -84,14 +84,15 @@ def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> N
 
 
 @pytest.mark.parametrize("polar", [0.05, 0.4])
-def test_a_bin_has_contents_and_no_rims(polar: float) -> None:
+@pytest.mark.parametrize("height", [0.045, 0.12])
+def test_a_bin_has_contents_and_no_rims(polar: float, height: float) -> None:
     rng = np.random.default_rng(3)
     contents = [
         box((*rng.uniform([-0.12, -0.07], [0.12, 0.07]), 0.03), (0.02, 0.045, 0.025), yaw)
         for yaw in rng.uniform(0, 3, 4)
     ]
     T_world_camera = camera(polar, -1.5, 0.8)
-    cloud = render([table(), *bin_walls(0.45, 0.32, 0.12), *contents], T_world_camera)
+    cloud = render([table(), *bin_walls(0.45, 0.32, height), *contents], T_world_camera)
     found = detect(cloud)
     assert found.grasps
     for grasp in found.grasps:
@@ -174,6 +175,37 @@ def test_an_empty_table_is_a_support_with_nothing_on_it() -> None:
     found = detect(render([table()], camera(0.6, -1.5, 0.7)))
     assert found.support is not None
     assert (found.grasps, found.objects) == ([], [])
+
+
+def test_a_table_with_nothing_but_furniture_on_it_has_no_grasps() -> None:
+    cloud = render([table(), *FURNITURE["monitor"], *FURNITURE["floor"]], camera(0.7, -1.5, 0.8))
+    found = detect(cloud)
+    assert found.support is not None
+    assert (found.grasps, found.objects) == ([], [])
+    assert any("looks like a thing" in warning for warning in found.warnings)
+
+
+def test_things_that_touch_are_grasped_however_long_the_heap_is() -> None:
+    rng = np.random.default_rng(2)
+    heap = [
+        box((x, rng.uniform(-0.03, 0.03), half), (0.035, rng.uniform(0.02, 0.035), half), 0.0)
+        for x, half in zip(np.arange(-0.28, 0.29, 0.07), rng.uniform(0.02, 0.05, 9), strict=True)
+    ]
+    T_world_camera = camera(0.6, -1.5, 0.8)
+    found = detect(render([table(), *heap], T_world_camera))
+    assert len(found.objects) == 1
+    assert found.grasps
+
+
+def test_no_hand_closes_on_a_wall_beside_a_thing() -> None:
+    walls = bin_walls(0.4, 0.3, 0.06)
+    leaning = box((-0.173, 0.0, 0.025), (0.02, 0.03, 0.025))  # 2 mm beside a wall
+    T_world_camera = camera(0.1, -1.5, 0.7)
+    found = detect(render([table(), *walls, leaning], T_world_camera), top_k=100)
+    for grasp in found.grasps:
+        # The hand closes along the wall, not across it.
+        closing = T_world_camera[:3, :3] @ grasp.T_cloud_hand[:3, 1]
+        assert abs(closing[0]) < 0.5
 
 
 def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> None:

@@ -55,6 +55,7 @@ SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 WALL = 0.008  # metres, at least, inside a side of the workspace where a wall at it is seen
+BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 ON = 10_000  # points of the support, at least, that tell its outline
 
 
@@ -117,7 +118,9 @@ def select_points(
         number = np.where(inside, _given_numbers(sent), UNKNOWN)
         return SelectedPoints(sent, number, None, up, viewpoints)
     height, margin, thick = support.heights(seen)
-    on, above = np.flatnonzero(np.abs(height) < thick), np.flatnonzero(height > margin)
+    # Where the cloud was cut off above the support, what is near it does not tell its outline.
+    near = (np.abs(height) < thick) & math.isfinite(support.spread)
+    on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
     on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
@@ -220,7 +223,10 @@ def choose_support(
         return None
     up = None if options.up is None else np.asarray(options.up, dtype=np.float64)
     if isinstance(request, SupportPlane):
-        found: Support | None = measured(seen, request)
+        # A bin's floor is not measured by the table around it.
+        around = BELOW_WORKSPACE * np.abs(request.normal)
+        over = inside_workspace(seen.points, options.workspace, around)
+        found: Support | None = measured(seen.take(np.flatnonzero(over)), request)
     else:
         where = seen.take(np.flatnonzero(inside)) if isinstance(request, RansacPlane) else seen
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
@@ -276,9 +282,7 @@ def _numbers(
             break
     if strict:
         return number
-    said = (
-        "nothing over the support plane looks like a thing (longer than max_object_size, cut off "
-    )
+    said = "nothing over the support plane looks like a thing (longer than max_object_size, "
     said += "cut off by the image, or not on the plane)"
     if (number >= 0).any():
         said += ": what the image cuts off is taken for things"
@@ -375,7 +379,9 @@ def single_viewpoint(
     return frame.points(viewpoints[0]).astype(np.float32)
 
 
-def inside_workspace(points: Float32, box: Workspace | None, around: float = 0.0) -> Bools:
+def inside_workspace(
+    points: Float32, box: Workspace | None, around: NDArray[np.floating] | float = 0.0
+) -> Bools:
     """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
     if box is None:
         return np.ones(len(points), dtype=bool)

@@ -38,6 +38,7 @@ TIMEOUT = "X-Request-Timeout"
 METHODS = {
     "/v1/grasps": "DetectGrasps",
     "/v1/grasps:score": "ScoreGrasps",
+    "/v1/outcomes": "RecordOutcome",
     "/v1/models": "ListModels",
     "/v1/models:reload": "ReloadModels",
     "/health/live": "Live",
@@ -135,6 +136,12 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
     @app.post("/v1/grasps:score")
     async def score_grasps() -> Response:
         return _GraspResponse(service, "ScoreGrasps")
+
+    if service.settings.outcomes_file is not None:
+
+        @app.post("/v1/outcomes")
+        async def record_outcome() -> Response:
+            return _GraspResponse(service, "RecordOutcome")
 
     @app.get("/v1/models")
     async def list_models() -> Response:

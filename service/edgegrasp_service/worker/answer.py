@@ -19,7 +19,7 @@ from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, report
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import http_bodies, messages
+from edgegrasp_service.worker import http_bodies, messages, outcomes
 from edgegrasp_service.worker.job import Answer, Facts, Job
 from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
@@ -77,11 +77,13 @@ class _Work:
         self._job = job
         self._encoding: Any = messages if job.transport == "grpc" else http_bodies
         self._catalogue = catalogue
-        self._max_points = settings.max_points
+        self._settings = settings
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
         """The body of the answer; raises any error that there may be."""
+        if self._job.method == "RecordOutcome":
+            return outcomes.append(self._job, self._catalogue, self._settings.outcomes_file)
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
@@ -115,9 +117,9 @@ class _Work:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
-        detector = self._catalogue.get(options.model)
-        given = {} if self._job.method == "DetectGrasps" else _given(fields, self._max_points)
-        cloud, options = decode_cloud(fields, options, self._max_points)
+        detector, most = self._catalogue.get(options.model), self._settings.max_points
+        given = {} if self._job.method == "DetectGrasps" else _given(fields, most)
+        cloud, options = decode_cloud(fields, options, most)
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given

@@ -251,7 +251,7 @@ class DepthImage(CameraView):
 CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one image
 
 
-def _parse(schema: type[Schema], fields: object, name: str) -> Schema:
+def parse(schema: type[Schema], fields: object, name: str) -> Schema:
     """Check plain values against a schema; raises InvalidRequest that names the field."""
     try:
         return schema.model_validate(fields)
@@ -283,7 +283,7 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
         InvalidRequest: A field is missing, unknown or wrong, or they contradict each other.
         PayloadTooLarge: More than `max_points` points.
     """
-    layout = _parse(PointCloud2, fields, "point_cloud2")
+    layout = parse(PointCloud2, fields, "point_cloud2")
     if layout.height * layout.width > max_points:
         raise too_many(layout.height * layout.width, max_points, "point_cloud2")
     record = _record(layout)
@@ -343,7 +343,7 @@ def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list
     if not isinstance(images, list) or not 1 <= len(images) <= MAX_VIEWS:
         count = f"{len(images)} images" if isinstance(images, list) else brief(images)
         raise InvalidRequest("depth_images", count, f"Send a list of 1 to {MAX_VIEWS} images.")
-    views = [_parse(DepthImage, image, f"depth_images.{row}") for row, image in enumerate(images)]
+    views = [parse(DepthImage, image, f"depth_images.{row}") for row, image in enumerate(images)]
     depths: list[Array] = []
     for row, view in enumerate(views):
         depths.append(_depth(view.depth, max_points, f"depth_images.{row}.depth"))
@@ -359,7 +359,7 @@ def _depth(depth: object, max_points: int, field: str) -> Array:
     if isinstance(depth, list):
         rows: Array = _numbers(field, [depth], holes=True)[0]
         return rows.astype(np.float64)
-    image = _parse(Depth, depth, field)
+    image = parse(Depth, depth, field)
     if image.encoding == "png":
         return read_png(image.data, max_points, f"{field}.data")
     dtype = np.dtype(DEPTH_ENCODINGS[image.encoding])

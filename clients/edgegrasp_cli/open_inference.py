@@ -1,0 +1,379 @@
+"""`edgegrasp open-inference`: the Open Inference Protocol v2 in front of a grasp server.
+
+A client of the server, in a process of its own: it gives the bytes of tensors their shape and
+sends them on. The server's workers are what reads them.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
+
+if TYPE_CHECKING:
+    import grpc
+    from starlette.applications import Starlette
+
+    from edgegrasp_client import GraspClient
+
+PLATFORM = "edgegrasp"
+VERSION = "1"  # of the tensors' names and meaning
+DTYPES = {"FP32": "<f4", "FP64": "<f8", "UINT16": "<u2", "INT32": "<i4"}
+CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
+INPUTS = {"points": ("FP32", [-1, 3]), "depth": ("FP32", [-1, -1]), "intrinsics": ("FP32", [4])}
+OUTPUTS = {
+    "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, as all of them
+    "score": ("FP32", [-1]),
+    "width": ("FP32", [-1]),  # metres
+    "object": ("INT32", [-1]),  # -1: of none
+}
+NOT_OPTIONS = {"binary_data_output"}  # parameters that tell the server how to write
+PARALLEL_CALLS = 32
+
+Tensors = dict[str, NDArray[Any]]
+Option = typer.Option
+
+
+@takes_flags(connection=CONNECTION)
+def open_inference(
+    server: Annotated[
+        str, Option(help="The grasp server: host:port (gRPC) or http://host:port.")
+    ] = "127.0.0.1:50051",
+    timeout: Timeout = 60.0,
+    host: Annotated[str, Option(help="Address to listen at.")] = "127.0.0.1",
+    http_port: Annotated[int, Option(help="Port of REST.")] = 8080,
+    grpc_port: Annotated[int, Option(help="Port of gRPC.")] = 8081,
+    name: Annotated[
+        str, Option(help="Model that stands for the server's default weights.")
+    ] = "default",
+    max_body_bytes: Annotated[int, Option(help="Largest request accepted.")] = 33_554_432,
+    *,
+    connection: dict[str, Any],
+) -> None:
+    """Answer the Open Inference Protocol v2 (KServe, Triton's clients) for a grasp server.
+
+    It asks for no token: let the gateway in front of it do that.
+    """
+    import uvicorn
+
+    with connect(server, timeout, **connection) as client:
+        models = Models(client, name, timeout)
+        with grpc_server(models, f"{host}:{grpc_port}", max_body_bytes):
+            app = http_app(models, max_body_bytes)
+            uvicorn.run(app, host=host, port=http_port, log_level="warning")
+
+
+class RefusedError(Exception):
+    """The answer to a request that cannot be served: a gRPC code's name, an HTTP status, why."""
+
+    def __init__(self, code: str, status: int, why: str) -> None:
+        super().__init__(why)
+        self.code, self.status = code, status
+
+
+class Answer(NamedTuple):
+    """What a model makes of tensors."""
+
+    outputs: Tensors  # in the order of OUTPUTS
+    parameters: dict[str, str]
+
+
+class Models:
+    """The weights of a grasp server as models of the protocol; raises RefusedError.
+
+    Args:
+        client: Of the server.
+        default: Name of the server's default weights, beside their own.
+        timeout: Seconds for a request that names no deadline.
+    """
+
+    def __init__(self, client: "GraspClient", default: str, timeout: float) -> None:
+        self._client, self._default, self._timeout = client, default, timeout
+
+    def ready(self) -> bool:
+        """Whether the server answers requests."""
+        return self._client.ready(timeout=5.0)
+
+    def check(self, name: str) -> None:
+        """Refuse a name that no model has."""
+        with _refusing():
+            known = [self._default, *(model.name for model in self._client.models())]
+        if name not in known:
+            raise RefusedError(
+                "NOT_FOUND", 404, f"No model {name!r}. Use one of: {', '.join(known)}."
+            )
+
+    def infer(
+        self, name: str, inputs: Tensors, parameters: Mapping[str, Any], timeout: float | None
+    ) -> Answer:
+        """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options."""
+        from edgegrasp_client.requests import plain_options
+
+        asked = {key: _option(value) for key, value in parameters.items()}
+        options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
+        if name != self._default:
+            options["model"] = name
+        given = set(inputs)
+        if given == {"points"}:
+            cloud: dict[str, Any] = {"cloud": inputs["points"]}
+        elif given == {"depth", "intrinsics"}:
+            image = {"depth": inputs["depth"], "intrinsics": inputs["intrinsics"].ravel()}
+            cloud = {"depth_images": [image]}
+        else:
+            named = ", ".join(sorted(given)) or "nothing"
+            fix = "Send points, or depth and intrinsics."
+            raise RefusedError("INVALID_ARGUMENT", 400, f"inputs: got {named}. {fix}")
+        with _refusing():
+            plain_options(options)  # no other argument of the client
+            seconds = self._timeout if timeout is None else min(timeout, self._timeout)
+            found = self._client.detect(**cloud, **options, timeout=seconds)
+        grasps = found.grasps
+        poses = np.array([grasp.T_cloud_hand for grasp in grasps], "<f4").reshape(-1, 4, 4)
+        outputs = {
+            "T_cloud_hand": poses,
+            "score": np.array([grasp.score for grasp in grasps], "<f4"),
+            "width": np.array([grasp.width for grasp in grasps], "<f4"),
+            "object": np.array([-1 if g.object is None else g.object for g in grasps], "<i4"),
+        }
+        return Answer(outputs, {"model": found.model, "warnings": " ".join(found.warnings)})
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """Errors of the client as those of the protocol."""
+    from edgegrasp_client import errors
+
+    table = [  # the first that fits
+        (errors.UnknownModelError, "NOT_FOUND", 404),
+        (errors.PayloadTooLargeError, "RESOURCE_EXHAUSTED", 413),
+        (errors.InvalidRequestError, "INVALID_ARGUMENT", 400),
+        (errors.AccessDeniedError, "PERMISSION_DENIED", 403),
+        (errors.OverloadedError, "RESOURCE_EXHAUSTED", 429),
+        (errors.ServerUnavailableError, "UNAVAILABLE", 503),
+        (errors.DeadlineError, "DEADLINE_EXCEEDED", 504),
+        (errors.GraspClientError, "INTERNAL", 500),
+    ]
+    try:
+        yield
+    except errors.GraspClientError as error:
+        code, status = next(row[1:] for row in table if isinstance(error, row[0]))
+        raise RefusedError(code, status, str(error)) from error
+
+
+def _option(value: Any) -> Any:
+    """The value of a parameter; text that is JSON stands for what it says."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def tensor(name: str, datatype: str, shape: Any, data: Any) -> NDArray[Any]:
+    """A tensor of bytes, little-endian, or of nested or flat lists; raises RefusedError."""
+    try:
+        dtype = DTYPES[datatype]
+        raw = isinstance(data, bytes)
+        flat = np.frombuffer(data, dtype) if raw else np.asarray(data, dtype)
+        return flat.reshape([int(size) for size in shape])
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        why = f"a datatype {datatype}" if isinstance(error, KeyError) else str(error)
+        fix = f"Give {', '.join(DTYPES)}, as many values as the shape has."
+        raise RefusedError("INVALID_ARGUMENT", 400, f"inputs.{name}: got {why}. {fix}") from None
+
+
+def _metadata(name: str) -> dict[str, Any]:
+    def tensors(table: Mapping[str, tuple[str, list[int]]]) -> list[dict[str, Any]]:
+        return [{"name": n, "datatype": kind, "shape": shape} for n, (kind, shape) in table.items()]
+
+    described = {"name": name, "versions": [VERSION], "platform": PLATFORM}
+    return {**described, "inputs": tensors(INPUTS), "outputs": tensors(OUTPUTS)}
+
+
+@contextmanager
+def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[int]:
+    """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
+    import grpc
+
+    from edgegrasp.oip import open_inference_pb2 as messages
+    from edgegrasp.oip.open_inference_pb2_grpc import (
+        GRPCInferenceServiceServicer,
+        add_GRPCInferenceServiceServicer_to_server,
+    )
+
+    class Servicer(GRPCInferenceServiceServicer):
+        def ServerLive(self, request: Any, context: Any) -> Any:  # noqa: N802
+            return messages.ServerLiveResponse(live=True)
+
+        def ServerReady(self, request: Any, context: Any) -> Any:  # noqa: N802
+            return messages.ServerReadyResponse(ready=models.ready())
+
+        def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
+            _or_abort(context, lambda: models.check(request.name))
+            return messages.ModelReadyResponse(ready=True)
+
+        def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
+            return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
+
+        def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
+            _or_abort(context, lambda: models.check(request.name))
+            return messages.ModelMetadataResponse(**_metadata(request.name))
+
+        def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
+            def infer() -> Answer:
+                tensors, parameters = _grpc_inputs(request), _grpc_parameters(request.parameters)
+                seconds = context.time_remaining()
+                return models.infer(request.model_name, tensors, parameters, seconds)
+
+            answer = _or_abort(context, infer)
+            outputs = [
+                messages.ModelInferResponse.InferOutputTensor(
+                    name=name, datatype=OUTPUTS[name][0], shape=array.shape
+                )
+                for name, array in answer.outputs.items()
+            ]
+            return messages.ModelInferResponse(
+                model_name=request.model_name,
+                model_version=VERSION,
+                id=request.id,
+                parameters={
+                    name: messages.InferParameter(string_param=text)
+                    for name, text in answer.parameters.items()
+                },
+                outputs=outputs,
+                raw_output_contents=[array.tobytes() for array in answer.outputs.values()],
+            )
+
+    options = [("grpc.max_receive_message_length", max_body_bytes)]
+    server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
+    add_GRPCInferenceServiceServicer_to_server(Servicer(), server)
+    port = server.add_insecure_port(address)
+    server.start()
+    try:
+        yield port
+    finally:
+        server.stop(grace=5.0).wait()
+
+
+def _or_abort(context: "grpc.ServicerContext", call: Callable[[], Any]) -> Any:
+    import grpc
+
+    try:
+        return call()
+    except RefusedError as refused:
+        context.abort(grpc.StatusCode[refused.code], str(refused))
+
+
+def _grpc_inputs(request: Any) -> Tensors:
+    raw = list(request.raw_input_contents)
+    if raw and len(raw) != len(request.inputs):
+        why = f"raw_input_contents: got {len(raw)} for {len(request.inputs)} inputs. Give each one."
+        raise RefusedError("INVALID_ARGUMENT", 400, why)
+    tensors = {}
+    for number, each in enumerate(request.inputs):
+        field = CONTENTS.get(each.datatype, "fp32_contents")
+        data = raw[number] if raw else getattr(each.contents, field)
+        tensors[each.name] = tensor(each.name, each.datatype, each.shape, data)
+    return tensors
+
+
+def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    values = {}
+    for name, each in parameters.items():
+        kind = each.WhichOneof("parameter_choice")
+        values[name] = None if kind is None else getattr(each, kind)
+    return values
+
+
+def http_app(models: Models, max_body_bytes: int) -> "Starlette":
+    """The REST paths of the protocol."""
+    from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
+    def live(request: Request) -> Response:
+        return JSONResponse({"live": True})
+
+    def ready(request: Request) -> Response:
+        is_ready = models.ready()
+        return JSONResponse({"ready": is_ready}, 200 if is_ready else 503)
+
+    def server(request: Request) -> Response:
+        return JSONResponse({"name": PLATFORM, "version": VERSION, "extensions": []})
+
+    def model(request: Request) -> Response:
+        models.check(request.path_params["name"])
+        return JSONResponse(_metadata(request.path_params["name"]))
+
+    def model_ready(request: Request) -> Response:
+        models.check(request.path_params["name"])
+        return JSONResponse({"name": request.path_params["name"], "ready": True})
+
+    async def infer(request: Request) -> Response:
+        body = bytearray()
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > max_body_bytes:
+                why = f"The body is over {max_body_bytes:,} bytes."
+                raise RefusedError("RESOURCE_EXHAUSTED", 413, why)
+        header = request.headers.get("inference-header-content-length")
+        name = request.path_params["name"]
+        return JSONResponse(await run_in_threadpool(_http_infer, models, name, body, header))
+
+    def refused(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RefusedError)
+        return JSONResponse({"error": str(error)}, error.status)
+
+    routes = [
+        Route("/v2", server),
+        Route("/v2/health/live", live),
+        Route("/v2/health/ready", ready),
+        Route("/v2/models/{name}", model),
+        Route("/v2/models/{name}/ready", model_ready),
+        Route("/v2/models/{name}/infer", infer, methods=["POST"]),
+    ]
+    return Starlette(routes=routes, exception_handlers={RefusedError: refused})
+
+
+def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
+    """The answer to the body of an inference; raises RefusedError."""
+    try:
+        head = len(body) if header is None else int(header)
+        request = json.loads(body[:head])
+        tensors, parameters = _http_inputs(request, bytes(body[head:]))
+    except RefusedError:
+        raise
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        fix = "Give the JSON of an inference request."
+        raise RefusedError("INVALID_ARGUMENT", 400, f"body: got {error!r}. {fix}") from None
+    answer = models.infer(name, tensors, parameters, None)
+    outputs = [
+        {
+            "name": each,
+            "datatype": OUTPUTS[each][0],
+            "shape": array.shape,
+            "data": array.ravel().tolist(),
+        }
+        for each, array in answer.outputs.items()
+    ]
+    named = {"model_name": name, "model_version": VERSION, "id": request.get("id", "")}
+    return {**named, "parameters": answer.parameters, "outputs": outputs}
+
+
+def _http_inputs(request: dict[str, Any], binary: bytes) -> tuple[Tensors, dict[str, Any]]:
+    """Tensors and parameters; tensors without `data` lie in `binary`, one behind the other."""
+    tensors, start = {}, 0
+    for each in request["inputs"]:
+        data = each.get("data")
+        if data is None:
+            end = start + int(each["parameters"]["binary_data_size"])
+            data, start = binary[start:end], end
+        tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
+    return tensors, request.get("parameters") or {}

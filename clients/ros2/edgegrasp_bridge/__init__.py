@@ -1,0 +1,1 @@
+"""EdgeGrasp in ROS 2: the node, and what it does as plain Python."""

@@ -1,0 +1,366 @@
+"""What the node does, without ROS: messages to a request, grasps to the fields of messages.
+
+Messages that come in are any objects with the attributes of theirs; those that go out are
+dictionaries of fields, for `rosidl_runtime_py.set_message_fields`. Poses are those of the hand's
+frame, but for `moveit_msgs/Grasp`, which has the end effector's parent link.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_in_scene, on_mask
+from edgegrasp_client.conversions import (
+    PANDA_JOINTS,
+    FingerJoints,
+    Float64,
+    matrix_from_quaternion,
+    moveit_grasp,
+    quaternion_from_matrix,
+)
+from edgegrasp_client.options import DetectOptions
+from edgegrasp_sim.picture import fork
+
+Message = dict[str, Any]
+Lookup = Callable[[str, str, Any], Float64]
+"""lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
+
+OPTION = "options."  # prefix of the parameters that are options of a detection
+ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
+    **dict.fromkeys(("mono8", "8UC1"), ("u1", 1)),
+    **dict.fromkeys(("rgb8", "bgr8", "8UC3"), ("u1", 3)),
+    **dict.fromkeys(("rgba8", "bgra8", "8UC4"), ("u1", 4)),
+    **dict.fromkeys(("mono16", "16UC1"), ("u2", 1)),
+    "32SC1": ("i4", 1),
+    "32FC1": ("f4", 1),
+}
+FLOATS = {7: "f4", 8: "f8"}  # of sensor_msgs/PointField
+DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
+LINE_WIDTH = 0.003  # metres
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The node's parameters beside the options; every field is one, of this name and default."""
+
+    server: str = "127.0.0.1:50051"  # host:port (gRPC) or http://host:port
+    timeout: float = 30.0  # seconds for a request
+    on_message: bool = False  # detect at every cloud or depth image, not only for an action
+    target_frame: str = ""  # what answers are in; empty: the frame of the cloud or image
+    camera_frame: str = ""  # where the camera of a cloud stands; empty: the cloud's own origin
+    gravity_frame: str = ""  # whose z is up; empty: found from the support
+    hand_frame: str = ""  # the gripper's hand frame, such as panda_hand; beside parent_link
+    parent_link: str = ""  # of the end effector, such as panda_link8; empty: the hand frame
+    joint_names: tuple[str, ...] = PANDA_JOINTS.names
+    joint_closed: float = 0.0  # position of each joint in the closed hand
+    joint_per_metre: float = 0.5  # what each joint moves for a metre of opening
+
+    @property
+    def joints(self) -> FingerJoints:
+        """The gripper's joints."""
+
+        def at(opening: float) -> tuple[float, ...]:
+            return (self.joint_closed + self.joint_per_metre * opening,) * len(self.joint_names)
+
+        return FingerJoints(self.joint_names, at)
+
+
+def parameters() -> dict[str, Any]:
+    """Names and defaults of the node's parameters; of an option: empty text, the server's."""
+    own = {each.name: each.default for each in fields(Settings)}
+    own["joint_names"] = list(Settings.joint_names)
+    return own | {f"{OPTION}{name}": "" for name in DetectOptions.__annotations__}
+
+
+def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]:
+    """Settings, and options of a detection; text of an option that is JSON stands for its value."""
+    own = {each.name: given[each.name] for each in fields(Settings)}
+    own["joint_names"] = tuple(own["joint_names"])
+    options = {}
+    for name, value in given.items():
+        if name.startswith(OPTION) and not (isinstance(value, str) and value == ""):
+            options[name.removeprefix(OPTION)] = _value(value)
+    return Settings(**own), options
+
+
+class Scene(NamedTuple):
+    """The latest messages: a cloud, or a depth image with its camera, and perhaps a mask."""
+
+    cloud: Any = None  # sensor_msgs/PointCloud2
+    depth: Any = None  # sensor_msgs/Image, rectified
+    camera: Any = None  # sensor_msgs/CameraInfo of `depth`
+    mask: Any = None  # sensor_msgs/Image: not 0 on what is to be grasped
+
+    @property
+    def header(self) -> Any:
+        """That of the message that the points are from; None: there is none yet."""
+        source = self.cloud if self.cloud is not None else self.depth
+        return None if source is None else source.header
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Grasps in one frame."""
+
+    grasps: list[Grasp]  # T_cloud_hand and approach_direction are in frame_id
+    detection: Detection  # as the server answered it, in the frame of the cloud
+    frame_id: str
+    stamp: Message
+
+    @property
+    def header(self) -> Message:
+        """std_msgs/Header."""
+        return {"stamp": self.stamp, "frame_id": self.frame_id}
+
+
+def detect(
+    client: GraspClient,
+    scene: Scene,
+    settings: Settings,
+    options: Mapping[str, Any],
+    lookup: Lookup,
+    object_cloud: Any = None,
+) -> Found:
+    """Grasps of a scene, or of one object in it.
+
+    Args:
+        client: Of the server.
+        scene: The latest messages.
+        settings: The node's parameters.
+        options: Of the detection; they come before what frames say.
+        lookup: Transforms between frames.
+        object_cloud: sensor_msgs/PointCloud2 of the object that grasps are for.
+
+    Raises:
+        GraspClientError: As of the client.
+        ValueError: There is no message to detect in, or one that cannot be read.
+    """
+    header = scene.header
+    if header is None and object_cloud is not None:
+        scene, object_cloud = Scene(cloud=object_cloud), None
+        header = scene.header
+    if header is None:
+        raise ValueError("No cloud and no depth image has come yet.")
+    frame_id, stamp = header.frame_id, header.stamp
+    asked = _from_frames(scene, settings, lookup) | dict(options)
+    if scene.mask is not None and object_cloud is None:
+        asked = dict(on_mask(image_array(scene.mask), asked))
+    cloud: Any = scene.cloud
+    if object_cloud is not None:
+        T = lookup(frame_id, object_cloud.header.frame_id, stamp)
+        wanted = cloud_points(object_cloud) @ T[:3, :3].T + T[:3, 3]
+        around = cloud_points(cloud) if cloud is not None else _depth_points(scene)
+        cloud, segment_ids = object_in_scene(wanted, around)
+        asked.setdefault("viewpoint", [0.0, 0.0, 0.0])
+        found = client.detect(cloud, segment_ids=segment_ids, **cast("DetectOptions", asked))
+    elif cloud is not None:
+        found = client.detect(cloud, **cast("DetectOptions", asked))
+    else:
+        image: DepthImage = {
+            "depth": image_array(scene.depth),
+            "intrinsics": camera_matrix(scene.camera),
+        }
+        found = client.detect(depth_images=[image], **cast("DetectOptions", asked))
+    target = settings.target_frame or frame_id
+    T_target_cloud = lookup(target, frame_id, stamp)
+    grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]
+    return Found(grasps, found, target, {"sec": stamp.sec, "nanosec": stamp.nanosec})
+
+
+def pose_array(found: Found) -> Message:
+    """geometry_msgs/PoseArray of the hand's frame, best first."""
+    return {"header": found.header, "poses": [_pose(each.T_cloud_hand) for each in found.grasps]}
+
+
+def marker_array(found: Found) -> Message:
+    """visualization_msgs/MarkerArray: a fork for each grasp, red to green by its score."""
+    markers: list[Message] = [{"header": found.header, "action": DELETE_ALL}]
+    for number, grasp in enumerate(found.grasps):
+        ends = fork(grasp.T_cloud_hand, grasp.width).reshape(-1, 3)
+        score = float(grasp.score)
+        marker = {
+            "header": found.header,
+            "ns": "grasps",
+            "id": number,
+            "type": LINE_LIST,
+            "scale": {"x": LINE_WIDTH, "y": 0.0, "z": 0.0},
+            "color": {"r": 1.0 - score, "g": score, "b": 0.0, "a": 1.0},
+            "points": [_xyz(end) for end in ends],
+        }
+        markers.append(marker)
+    return {"markers": markers}
+
+
+def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
+    """Result and feedback of grasping_msgs/GraspPlanning: poses of the end effector's parent."""
+    link = settings.parent_link
+    T_hand_link = lookup(settings.hand_frame or link, link, None) if link else None
+    grasps = [
+        moveit_grasp(
+            grasp,
+            found.frame_id,
+            name=f"grasp_{number}",
+            stamp=found.stamp,
+            joints=settings.joints,
+            T_hand_link=T_hand_link,
+        )
+        for number, grasp in enumerate(found.grasps)
+    ]
+    return {"grasps": grasps}
+
+
+def object_results(found: Found, object_id: str = "", most: int = 0) -> Message:
+    """Result of GenerateGrasps: the grasps of each object, or of the one that was asked for.
+
+    Args:
+        found: The grasps.
+        object_id: Name of the object whose cloud was sent; empty: all, by their numbers.
+        most: Grasps for each at most; 0: all.
+    """
+    numbers = [thing.number for thing in found.detection.objects]
+    groups: list[tuple[str, list[Grasp]]] = [
+        (str(number), [each for each in found.grasps if each.object == number])
+        for number in numbers
+    ]
+    if object_id or not numbers:
+        groups = [(object_id, found.grasps)]
+    return {"results": [_object_result(found, *group, most) for group in groups]}
+
+
+def _object_result(found: Found, name: str, grasps: list[Grasp], most: int) -> Message:
+    stages = ", ".join(f"{count} {stage}" for stage, count in found.detection.counts.items())
+    candidates = [
+        {
+            "pose": {"header": found.header, "pose": _pose(grasp.T_cloud_hand)},
+            "confidence": min(max(float(grasp.score), 0.0), 1.0),
+            "width": float(grasp.width),
+        }
+        for grasp in (grasps[:most] if most else grasps)
+    ]
+    told = " ".join([f"No grasp: {stages}.", *found.detection.warnings])
+    return {
+        "object_id": name,
+        "success": bool(candidates),
+        "message": "" if candidates else told,
+        "candidates": candidates,
+    }
+
+
+def image_array(image: Any) -> NDArray[Any]:
+    """The values of a sensor_msgs/Image: (H, W), or (H, W, C) of several channels.
+
+    Raises:
+        ValueError: Of an encoding that is no depth and no mask.
+    """
+    if image.encoding not in ENCODINGS:
+        known = ", ".join(ENCODINGS)
+        raise ValueError(f"encoding: got {image.encoding!r}. Send one of: {known}.")
+    kind, channels = ENCODINGS[image.encoding]
+    dtype = np.dtype(f"{'>' if image.is_bigendian else '<'}{kind}")
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    used = np.ascontiguousarray(rows[:, : image.width * channels * dtype.itemsize])
+    values = used.view(dtype).astype(dtype.newbyteorder("="))
+    return values if channels == 1 else values.reshape(image.height, image.width, channels)
+
+
+def camera_matrix(camera: Any) -> Float64:
+    """The (3, 3) matrix of a rectified image: that of `p`, or `k` where there is no `p`.
+
+    Raises:
+        ValueError: No CameraInfo has come, or one of a camera that is not calibrated.
+    """
+    if camera is None:
+        raise ValueError("The depth image has no CameraInfo yet.")
+    projection = np.asarray(camera.p, np.float64).reshape(3, 4)[:, :3]
+    matrix = projection if projection[0, 0] else np.asarray(camera.k, np.float64).reshape(3, 3)
+    if not matrix[0, 0]:
+        raise ValueError("camera_info: p and k are 0. Calibrate the camera.")
+    return matrix
+
+
+def cloud_points(cloud: Any) -> Float64:
+    """Points (N, 3) of a sensor_msgs/PointCloud2, NaN where there is no reading.
+
+    Raises:
+        ValueError: It has no x, y, z of floats.
+    """
+    known = {field.name: field for field in cloud.fields}
+    xyz = [known.get(name) for name in "xyz"]
+    if any(field is None or field.datatype not in FLOATS for field in xyz):
+        raise ValueError(f"fields: got {', '.join(known) or 'none'}. Send x, y, z of floats.")
+    order = ">" if cloud.is_bigendian else "<"
+    layout = {
+        "names": list("xyz"),
+        "formats": [order + FLOATS[cast("Any", field).datatype] for field in xyz],
+        "offsets": [cast("Any", field).offset for field in xyz],
+        "itemsize": cloud.point_step,
+    }
+    data = np.frombuffer(cloud.data, np.uint8).reshape(cloud.height, cloud.row_step)
+    used = np.ascontiguousarray(data[:, : cloud.width * cloud.point_step])
+    table = used.view(np.dtype(cast("Any", layout))).ravel()
+    return np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
+
+
+def matrix_of(transform: Any) -> Float64:
+    """(4, 4) of a geometry_msgs/Transform."""
+    turn, shift = transform.rotation, transform.translation
+    T = np.eye(4)
+    T[:3, :3] = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
+    T[:3, 3] = shift.x, shift.y, shift.z
+    return T
+
+
+def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:
+    """What frames say of a request: where the camera stands, and which way is up."""
+    frame_id, stamp = scene.header.frame_id, scene.header.stamp
+    asked: dict[str, Any] = {}
+    if scene.cloud is not None:
+        camera = settings.camera_frame or frame_id
+        asked["viewpoint"] = lookup(frame_id, camera, stamp)[:3, 3].tolist()
+    if settings.gravity_frame:
+        asked["up"] = lookup(frame_id, settings.gravity_frame, stamp)[:3, 2].tolist()
+    return asked
+
+
+def _depth_points(scene: Scene) -> Float64:
+    """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
+    depth = image_array(scene.depth)
+    matrix = camera_matrix(scene.camera)
+    z = depth * (0.001 if depth.dtype.kind == "u" else 1.0)
+    z = np.where(z > 0, z, np.nan)
+    rows, columns = np.indices(depth.shape)
+    x, y = (columns - matrix[0, 2]) / matrix[0, 0], (rows - matrix[1, 2]) / matrix[1, 1]
+    return np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3)
+
+
+def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
+    pose = T_target_cloud @ grasp.T_cloud_hand
+    return replace(
+        grasp,
+        T_cloud_hand=pose.astype(np.float32),
+        approach_direction=pose[:3, 2].astype(np.float32),
+    )
+
+
+def _pose(T: NDArray[Any]) -> Message:
+    """geometry_msgs/Pose; the orientation's fields are x, y, z, w."""
+    orientation = quaternion_from_matrix(T[:3, :3]).tolist()
+    return {
+        "position": _xyz(T[:3, 3]),
+        "orientation": dict(zip("xyzw", orientation, strict=True)),
+    }
+
+
+def _xyz(vector: NDArray[Any]) -> Message:
+    return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
+
+
+def _value(value: Any) -> Any:
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value

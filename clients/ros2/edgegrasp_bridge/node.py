@@ -1,0 +1,136 @@
+#!/usr/bin/env python3
+"""The node: rclpy around `bridge`, and nothing that could be tested without it."""
+
+import importlib
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseArray
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.action import ActionServer
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
+from rosidl_runtime_py.set_message import set_message_fields
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from tf2_ros import Buffer, TransformListener
+from visualization_msgs.msg import MarkerArray
+
+from edgegrasp_bridge import bridge
+from edgegrasp_client import GraspClient, GraspClientError
+
+INPUTS = {"points": PointCloud2, "depth": Image, "camera_info": CameraInfo, "mask": Image}
+FIELDS = {"points": "cloud", "depth": "depth", "camera_info": "camera", "mask": "mask"}
+
+
+class EdgeGraspNode(Node):
+    """Subscribes to clouds or depth images; answers two actions; publishes what was found."""
+
+    def __init__(self) -> None:
+        super().__init__("edgegrasp")
+        dynamic = ParameterDescriptor(dynamic_typing=True)
+        for name, default in bridge.parameters().items():
+            self.declare_parameter(name, default, dynamic)
+        settings, _ = self._read()
+        self._client = GraspClient(settings.server, timeout=settings.timeout)
+        self._scene = bridge.Scene()
+        self._buffer = Buffer()
+        self._listener = TransformListener(self._buffer, self)
+        self._poses = self.create_publisher(PoseArray, "grasps", 1)
+        self._markers = self.create_publisher(MarkerArray, "grasp_markers", 1)
+        inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
+        for topic, kind in INPUTS.items():
+            take = self._take(FIELDS[topic])
+            self.create_subscription(
+                kind, topic, take, qos_profile_sensor_data, callback_group=inputs
+            )
+        for package, name, answer in (
+            ("grasping_msgs", "GraspPlanning", self._plan),
+            ("edgegrasp_ros2", "GenerateGrasps", self._generate),
+        ):
+            try:
+                kind = getattr(importlib.import_module(f"{package}.action"), name)
+            except ModuleNotFoundError:
+                self.get_logger().warning(f"{package} is not installed: no action {name}")
+                continue
+            topic = "plan_grasps" if name == "GraspPlanning" else "generate_grasps"
+            execute = self._executing(kind, answer)
+            ActionServer(self, kind, topic, execute, callback_group=actions)
+
+    def _read(self) -> Any:
+        names = list(bridge.parameters())
+        values = [parameter.value for parameter in self.get_parameters(names)]
+        return bridge.read_parameters(dict(zip(names, values, strict=True)))
+
+    def _take(self, field: str) -> Any:
+        def take(message: Any) -> None:
+            self._scene = self._scene._replace(**{field: message})
+            if field in ("cloud", "depth") and self.get_parameter("on_message").value:
+                try:
+                    self._detect()
+                except (GraspClientError, ValueError) as error:
+                    self.get_logger().warning(str(error))
+
+        return take
+
+    def _detect(self, object_cloud: Any = None) -> Any:
+        settings, options = self._read()
+        found = bridge.detect(
+            self._client, self._scene, settings, options, self._lookup, object_cloud
+        )
+        for warning in found.detection.warnings:
+            self.get_logger().warning(warning)
+        poses, markers = PoseArray(), MarkerArray()
+        set_message_fields(poses, bridge.pose_array(found))
+        set_message_fields(markers, bridge.marker_array(found))
+        self._poses.publish(poses)
+        self._markers.publish(markers)
+        return found, settings
+
+    def _executing(self, kind: Any, answer: Any) -> Any:
+        def execute(goal: Any) -> Any:
+            result = kind.Result()
+            try:
+                set_message_fields(result, answer(goal.request))
+                goal.succeed()
+            except Exception as error:  # tf2's too: a goal that fails is told, the node goes on
+                self.get_logger().error(str(error))
+                goal.abort()
+            return result
+
+        return execute
+
+    def _plan(self, goal: Any) -> bridge.Message:
+        cluster = goal.object.point_cluster
+        found, settings = self._detect(cluster if cluster.data else None)
+        return bridge.moveit_grasps(found, settings, self._lookup)
+
+    def _generate(self, goal: Any) -> bridge.Message:
+        cluster = goal.object_cloud
+        found, _ = self._detect(cluster if cluster.data else None)
+        return bridge.object_results(found, goal.object_id, goal.max_candidates)
+
+    def _lookup(self, target: str, source: str, stamp: Any) -> bridge.Float64:
+        if target == source:
+            return np.eye(4)
+        when = Time() if stamp is None else Time.from_msg(stamp)
+        found = self._buffer.lookup_transform(target, source, when, Duration(seconds=1.0))
+        return bridge.matrix_of(found.transform)
+
+
+def main() -> None:
+    """Run the node."""
+    rclpy.init()
+    executor = MultiThreadedExecutor()
+    executor.add_node(EdgeGraspNode())
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        executor.spin()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Learning from the robot: weights recalibrated on grasps that were tried, held or not.
+
+Two numbers are fitted, p = sigmoid(scale * logit + shift) (Platt scaling): as much as some hundred
+outcomes can tell. The order of grasps stays; what changes is how far a score can be trusted.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import logit as logit_of
+
+from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
+from edgegrasp_training.evaluation import cross_entropy
+
+SCORES = (1e-4, 1.0 - 1e-4)  # scores are taken to lie between
+# Spread of log(scale) and of shift before there is any outcome: few outcomes change little.
+PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """Grasps that were tried."""
+
+    logit: NDArray[np.float64]  # (N,) of the score
+    held: NDArray[np.float64]  # (N,) 1 or 0
+
+    def of(self, rows: NDArray[np.int64]) -> Self:
+        """Some of them."""
+        return replace(self, logit=self.logit[rows], held=self.held[rows])
+
+
+def read_outcomes(path: Path, digest: str = "") -> Outcomes:
+    """The outcomes in a file that a server wrote, an object of JSON on each line.
+
+    Args:
+        path: The file.
+        digest: Of the weights whose scores count; empty: all.
+
+    Raises:
+        OSError: It cannot be read.
+        ValueError: A line is no outcome, or none is of these weights.
+    """
+    scores, held = [], []
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            outcome = json.loads(line)
+            if not digest or outcome["digest"] == digest:
+                scores.append(float(outcome["score"]))
+                held.append(float(outcome["held"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}, line {number}: {error!r}. It is no outcome.") from None
+    if not scores:
+        raise ValueError(
+            f"{path}: no outcome of the weights {digest[:12]}. Name those that scored."
+        )
+    return Outcomes(logit_of(np.clip(scores, *SCORES)), np.array(held))
+
+
+def fit(outcomes: Outcomes) -> tuple[float, float]:
+    """Scale and shift of the logits that are most probable after the outcomes."""
+
+    def cost(parameters: NDArray[np.float64]) -> float:
+        log_scale, shift = parameters
+        prior = (log_scale / PRIOR_SCALE) ** 2 / 2 + (shift / PRIOR_SHIFT) ** 2 / 2
+        logit = np.exp(log_scale) * outcomes.logit + shift
+        return len(logit) * cross_entropy(logit, outcomes.held) + float(prior)
+
+    log_scale, shift = minimize(cost, np.zeros(2)).x
+    return float(np.exp(log_scale)), float(shift)
+
+
+def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
+    """Write weights whose scores are calibrated on the outcomes of the old ones.
+
+    Args:
+        weights: Those that scored the grasps.
+        outcomes_file: As of `read_outcomes`; outcomes of other weights are left out.
+        folder: Gets NAME-robot.safetensors.
+
+    Returns:
+        What was done, in a sentence.
+
+    Raises:
+        InvalidCheckpoint: The weights cannot be read.
+        ValueError: As of `read_outcomes`.
+    """
+    network, metadata = load_checkpoint(weights)
+    outcomes = read_outcomes(outcomes_file, metadata.digest)
+    scale, shift = fit(outcomes)
+    temperature = metadata.temperature / scale
+    # sigmoid((logit + shift * temperature) / temperature): the shift goes into the last bias.
+    last = [layer for layer in network.modules() if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.bias.add_(shift * temperature)
+    held = float(outcomes.held.mean())
+    learned = {"outcomes": len(outcomes.held), "outcomes_held": round(held, 3)}
+    training = {**metadata.training, **learned, "recalibrated_from_digest": metadata.digest}
+    name = f"{metadata.name}-robot"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.safetensors"
+    new = replace(metadata, name=name, temperature=temperature, training=training)
+    save_checkpoint(path, network, new)
+    before = cross_entropy(outcomes.logit, outcomes.held)
+    after = cross_entropy(scale * outcomes.logit + shift, outcomes.held)
+    return (
+        f"{len(outcomes.held)} outcomes, {held:.2f} held: scores' cross entropy {before:.3f} -> "
+        f"{after:.3f} (scale {scale:.2f}, shift {shift:+.2f}): {path}"
+    )

@@ -1,0 +1,1 @@
+"""edgegrasp.oip: protobuf messages and gRPC stubs of the Open Inference Protocol."""

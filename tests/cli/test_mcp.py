@@ -1,0 +1,140 @@
+"""The tools as an agent has them: mcp's own client, over stdio and over HTTP."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
+image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+
+PROGRAM = ["-c", "from edgegrasp_cli.main import main; main()", "mcp"]
+CAMERA = [60.0, 60.0, 15.5, 11.5]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    depth = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
+    mask = np.zeros((24, 32), np.uint8)
+    mask[4:12, 8:20] = 255
+    image.fromarray(depth).save(folder / "depth.png")
+    image.fromarray(mask).save(folder / "mask.png")
+    np.save(folder / "cloud.npy", np.random.default_rng(1).uniform(0, 0.2, (500, 3)))
+    np.save(tmp_path / "outside.npy", np.zeros((9, 3)))
+    return folder
+
+
+@asynccontextmanager
+async def agent(address: str, folder: Path) -> AsyncIterator[Any]:
+    flags = ["--server", address, "--folder", str(folder)]
+    program = mcp.StdioServerParameters(
+        command=sys.executable, args=[*PROGRAM, *flags], env=dict(os.environ)
+    )
+    async with mcp.Client(program, read_timeout_seconds=120) as client:
+        yield client
+
+
+def answer(result: Any) -> Any:
+    assert not result.is_error, result.content
+    return json.loads(result.content[0].text)
+
+
+async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) -> None:
+    async with agent(dummy_server.grpc_address, folder) as client:
+        tools = {tool.name: tool for tool in (await client.list_tools()).tools}
+        assert set(tools) == {
+            "generate_grasps_from_point_cloud",
+            "generate_grasps_from_depth",
+            "visualize_grasps",
+            "edgegrasp_health_check",
+            "edgegrasp_server_info",
+        }
+        assert "workspace" in tools["generate_grasps_from_depth"].description
+        health = await client.call_tool("edgegrasp_health_check", {})
+        assert health.content[0].text == "ready"
+        (info,) = answer(await client.call_tool("edgegrasp_server_info", {}))
+        assert info["name"] == "dummy"
+
+        asked = {"point_cloud_file": "cloud.npy", "num_grasps": 3, "options": {"seed": 7}}
+        found = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
+        again = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
+        assert found == again
+        assert len(found["grasps"]) == 3
+        grasp = found["grasps"][0]
+        assert np.linalg.norm(grasp["hand_quaternion_xyzw"]) == pytest.approx(1, abs=1e-3)
+        tcp = np.subtract(grasp["tcp_position"], grasp["hand_position"])
+        assert tcp @ grasp["approach_direction"] == pytest.approx(0.1, abs=1e-3)
+
+        shown = await client.call_tool("visualize_grasps", asked)
+        assert shown.content[0].text.startswith("3 grasps, the best ")
+        assert shown.content[1].mime_type == "image/png"
+
+
+async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder: Path) -> None:
+    async with agent(dummy_server.http_url, folder) as client:
+        asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "num_grasps": 500}
+        result = await client.call_tool("generate_grasps_from_depth", asked)
+        assert 1 <= len(answer(result)["grasps"]) <= 20
+        assert len(result.content[0].text) < 300 * 20
+        shown = await client.call_tool("visualize_grasps", asked | {"mask_file": "mask.png"})
+        assert shown.content[1].type == "image"
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "told"),
+    [
+        ("generate_grasps_from_point_cloud", {"point_cloud_file": "none.npy"}, "none.npy"),
+        ("generate_grasps_from_point_cloud", {"point_cloud_file": "../outside.npy"}, "not below"),
+        ("generate_grasps_from_depth", {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
+        ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
+        (
+            "generate_grasps_from_point_cloud",
+            {"point_cloud_file": "cloud.npy", "options": {"tok_k": 1}},
+            "options.tok_k",
+        ),
+    ],
+)
+async def test_what_is_wrong_reaches_the_agent(
+    dummy_server, folder: Path, tool: str, arguments: dict, told: str
+) -> None:
+    async with agent(dummy_server.grpc_address, folder) as client:
+        result = await client.call_tool(tool, arguments)
+        assert result.is_error
+        assert told in result.content[0].text
+
+
+@pytest.fixture
+def http_address(dummy_server, folder: Path) -> Iterator[str]:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    flags = ["--server", dummy_server.grpc_address, "--folder", str(folder)]
+    command = [sys.executable, *PROGRAM, *flags, "--http", f"127.0.0.1:{port}"]
+    with subprocess.Popen(command) as process:
+        try:
+            while process.poll() is None:
+                with socket.socket() as probe:
+                    if probe.connect_ex(("127.0.0.1", port)) == 0:
+                        break
+                time.sleep(0.1)
+            yield f"http://127.0.0.1:{port}/mcp"
+        finally:
+            process.terminate()
+
+
+async def test_the_tools_over_http(http_address: str) -> None:
+    async with mcp.Client(http_address) as client:
+        found = await client.call_tool(
+            "generate_grasps_from_point_cloud", {"point_cloud_file": "cloud.npy"}
+        )
+        assert len(answer(found)["grasps"]) == 5

@@ -1,0 +1,157 @@
+"""The gateway as others see it: Triton's client over both transports, and plain JSON."""
+
+import importlib.util
+import json
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from edgegrasp_cli.open_inference import Models, RefusedError, grpc_server, http_app
+from edgegrasp_client import GraspClient
+
+uvicorn = pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
+
+CLIENT = Path(__file__).with_name("triton_client.py")
+LIMIT = 200_000  # bytes
+
+
+@pytest.fixture(scope="module")
+def gateway(dummy_server) -> Iterator[dict[str, str]]:
+    """Addresses of a gateway in this process, by transport."""
+    with GraspClient(dummy_server.grpc_address) as client:
+        models = Models(client, "grasps", 60.0)
+        config = uvicorn.Config(http_app(models, LIMIT), port=0, log_level="error")
+        server = uvicorn.Server(config)
+        bound = config.bind_socket()
+        thread = threading.Thread(target=server.run, args=([bound],))
+        thread.start()
+        with grpc_server(models, "127.0.0.1:0", LIMIT) as port:
+            yield {
+                "http": f"127.0.0.1:{bound.getsockname()[1]}",
+                "grpc": f"127.0.0.1:{port}",
+            }
+        server.should_exit = True
+        thread.join()
+        bound.close()
+
+
+@pytest.fixture
+def post(gateway) -> Callable[..., httpx.Response]:
+    def post(body: Any, model: str = "grasps") -> httpx.Response:
+        url = f"http://{gateway['http']}/v2/models/{model}/infer"
+        return httpx.post(url, content=body if isinstance(body, bytes) else json.dumps(body))
+
+    return post
+
+
+def points_of(cloud: np.ndarray, **changes: Any) -> dict[str, Any]:
+    tensor = {"name": "points", "datatype": "FP32", "shape": cloud.shape, "data": cloud.tolist()}
+    return {"inputs": [tensor | changes]}
+
+
+@pytest.mark.parametrize("transport", ["http", "grpc"])
+@pytest.mark.parametrize("kind", ["points", "depth"])
+def test_tritons_client_gets_grasps(gateway, transport, kind, cloud, tmp_path, dummy_server):
+    for module in ("tritonclient", "geventhttpclient"):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"{module} is not installed")
+    file = tmp_path / "inputs.npz"
+    depth = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
+    camera = np.array([60.0, 60.0, 15.5, 11.5], np.float32)
+    tensors = {"points": cloud} if kind == "points" else {"depth": depth, "intrinsics": camera}
+    np.savez(file, **tensors)
+    command = [sys.executable, "-P", CLIENT, transport, gateway[transport], "grasps", file]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["health"] == [True, True, True]
+    assert [tensor["name"] for tensor in told["inputs"]] == ["points", "depth", "intrinsics"]
+    with GraspClient(dummy_server.grpc_address) as client:
+        images = [{"depth": depth, "intrinsics": camera}]
+        sent = {"cloud": cloud} if kind == "points" else {"depth_images": images}
+        expected = client.detect(**sent, top_k=4, up=[0, 0, 1]).grasps
+    assert len(told["score"]) == 4
+    np.testing.assert_allclose(told["T_cloud_hand"], [g.T_cloud_hand for g in expected], atol=1e-6)
+    np.testing.assert_allclose(told["score"], [g.score for g in expected], atol=1e-6)
+    np.testing.assert_allclose(told["width"], [g.width for g in expected], atol=1e-6)
+
+
+def test_a_request_in_json(post, gateway, cloud) -> None:
+    body = points_of(cloud) | {"id": "a", "parameters": {"top_k": 2, "seed": 3}}
+    answer = post(body).json()
+    assert (answer["id"], answer["model_name"]) == ("a", "grasps")
+    shapes = {tensor["name"]: tensor["shape"] for tensor in answer["outputs"]}
+    assert shapes == {"T_cloud_hand": [2, 4, 4], "score": [2], "width": [2], "object": [2]}
+    assert answer["parameters"]["model"] == "dummy"
+    assert post(body, "dummy").json()["outputs"] == answer["outputs"]
+    base = f"http://{gateway['http']}/v2"
+    assert httpx.get(base).json()["name"] == "edgegrasp"
+    assert httpx.get(f"{base}/models/dummy").json()["platform"] == "edgegrasp"
+    assert httpx.get(f"{base}/models/dummy/ready").json() == {"name": "dummy", "ready": True}
+
+
+@pytest.mark.parametrize(
+    ("changes", "model", "status", "told"),
+    [
+        ({"name": "cloud"}, "grasps", 400, "inputs: got cloud. Send points, or depth"),
+        ({"datatype": "BYTES"}, "grasps", 400, "inputs.points: got a datatype BYTES"),
+        ({"shape": [7, 3]}, "grasps", 400, "inputs.points: got cannot reshape"),
+        ({"data": [[1, 2], [3]]}, "grasps", 400, "inputs.points"),
+        ({"data": None}, "grasps", 400, "body: got KeyError('parameters')"),
+        ({}, "resnet", 404, "resnet"),
+        (b"{", "grasps", 400, "Give the JSON"),
+        (b"[" * 100_000, "grasps", 400, "Give the JSON"),
+        (b" " * (LIMIT + 1), "grasps", 413, "200,000 bytes"),
+        ({"parameters": {"seed": -1}}, "grasps", 400, "options.seed: got -1."),
+        ({"parameters": {"timeout": 5}}, "grasps", 400, "options.timeout"),
+    ],
+)
+def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> None:
+    body: Any = changes
+    if isinstance(changes, dict):
+        top = {name: changes.pop(name) for name in ("parameters",) if name in changes}
+        body = points_of(cloud, **changes) | top
+    answer = post(body, model)
+    assert answer.status_code == status, answer.text
+    assert told in answer.json()["error"]
+
+
+def test_the_command_serves_both_transports(dummy_server) -> None:
+    free = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
+    ports = [str(one.getsockname()[1]) for one in free]
+    for one in free:
+        one.close()
+    flags = [
+        "--server",
+        dummy_server.grpc_address,
+        "--http-port",
+        ports[0],
+        "--grpc-port",
+        ports[1],
+    ]
+    program = "from edgegrasp_cli.main import main; main()"
+    with subprocess.Popen([sys.executable, "-c", program, "open-inference", *flags]) as process:
+        try:
+            with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
+                ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)
+            assert ready.json() == {"ready": True}
+            socket.create_connection(("127.0.0.1", int(ports[1]))).close()
+        finally:
+            process.terminate()
+
+
+def test_a_server_that_is_away() -> None:
+    with GraspClient("127.0.0.1:1", timeout=0.2, retry=False) as client:
+        models = Models(client, "grasps", 0.2)
+        assert not models.ready()
+        with pytest.raises(RefusedError) as caught:
+            models.check("grasps")
+        assert caught.value.status in (503, 504)

@@ -1,0 +1,262 @@
+"""The node's logic, with messages that went through CDR and a server behind the client."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_bridge import bridge
+from edgegrasp_bridge.bridge import Scene, Settings
+from edgegrasp_client import GraspClient, InvalidRequestError
+from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
+from edgegrasp_client.options import DetectOptions
+
+STAMP = {"sec": 12, "nanosec": 345}
+HEADER = {"stamp": STAMP, "frame_id": "camera"}
+MATRIX = [60.0, 0.0, 15.5, 0.0, 60.0, 11.5, 0.0, 0.0, 1.0]
+DEPTH = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
+
+T_base_camera = np.eye(4)
+T_base_camera[:3, :3] = Rotation.from_euler("x", 2.5).as_matrix()
+T_base_camera[:3, 3] = 0.4, 0.0, 0.7
+FRAMES = {"camera": T_base_camera, "base": np.eye(4), "hand": np.eye(4), "link8": PANDA_LINK8}
+
+
+def lookup(target: str, source: str, stamp: Any) -> np.ndarray:
+    """tf2, of a robot that stands still."""
+    assert stamp is None or (stamp.sec, stamp.nanosec) == (12, 345)
+    return np.linalg.inv(FRAMES[target]) @ FRAMES[source]
+
+
+@pytest.fixture(scope="module")
+def client(dummy_server) -> Iterator[GraspClient]:
+    with GraspClient(dummy_server.grpc_address) as client:
+        yield client
+
+
+@pytest.fixture
+def make_cloud(sent) -> Callable[..., Any]:
+    def make_cloud(points: np.ndarray, frame_id: str = "camera", bigendian: bool = False) -> Any:
+        """x, y, z and a colour in 20 bytes, rows padded to 4 more."""
+        rows = points.reshape(-1, *points.shape[-2:])
+        order = ">" if bigendian else "<"
+        data = np.zeros((rows.shape[0], rows.shape[1] * 20 + 4), np.uint8)
+        table = np.zeros((*rows.shape[:2], 5), f"{order}f4")
+        table[..., :3] = rows
+        data[:, : rows.shape[1] * 20] = table.view(np.uint8).reshape(rows.shape[0], -1)
+        fields = [
+            {"name": name, "offset": 4 * number, "datatype": 7, "count": 1}
+            for number, name in enumerate(("x", "y", "z", "rgb"))
+        ]
+        return sent(
+            "sensor_msgs/msg/PointCloud2",
+            {
+                "header": HEADER | {"frame_id": frame_id},
+                "height": rows.shape[0],
+                "width": rows.shape[1],
+                "fields": fields,
+                "is_bigendian": bigendian,
+                "point_step": 20,
+                "row_step": data.shape[1],
+                "data": data.ravel(),
+            },
+        )
+
+    return make_cloud
+
+
+@pytest.fixture
+def make_image(sent) -> Callable[..., Any]:
+    def make_image(pixels: np.ndarray, encoding: str, padding: int = 0) -> Any:
+        flat = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
+        rows = np.pad(flat, ((0, 0), (0, padding)))
+        size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.shape[1]}
+        told = {"header": HEADER, "encoding": encoding, "data": rows.ravel()}
+        return sent("sensor_msgs/msg/Image", size | told)
+
+    return make_image
+
+
+@pytest.fixture
+def camera(sent) -> Any:
+    projection = np.insert(np.reshape(MATRIX, (3, 3)), 3, 0.0, axis=1).ravel()
+    size = {"header": HEADER, "height": 24, "width": 32}
+    return sent("sensor_msgs/msg/CameraInfo", size | {"k": [9.0] * 9, "p": projection})
+
+
+def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud) -> None:
+    settings = Settings(target_frame="base", hand_frame="hand", parent_link="link8")
+    options = {"seed": 3, "top_k": 5}
+    found = bridge.detect(client, Scene(make_cloud(cloud)), settings, options, lookup)
+    expected = client.detect(cloud, viewpoint=[0, 0, 0], seed=3, top_k=5).grasps
+    hands = [T_base_camera @ grasp.T_cloud_hand for grasp in expected]
+    assert len(hands) == 5
+
+    poses = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found))
+    assert (poses.header.frame_id, poses.header.stamp.sec) == ("base", 12)
+    np.testing.assert_allclose([matrix(pose) for pose in poses.poses], hands, atol=1e-5)
+
+    markers = sent("visualization_msgs/msg/MarkerArray", bridge.marker_array(found)).markers
+    assert [marker.action for marker in markers] == [3, 0, 0, 0, 0, 0]
+    fingers = np.array([[p.x, p.y, p.z] for p in markers[1].points])
+    assert fingers.shape == (8, 3)
+    in_hand = (fingers - hands[0][:3, 3]) @ hands[0][:3, :3]
+    assert np.ptp(in_hand[:, 1]) == pytest.approx(expected[0].width, abs=1e-5)
+
+    planned = bridge.moveit_grasps(found, settings, lookup)
+    result = sent("grasping_msgs/msg/GraspPlanning_Result", planned)
+    for grasp, hand, wanted in zip(result.grasps, hands, expected, strict=True):
+        np.testing.assert_allclose(matrix(grasp.grasp_pose.pose), hand @ PANDA_LINK8, atol=1e-5)
+        assert grasp.grasp_quality == pytest.approx(wanted.score)
+        way = grasp.pre_grasp_approach.direction
+        for header in (way.header, grasp.grasp_pose.header):
+            assert (header.frame_id, header.stamp.sec, header.stamp.nanosec) == ("base", 12, 345)
+        np.testing.assert_allclose(
+            [way.vector.x, way.vector.y, way.vector.z], hand[:3, 2], atol=1e-5
+        )
+        assert grasp.pre_grasp_posture.points[0].positions.sum() == pytest.approx(wanted.width)
+
+    fields = bridge.object_results(found, "mug", most=2)
+    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
+    assert (each.object_id, each.success, len(each.candidates)) == ("mug", True, 2)
+    assert 0 <= each.candidates[1].confidence <= each.candidates[0].confidence <= 1
+    np.testing.assert_allclose(matrix(each.candidates[0].pose.pose), hands[0], atol=1e-5)
+
+
+def matrix(pose: Any) -> np.ndarray:
+    transform = np.eye(4)
+    turn = pose.orientation
+    transform[:3, :3] = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
+    transform[:3, 3] = pose.position.x, pose.position.y, pose.position.z
+    return transform
+
+
+@pytest.mark.parametrize(("kind", "encoding"), [(np.uint16, "16UC1"), (np.float32, "32FC1")])
+def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encoding) -> None:
+    depth = DEPTH if kind == np.uint16 else DEPTH.astype(kind) / 1000
+    scene = Scene(depth=make_image(depth, encoding, padding=6), camera=camera)
+    found = bridge.detect(client, scene, Settings(), {}, lookup)
+    expected = client.detect(depth_images=[{"depth": depth, "intrinsics": MATRIX}]).grasps
+    assert found.frame_id == "camera"
+    np.testing.assert_allclose(
+        [grasp.T_cloud_hand for grasp in found.grasps],
+        [grasp.T_cloud_hand for grasp in expected],
+        atol=1e-6,
+    )
+
+
+class Asked:
+    """In the place of a client: keeps what was asked, and answers with no grasp."""
+
+    def __init__(self, answer: Any) -> None:
+        self._answer = answer
+
+    def detect(self, cloud: Any = None, **given: Any) -> Any:
+        self.cloud, self.given = cloud, given
+        return replace(self._answer, grasps=[])
+
+
+@pytest.fixture
+def asked(client, cloud) -> Asked:
+    return Asked(client.detect(cloud, top_k=1))
+
+
+def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cloud) -> None:
+    settings = Settings(camera_frame="camera", gravity_frame="base")
+    bridge.detect(asked, Scene(make_cloud(cloud, "base")), settings, {}, lookup)
+    np.testing.assert_allclose(asked.given["viewpoint"], [0.4, 0.0, 0.7])
+    np.testing.assert_allclose(asked.given["up"], [0, 0, 1], atol=1e-12)
+    bridge.detect(asked, Scene(make_cloud(cloud)), settings, {"viewpoint": [1, 2, 3]}, lookup)
+    assert asked.given["viewpoint"] == [1, 2, 3]
+    np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "32SC1", "rgb8"])
+def test_a_mask_says_where(asked, make_image, camera, encoding) -> None:
+    wanted = DEPTH > 550
+    kinds = {"mono8": np.uint8, "32SC1": np.int32}
+    pixels = wanted.astype(kinds.get(encoding, np.uint8)) * 7
+    if encoding == "rgb8":
+        pixels = np.stack([pixels * 0, pixels, pixels * 0], axis=-1)
+    scene = Scene(None, make_image(DEPTH, "16UC1"), camera, make_image(pixels, encoding))
+    bridge.detect(asked, scene, Settings(), {}, lookup)
+    (outside,) = asked.given["contact_region"]["exclude"]
+    np.testing.assert_array_equal(outside["mask"], ~wanted)
+
+
+@pytest.mark.parametrize("bigendian", [False, True])
+def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camera, bigendian):
+    organised = np.full((4, 50, 3), np.nan, np.float32)
+    organised[1:] = np.random.default_rng(0).uniform(0.3, 0.4, (3, 50, 3))
+    thing = organised[2, :20]
+    in_base = thing @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
+    cluster = make_cloud(in_base, "base", bigendian)
+    scene = Scene(make_cloud(organised, bigendian=bigendian))
+    bridge.detect(asked, scene, Settings(), {}, lookup, cluster)
+    segment_ids = asked.given["segment_ids"]
+    np.testing.assert_allclose(asked.cloud[segment_ids == 1], thing, atol=1e-5)
+    assert len(thing) + 100 < len(asked.cloud) <= 150
+
+    bridge.detect(
+        asked,
+        Scene(depth=make_image(DEPTH, "16UC1"), camera=camera),
+        Settings(),
+        {},
+        lookup,
+        cluster,
+    )
+    around = asked.cloud[asked.given["segment_ids"] == 0]
+    assert len(around) == DEPTH.size
+    column = 60.0 * around[:, 0] / around[:, 2] + 15.5
+    np.testing.assert_allclose(column.reshape(24, 32)[0], np.arange(32), atol=1e-3)
+
+    bridge.detect(asked, Scene(), Settings(), {}, lookup, cluster)
+    assert asked.cloud is cluster
+
+
+def test_no_grasp_says_why(asked, sent, make_cloud, cloud) -> None:
+    found = bridge.detect(asked, Scene(make_cloud(cloud)), Settings(), {}, lookup)
+    fields = bridge.object_results(found, "mug")
+    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
+    assert not each.success
+    assert "No grasp: 500 points" in each.message
+
+
+def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
+    parameters = bridge.parameters()
+    assert {f"options.{name}" for name in DetectOptions.__annotations__} < set(parameters)
+    given = parameters | {
+        "options.top_k": 2,
+        "options.up": [0.0, 0.0, 1.0],
+        "options.support": "none",
+        "options.workspace": '{"min": [-1, -1, -1], "max": [1, 1, 1]}',
+        "target_frame": "base",
+        "joint_names": ["finger"],
+    }
+    settings, options = bridge.read_parameters(given)
+    assert settings.joints.at(0.08) == {"finger": 0.04}
+    assert options["workspace"]["max"] == [1, 1, 1]
+    found = bridge.detect(client, Scene(make_cloud(cloud)), settings, options, lookup)
+    assert len(found.grasps) == 2
+    wrong = options | {"top_k": "many"}
+    with pytest.raises(InvalidRequestError, match="top_k"):
+        bridge.detect(client, Scene(make_cloud(cloud)), settings, wrong, lookup)
+
+
+def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, camera, cloud) -> None:
+    image = make_image(DEPTH, "16UC1")
+    empty = sent("sensor_msgs/msg/CameraInfo", {"header": HEADER})
+    flat = make_cloud(cloud)
+    flat.fields[0].name = "intensity"
+    for scene, cluster, told in (
+        (Scene(), None, "No cloud and no depth image has come yet"),
+        (Scene(depth=image), None, "no CameraInfo yet"),
+        (Scene(depth=image, camera=empty), None, "p and k are 0"),
+        (Scene(depth=make_image(DEPTH, "bayer"), camera=camera), None, "encoding: got 'bayer'"),
+        (Scene(make_cloud(cloud)), flat, "Send x, y, z of floats"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            bridge.detect(client, scene, Settings(), {}, lookup, cluster)

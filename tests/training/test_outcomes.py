@@ -1,0 +1,62 @@
+"""Weights recalibrated on outcomes: their scores are what the outcomes say, their order stays."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
+from edgegrasp_training.outcomes import Outcomes, fit, read_outcomes, recalibrate
+
+
+def drawn(scale: float, shift: float, count: int) -> Outcomes:
+    """Outcomes of a robot on which the scores are off by so much."""
+    rng = np.random.default_rng(0)
+    logit = rng.normal(1.0, 2.0, count)
+    held = rng.random(count) < 1.0 / (1.0 + np.exp(-scale * logit - shift))
+    return Outcomes(logit, held.astype(float))
+
+
+def test_what_the_robot_is_off_by_is_found() -> None:
+    assert fit(drawn(0.5, -1.0, 20_000)) == pytest.approx((0.5, -1.0), abs=0.05)
+
+
+@pytest.mark.parametrize("held", [0.0, 1.0])
+def test_few_outcomes_change_little(held: float) -> None:
+    scale, shift = fit(Outcomes(np.array([3.0, 3.0]), np.array([held, held])))
+    assert 0.5 < scale < 1.5
+    assert abs(shift) < 2.5
+
+
+@pytest.mark.parametrize("name", ["balls", "vn", "hands"])
+def test_the_new_weights_answer_the_fitted_probability(
+    name: str, networks, made_up_view, tmp_path: Path
+) -> None:
+    config, old = networks[name], tmp_path / "old.safetensors"
+    metadata = CheckpointMetadata("old", config, 0.0045, "panda", temperature=1.5)
+    network = build_network(config, torch.Generator().manual_seed(0))
+    save_checkpoint(old, network, metadata)
+    network, metadata = load_checkpoint(old)
+    lines = [
+        {"digest": metadata.digest, "score": 0.9, "held": number % 3 == 0} for number in range(60)
+    ]
+    lines.append({"digest": "of other weights", "score": 0.9, "held": True})
+    file = tmp_path / "outcomes.jsonl"
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert recalibrate(old, file, tmp_path).startswith("60 outcomes, 0.33 held")
+    new, recalibrated = load_checkpoint(tmp_path / "old-robot.safetensors")
+    assert recalibrated.training["recalibrated_from_digest"] == metadata.digest
+    scale, shift = fit(read_outcomes(file, metadata.digest))
+    assert shift < -0.5
+    grasps = tried_grasps(made_up_view(1), config, load_gripper())
+    pack = pack_hands if name == "hands" else pack_balls
+    batch = pack(grasps, grasps.balls(), config).batch
+    with torch.inference_mode():
+        before, after = network(batch), new(batch)
+    expected = scale * before / metadata.temperature + shift
+    torch.testing.assert_close(after / recalibrated.temperature, expected, atol=1e-4, rtol=1e-4)
