@@ -20,7 +20,7 @@ venv: $(INSTALLED) ## make .venv with everything, and the system libraries it ne
 $(INSTALLED): pyproject.toml constraints.txt scripts/system_packages.sh
 	scripts/system_packages.sh $(PYTHON)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python scripts/install.py constraints.txt --editable '.[dev]'
 	@touch $@
 
 lint: $(INSTALLED) ## style, types, import boundaries, generated code

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.local_server import local_server
-from edgegrasp_sim.camera import Observation, crop
+from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.engine import ENGINES, choose_engine
-from edgegrasp_sim.picture import draw_grasps
+from edgegrasp_sim.picture import Picture, View
 from edgegrasp_sim.simulation import ClutterSimulation
 
 OUTPUT = Path(__file__).resolve().parents[1] / "demo_output"
@@ -32,7 +32,9 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
     scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
     with ClutterSimulation(engine=chosen.name) as simulation:
         placed = simulation.reset("pile", scene, num_objects=6)
-        seen = simulation.observe(camera, noise, table="auto")
+        pose = EVALUATION_VIEWS.sample(camera)[0]
+        seen = simulation.observe_from([pose], noise, table="auto")
+        colors = simulation.color_image(pose).reshape(-1, 3)[seen.pixels]
         print(f"Scene: {placed} objects on a table; the camera sees {len(seen.cloud):,} points.")
 
         over_grpc, over_rest = detect_over_both(seen, seed)
@@ -50,15 +52,13 @@ def main(seed: int, output: Path, engine: str | None = None) -> None:
         print(f"Executed the best one in the simulator: {verdict}.")
 
     output.mkdir(parents=True, exist_ok=True)
-    write_ply(output / "scene.ply", seen.cloud)
+    write_ply(output / "scene.ply", seen.cloud, colors)
     drawn = over_grpc.grasps[:LISTED]
-    draw_grasps(
-        output / "grasps.png",
-        crop(seen.cloud, seen.workspace, 0.05),
-        drawn,
-        camera_position=seen.camera_position,
-        title=f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}.",
-    )
+    title = f"The {len(drawn)} best grasps among {placed} objects. Executed the best: {verdict}."
+    view = View.of(crop(seen.cloud, seen.workspace, 0.05), seen.camera_position)
+    picture = Picture(view, seen.cloud, colors, title=title)
+    picture.grasps(drawn)
+    picture.save(output / "grasps.png")
     print(f"In {output.name}/: grasps.png, the picture, and scene.ply, the cloud.")
 
 
@@ -73,6 +73,7 @@ def detect_over_both(seen: Observation, seed: int) -> tuple[Detection, Detection
         "top_k": 20,
         "suppression": {"translation": 0.02, "rotation": 3.2},  # one grasp every 2 cm
     }
+    print("Starting a server, which loads its weights …", flush=True)
     with local_server("--log-level", "warning") as addresses:
         print(f"Server: {addresses.http_url} and gRPC {addresses.grpc_address}\n")
         with GraspClient(addresses.grpc_address, timeout=TIMEOUT) as client:
@@ -99,13 +100,13 @@ def report(transport: str, detection: Detection) -> None:
     print("counts:", ", ".join(f"{name} {count}" for name, count in detection.counts.items()), "\n")
 
 
-def write_ply(path: Path, cloud: NDArray[np.float32]) -> None:
-    """Write a cloud, (N, 3) metres, as a binary PLY file."""
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
-        "property float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    path.write_bytes(header.encode() + cloud.astype("<f4").tobytes())
+def write_ply(path: Path, cloud: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
+    """Write a cloud, (N, 3) metres, and its colours as a binary PLY file."""
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    shades = "".join(f"property uchar {shade}\n" for shade in ("red", "green", "blue"))
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud)}\n"
+    rows = np.concatenate([cloud.astype("<f4").view(np.uint8), colors], axis=1)
+    path.write_bytes(f"{head}{axes}{shades}end_header\n".encode() + rows.tobytes())
 
 
 def same(one: Detection, other: Detection) -> bool:

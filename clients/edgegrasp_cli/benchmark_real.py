@@ -1,6 +1,5 @@
 """`edgegrasp benchmark-real`: grasps in scenes of real cameras, judged by labels, and drawn."""
 
-import itertools
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -23,15 +22,13 @@ from edgegrasp_cli.flags import (
 if TYPE_CHECKING:
     from edgegrasp_cli.real_scenes import PlaneFigures, RealScene, SceneFigures
     from edgegrasp_model.gripper import Gripper
+    from edgegrasp_sim.picture import Picture
 
 Option = typer.Option
 DECIDED = ("viewpoint",)  # options that the scene decides
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
-CAPTION = (
-    "forks: palm and opened fingers, the stem shows where the hand comes from; coloured by score\n"
-    "white: borders of the labelled objects    green: labelled plane    pink: the plane found"
-)
+CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
 @takes_flags(connection=CONNECTION, options=option_flags(*DECIDED))
@@ -54,6 +51,9 @@ def benchmark_real(
     A request holds the image and its intrinsics, or the cloud and that the camera is at its
     origin, and the options given as flags; nothing else is said about a scene.
     """
+    from rich.console import Console
+    from rich.progress import track
+
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
@@ -62,7 +62,7 @@ def benchmark_real(
     model = ""
     with open_client(server, timeout, connection, weights, grippers, device) as client:
         client.detect(**loaded[0].request, **fields)  # what is loaded or compiled first takes time
-        for scene in loaded:
+        for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
             detection = client.detect(**scene.request, **fields)
             milliseconds = 1000 * (time.perf_counter() - start)
@@ -198,54 +198,21 @@ def draw(
         plane: Normal (3,) and offset of the plane found, if one was.
         title: One line above the picture.
     """
-    from matplotlib import colormaps
-    from matplotlib.figure import Figure
+    from edgegrasp_sim.picture import Picture
 
-    from edgegrasp_sim.picture import draw_fork, fork
-
-    rows, columns = scene.shape
-    row = _row_of_pixel(scene)
-    labels = np.where(row >= 0, scene.labels[row], 0)
-    depth = np.where(row >= 0, np.abs(scene.points[row, 2]), np.nan)
-    figure = Figure(figsize=(10, 10 * rows / columns + 1), dpi=110)
-    figure.suptitle(title, fontsize=11)
-    height = 10 * rows / columns / (10 * rows / columns + 1)
-    axes: Any = figure.add_axes((0, 0.55 * (1 - height), 1, height))
-    axes.set_axis_off()
-    if scene.rgb is not None:
-        axes.imshow(scene.rgb)
-    else:
-        axes.imshow(depth, cmap="gray_r", vmax=np.nanpercentile(depth, 98))
+    picture = Picture(scene.camera, scene.points, image=scene.rgb, title=title + CAPTION)
+    row = picture.row_of_pixel
     for label in scene.objects:
-        axes.contour(labels == label, [0.5], colors="white", linewidths=0.8)
-    _draw_plane(axes, scene, scene.normal, scene.offset, LABELLED, width=3.5)
+        picture.outline((row >= 0) & (scene.labels[row] == label))
+    _draw_plane(picture, scene, scene.normal, scene.offset, LABELLED, width=3.5)
     if plane is not None:
-        _draw_plane(axes, scene, *plane, FOUND, width=1.4)
-    for rank, grasp in reversed(list(enumerate(grasps))):
-        lines = scene.camera.pixels(fork(grasp.T_cloud_hand, grasp.width))
-        colour = colormaps["plasma"](grasp.score)
-        draw_fork(axes, lines, colour, rank, labelled=True)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
-    figure.text(0.5, 0.01, CAPTION, fontsize=9, ha="center")
-    figure.savefig(path)
-
-
-def _row_of_pixel(scene: "RealScene") -> Any:
-    """(H, W) the row of the cloud that is seen at each pixel, the nearest; -1: none."""
-    seen = np.flatnonzero(np.isfinite(scene.points).all(axis=1))
-    seen = seen[np.argsort(-np.abs(scene.points[seen, 2]))]  # nearer ones are drawn over others
-    column, row = np.rint(scene.camera.pixels(scene.points[seen])).astype(int).T
-    image = np.full(scene.shape, -1)
-    spread = range(-1, 2) if scene.rgb is None else range(1)  # closes the gaps between points
-    for down, right in itertools.product(spread, spread):
-        rows, columns = row + down, column + right
-        inside = (rows >= 0) & (rows < scene.shape[0]) & (columns >= 0) & (columns < scene.shape[1])
-        image[rows[inside], columns[inside]] = seen[inside]
-    return image
+        _draw_plane(picture, scene, *plane, FOUND, width=1.4)
+    picture.grasps(grasps)
+    picture.save(path)
 
 
 def _draw_plane(
-    axes: Any, scene: "RealScene", normal: Any, offset: float, colour: str, *, width: float
+    picture: "Picture", scene: "RealScene", normal: Any, offset: float, color: str, *, width: float
 ) -> None:
     """A square of a plane at the foot of each object, and the way up from it."""
     across = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
@@ -255,5 +222,4 @@ def _draw_plane(
         middle = foot - (foot @ normal - offset) * normal
         around = [(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)]
         for line in (middle + around @ half, [middle, middle + PLANE_SQUARE / 2 * normal]):
-            pixels = scene.camera.pixels(np.asarray(line))
-            axes.plot(*pixels.T, color=colour, linewidth=width, zorder=900)
+            picture.lines(line, color, width)

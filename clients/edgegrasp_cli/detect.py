@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
 
 Option = typer.Option
+DRAWN = 10  # grasps in a picture
+DRAWN_AROUND = 0.4  # metres from the grasps: what a picture of a cloud shows
 
 Weights = Annotated[
     list[Path] | None,
@@ -34,6 +36,16 @@ Weights = Annotated[
 Grippers = Annotated[
     list[Path] | None, Option(help="Gripper file (.toml), where there is no server.")
 ]
+Cloud = Annotated[
+    Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+]
+Depth = Annotated[
+    Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
+]
+DepthScale = Annotated[
+    float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
+]
+Color = Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")]
 Intrinsics = Annotated[
     str | None,
     Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
@@ -43,17 +55,11 @@ Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is n
 
 @takes_flags(connection=CONNECTION, options=option_flags())
 def detect(
-    file: Annotated[
-        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
-    ] = None,
-    depth: Annotated[
-        Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
-    ] = None,
+    file: Cloud = None,
+    depth: Depth = None,
     intrinsics: Intrinsics = None,
-    depth_scale: Annotated[
-        float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
-    ] = None,
-    color: Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")] = None,
+    depth_scale: DepthScale = None,
+    color: Color = None,
     mask: Annotated[
         Path | None, Option(help="Grasp only where this is not 0: .png or .npy, same pixels.")
     ] = None,
@@ -62,6 +68,9 @@ def detect(
     weights: Weights = None,
     grippers: Grippers = None,
     device: Device = "cpu",
+    picture: Annotated[
+        Path | None, Option(help="Picture of the best grasps to write, .png or .jpg.")
+    ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
@@ -74,6 +83,8 @@ def detect(
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
     """
+    from rich.console import Console
+
     fields = _options(options_file, options)
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
@@ -81,8 +92,11 @@ def detect(
         from edgegrasp_client import on_mask
 
         fields = dict(on_mask(_pixels(mask), fields))
-    with open_client(server, timeout, connection, weights, grippers, device) as client:
+    waiting = Console(stderr=True).status("Looking for grasps…")
+    with waiting, open_client(server, timeout, connection, weights, grippers, device) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
+    if picture is not None:
+        draw(picture, detection, fields, file, images, colors)
     if as_document:
         from edgegrasp_service.worker.http_bodies import write
 
@@ -106,7 +120,8 @@ def models(
     table = Table(
         "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
     )
-    with open_client(server, timeout, connection, weights) as client:
+    waiting = Console(stderr=True).status("Loading weights…")
+    with waiting, open_client(server, timeout, connection, weights) as client:
         found = client.models()
     for row in found:
         table.add_row(
@@ -160,21 +175,7 @@ class OwnDetector:
         self, cloud: Any = None, *, depth_images: Any = None, colors: Any = None, **options: Any
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
-        from edgegrasp_client.clouds import depth_image_fields, npy_bytes
-        from edgegrasp_model.options import parse_options
-        from edgegrasp_service.worker.request_cloud import File, decode_cloud
-
-        fields: dict[str, Any] = {}
-        if colors is not None:
-            fields["colors"] = File("npy", npy_bytes(colors))
-        if depth_images is not None:
-            images = enumerate(depth_images)
-            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
-        elif isinstance(cloud, Path):
-            fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
-        else:
-            fields["cloud"] = File("npy", npy_bytes(cloud))
-        sent, parsed = decode_cloud(fields, parse_options(options), sys.maxsize)
+        sent, parsed = decode(cloud, depth_images, colors, options)
         return self._catalogue.get(parsed.model).detect(sent, parsed)
 
     def models(self) -> "list[Model]":
@@ -190,6 +191,77 @@ class OwnDetector:
 
         weights, grippers, device = self._load
         return ModelCatalogue.load(weights, "", choose_device(device), grippers)
+
+
+def decode(cloud: Any, depth_images: Any, colors: Any, options: Mapping[str, Any]) -> Any:
+    """What a server makes of a request: a CloudInput and DetectOptions; raises as it does."""
+    from edgegrasp_client.clouds import depth_image_fields, npy_bytes
+    from edgegrasp_model.options import parse_options
+    from edgegrasp_service.worker.request_cloud import File, decode_cloud
+
+    fields: dict[str, Any] = {}
+    if colors is not None:
+        fields["colors"] = File("npy", npy_bytes(colors))
+    if depth_images is not None:
+        images = enumerate(depth_images)
+        fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+    elif isinstance(cloud, Path):
+        fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
+    else:
+        fields["cloud"] = File("npy", npy_bytes(cloud))
+    return decode_cloud(fields, parse_options(options), sys.maxsize)
+
+
+def draw(
+    path: Path,
+    detection: Any,
+    options: Mapping[str, Any],
+    cloud: Any = None,
+    depth_images: "list[DepthImage] | None" = None,
+    colors: NDArray[Any] | None = None,
+) -> None:
+    """Write a picture of a request and the best of its grasps.
+
+    A camera's one image is drawn as that camera saw it, in its colours where they are given; a
+    cloud from its viewpoint, or from above at a slant.
+
+    Args:
+        path: `.png` or `.jpg` file to write.
+        detection: The answer.
+        options: Those of the request; its regions are drawn.
+        cloud: As for `decode`, as the rest.
+        depth_images: In place of a cloud.
+        colors: Of the points.
+    """
+    import numpy as np
+
+    from edgegrasp_client.clouds import depth_image_fields
+    from edgegrasp_sim.picture import Picture, View
+
+    sent, parsed = decode(cloud, depth_images, colors, options)
+    shape, points = np.shape(sent.points), np.reshape(sent.points, (-1, 3))
+    shades = None if sent.colors is None else np.reshape(sent.colors, (-1, 3))
+    if shades is not None and shades.dtype.kind == "f":
+        shades = 255 * shades
+    shown, image = detection.grasps[:DRAWN], None
+    if depth_images is not None and len(depth_images) == 1:
+        camera = depth_image_fields(depth_images[0], 0)
+        pose = np.asarray(camera["T_cloud_camera"])
+        view = View(shape[:2], **camera["intrinsics"], T_cloud_camera=pose)
+        image = None if shades is None else shades.reshape(shape).astype(np.uint8)
+    else:
+        seen = points[np.isfinite(points).all(axis=1)]
+        middle = np.median([grasp.T_cloud_tcp[:3, 3] for grasp in shown] or seen, axis=0)
+        near = seen[np.linalg.norm(seen - middle, axis=1) < DRAWN_AROUND]
+        up = np.asarray(detection.up, dtype=np.float64)
+        aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        eye = np.ravel(parsed.viewpoint or middle + 0.6 * up - 0.5 * aside)[:3]
+        view = View.of(near if len(near) else seen, eye, up)
+    title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
+    picture = Picture(view, points, shades, image, title)
+    picture.regions(options)
+    picture.grasps(shown)
+    picture.save(path)
 
 
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:

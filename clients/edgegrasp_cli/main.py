@@ -16,6 +16,7 @@ except ModuleNotFoundError:
 COMMANDS = {
     "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
     "detect": ("detect", "service", "Find grasps in a cloud or a depth image."),
+    "view": ("view", "service", "Look at a scene and its grasps in the browser."),
     "models": ("detect", "service", "List the weights that can be used."),
     "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),
     "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),

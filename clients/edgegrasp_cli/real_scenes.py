@@ -6,11 +6,13 @@ A scene is an .npz file: docs/benchmark.md has its arrays.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+
+from edgegrasp_sim.picture import View
 
 if TYPE_CHECKING:  # Numba is loaded where grasps are judged
     from edgegrasp_model.gripper import Gripper
@@ -25,23 +27,7 @@ FIRST_OBJECT = 2  # lower labels: 0 anything else, 1 the support plane
 BELOW = 0.1  # sine of the angle over the level; the detector's own limit, 6 degrees
 NOISE = 0.003  # metres; 98 % of the points of a depth camera's plane lie within it at 0.6 to 0.9 m
 MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
-VIRTUAL_IMAGE = (480, 640)  # rows and columns of the picture of an unorganised cloud
 MAX_PINHOLE_ERROR = 1.0  # pixels; an organised cloud that is further off has no such camera
-
-
-class Camera(NamedTuple):
-    """A pinhole camera, pixels: column = fx * x / z + cx, row = fy * y / z + cy."""
-
-    fx: float  # negative where z points backward
-    fy: float
-    cx: float
-    cy: float
-
-    def pixels(self, points: Array) -> Float64:
-        """Columns and rows (..., 2) of points (..., 3), camera frame."""
-        x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -54,8 +40,7 @@ class RealScene:
     labels: NDArray[np.uint8]  # (R,) 0 anything else, 1 the support plane, 2 and up objects
     normal: Float64  # (3,) of the support plane, toward the camera
     offset: float  # normal . x of its points
-    camera: Camera
-    shape: tuple[int, int]  # rows and columns of the camera's image
+    camera: View
     rgb: NDArray[np.uint8] | None  # (H, W, 3)
 
     @property
@@ -145,10 +130,10 @@ def load_scene(file: Path) -> RealScene:
     rgb = arrays.get("rgb")
     if rgb is not None:
         checked.get("rgb", "u", "a colour of three bytes for each pixel", points.shape)
-    shape = (points.shape[0], points.shape[1]) if points.ndim == 3 else VIRTUAL_IMAGE
     camera = _camera(arrays.get("intrinsics"), points)
     if camera is None:
-        camera, rgb, shape = _virtual_camera(points), None, VIRTUAL_IMAGE
+        seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
+        camera, rgb = View.of(seen, np.zeros(3), normal), None
     return RealScene(
         file.stem,
         request,
@@ -157,7 +142,6 @@ def load_scene(file: Path) -> RealScene:
         normal.astype(np.float64),
         offset,
         camera,
-        shape,
         rgb,
     )
 
@@ -266,27 +250,17 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
     return {"cloud": points, "viewpoint": (0.0, 0.0, 0.0)}, points.astype(np.float32)
 
 
-def _camera(intrinsics: Array | None, points: Float32) -> Camera | None:
+def _camera(intrinsics: Array | None, points: Float32) -> View | None:
     """The camera of an image; of an organised cloud by least squares; None where there is none."""
-    if intrinsics is not None:
-        return Camera(*intrinsics.tolist())
     if points.ndim != 3:
         return None
+    shape = points.shape[0], points.shape[1]
+    if intrinsics is not None:
+        return View(shape, *intrinsics.tolist())
     seen = np.isfinite(points).all(axis=2) & (points[..., 2] != 0.0)
     row, column = np.nonzero(seen)
     x, y, z = points[seen].T.astype(np.float64)
     (fx, cx), (fy, cy) = np.polyfit(x / z, column, 1), np.polyfit(y / z, row, 1)
-    camera = Camera(fx, fy, cx, cy)
-    off = np.abs(camera.pixels(points[seen]) - np.stack([column, row], axis=1)).max()
-    return camera if off < MAX_PINHOLE_ERROR else None
-
-
-def _virtual_camera(points: Float32) -> Camera:
-    """A camera at the origin whose picture holds every point."""
-    x, y, z = points.reshape(-1, 3)[np.isfinite(points.reshape(-1, 3)).all(axis=1)].T
-    rows, columns = VIRTUAL_IMAGE
-    across, down = x / z, y / z
-    focal = 0.9 * min(columns / np.ptp(across), rows / np.ptp(down))
-    fx = focal if np.median(z) > 0 else -focal
-    middle = [(values.min() + values.max()) / 2 for values in (across, down)]
-    return Camera(fx, focal, columns / 2 - fx * middle[0], rows / 2 - focal * middle[1])
+    view = View(shape, fx, fy, cx, cy)
+    off = np.abs(view.project(points[seen])[0] - np.stack([column, row], axis=1)).max()
+    return view if off < MAX_PINHOLE_ERROR else None

@@ -32,6 +32,8 @@ def attempt(
     ] = None,
 ) -> None:
     """Make one recorded attempt again, in the scene and view it was made in."""
+    from rich.console import Console
+
     from edgegrasp_sim.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
     from edgegrasp_sim.report import attempt_title
@@ -39,7 +41,8 @@ def attempt(
 
     folder = ResultFolder(results)
     first = folder.manifest()["seeds"][0]
-    with Replay(folder, objects) as repeated:
+    waiting = Console(stderr=True).status("Making the attempt again…")
+    with waiting, Replay(folder, objects) as repeated:
         done = repeated.find(first if seed is None else seed, round, number)
         now, seen = repeated.repeat(done.seed, round, number)
     before, title = done.attempts[number], attempt_title(done, number)

@@ -1,28 +1,38 @@
-"""A picture of a cloud and the grasps found in it, as a person would want to see them."""
+"""Pictures of clouds and the grasps found in them, drawn without a screen.
 
-from collections.abc import Sequence
+A picture looks through a pinhole camera: the one that took the cloud, over its own image where
+there is one, or else one that is put where it stood.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Points = NDArray[np.float64]
 
-
 PALM_Z = 0.0658  # metres along the hand's z: the palm's surface
 TIP_Z = 0.1122  # metres along the hand's z: the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
-TICKS = 0.05  # metres between the ticks of an axis
-MARGIN = 0.02  # metres around everything drawn
-MAX_CLOUD_POINTS = 12_000  # more would only hide each other
+BAR = 0.005  # metres, thickness of a fork
+BARS = (2.0, 7.0)  # points that this is at least and at most
+BEHIND = 0.006  # metres behind the cloud from which on a fork is drawn as hidden
 LABELLED = 5  # grasps that carry their rank
-CAPTION = (
-    "grey: the cloud, lighter is higher    forks: palm and opened fingers, "
-    "the stem shows where the hand comes from"
-)
-BEST_EDGE = "#d00000"
-OUTLINE = "black"
+SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
+SMALLEST = 0.25  # metres across, of what such a picture shows
+SPREAD = 8  # pixels that gaps between points are closed by at most
+WIDTH, DPI = 10.0, 130  # inches, dots per inch
+FOOT = 0.75  # inches below the picture: title and scale
+SMOOTHED = 8  # times that depths are averaged with their neighbours before they are shaded
+LAMP = (-0.3, -0.6, -0.74)  # to it from a surface, camera frame: left, up, towards the camera
+MAP = "viridis"  # colours of scores from 0 to 1
+OUTLINE = "#10151d"
+REGION = "#4cc9f0"
+EDGES = [(a, b) for a in range(8) for b in range(8) if a < b and bin(a ^ b).count("1") == 1]
 
 
 class Drawable(Protocol):
@@ -36,6 +46,203 @@ class Drawable(Protocol):
     def width(self) -> float: ...  # noqa: D102  # metres
 
 
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame.
+
+    Attributes:
+        shape: rows and columns of its image.
+        fx: pixels; negative where the cloud's z points backward.
+        fy: pixels.
+        cx: pixels.
+        cy: pixels.
+        T_cloud_camera: (4, 4); by default the cloud is in the camera's frame.
+    """
+
+    shape: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    T_cloud_camera: NDArray[np.floating] = field(default_factory=lambda: np.eye(4))
+
+    @classmethod
+    def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
+        """A camera at `eye` (3,) whose image holds most of the points (N, 3)."""
+        seen = np.asarray(points, dtype=np.float64)
+        (rows, columns), position = SIZE, np.asarray(eye, dtype=np.float64)
+        z = np.median(seen, axis=0) - position
+        z /= np.linalg.norm(z)
+        x = np.cross(z, np.asarray(up, dtype=np.float64))
+        x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0.0, 0.0])
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), position
+        right, down, ahead = ((seen - position) @ T[:3, :3]).T
+        ahead = np.maximum(ahead, 0.05)
+        (left, right), (top, bottom) = (np.quantile(v / ahead, (0.01, 0.99)) for v in (right, down))
+        least = SMALLEST / float(np.median(ahead))
+        focal = 0.8 * min(columns / max(right - left, least), rows / max(bottom - top, least))
+        middle = columns / 2 - focal * (left + right) / 2, rows / 2 - focal * (top + bottom) / 2
+        return cls(SIZE, focal, focal, *middle, T)
+
+    def project(self, points: ArrayLike) -> tuple[Points, Points]:
+        """Columns and rows (..., 2), and distances along the line of sight (...), metres."""
+        turn, position = self.T_cloud_camera[:3, :3], self.T_cloud_camera[:3, 3]
+        x, y, z = np.moveaxis((np.asarray(points, dtype=np.float64) - position) @ turn, -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        return pixels, z if self.fx > 0 else -z
+
+    def rows_of_pixels(self, points: ArrayLike) -> NDArray[np.int64]:
+        """(H, W) the row of the cloud that is seen at each pixel, the nearest; -1: none."""
+        pixels, depth = self.project(points)
+        seen = np.flatnonzero(np.isfinite(pixels).all(axis=1) & (depth > 0.0))
+        seen = seen[np.argsort(-depth[seen], kind="stable")]  # nearer ones over others
+        rows, columns = self.shape
+        column, row = np.clip(np.rint(pixels[seen]), -1e6, 1e6).astype(np.int64).T
+        within = ((row >= 0) & (row < rows) & (column >= 0) & (column < columns)).sum()
+        gap = np.sqrt(rows * columns / max(within, 1))  # pixels from point to point
+        spread = int(min(1.2 * gap - 0.6, SPREAD))
+        around = np.arange(-spread, spread + 1)
+        column = np.add.outer(column, np.tile(around, len(around)))
+        row = np.add.outer(row, np.repeat(around, len(around)))
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        image = np.full(self.shape, -1)
+        of_point = np.broadcast_to(seen[:, None], row.shape)
+        image[row[inside], column[inside]] = of_point[inside]
+        return image
+
+
+class Picture:
+    """A picture of a cloud; what is drawn later lies over what was drawn before.
+
+    Args:
+        view: The camera.
+        points: (N, 3) metres, cloud frame; NaN where there is no reading.
+        colors: (N, 3) uint8, or None.
+        image: (H, W, 3) uint8 of the camera; None: the cloud itself is drawn.
+        title: A line below the picture.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        points: ArrayLike,
+        colors: NDArray[np.uint8] | None = None,
+        image: NDArray[np.uint8] | None = None,
+        title: str = "",
+    ) -> None:
+        from matplotlib.figure import Figure
+
+        self.view = view
+        cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        self.row_of_pixel = view.rows_of_pixels(cloud)
+        seen = self.row_of_pixel >= 0
+        self._depth = np.where(seen, view.project(cloud)[1][self.row_of_pixel], np.nan)
+        if image is None:
+            row = self.row_of_pixel
+            drawn: Any = self._shaded() if colors is None else colors.reshape(-1, 3)[row]
+            image = np.where(seen[..., None], drawn, 255).astype(np.uint8)
+        rows, columns = view.shape
+        height = WIDTH * rows / columns
+        self._figure = Figure(figsize=(WIDTH, height + FOOT), dpi=DPI)
+        self._foot = FOOT / (height + FOOT)
+        self._axes: Any = self._figure.add_axes((0, self._foot, 1, 1 - self._foot))
+        self._axes.set_axis_off()
+        self._axes.imshow(image)
+        self._point = 72 * WIDTH / columns  # points that a pixel is wide
+        self._figure.text(0.015, self._foot / 2, title, fontsize=10, va="center")
+
+    def _shaded(self) -> Points:
+        """(H, W, 3) the cloud in greys."""
+        rows, columns = self.view.shape
+        depth = self._depth
+        for _ in range(SMOOTHED):  # over the noise of the camera
+            around = np.pad(depth, 1, mode="edge")
+            parts = [around[y : y + rows, x : x + columns] for y, x in np.ndindex(3, 3)]
+            near = [np.where(np.abs(part - depth) < BEHIND, part, depth) for part in parts]
+            depth = np.mean(near, axis=0)
+        grey = 70 + 165 * lit(depth, abs(self.view.fx), self.view.fy)
+        return np.repeat(grey[..., None], 3, axis=2)
+
+    def lines(self, points: ArrayLike, color: str, width: float = 1.5) -> None:
+        """Draw a line through points (K, 3), cloud frame."""
+        pixels, _ = self.view.project(points)
+        self._axes.plot(*pixels.T, color=color, linewidth=width)
+
+    def outline(self, mask: NDArray[np.bool_], color: str = "white") -> None:
+        """Draw the border of what is marked in the image: (H, W)."""
+        if mask.any():
+            self._axes.contour(mask, [0.5], colors=color, linewidths=1.0)
+
+    def regions(self, options: Mapping[str, Any]) -> None:
+        """Draw the workspace and the boxes and balls of the regions of a request's options."""
+        boxes = [{"kind": "box", **options["workspace"]}] if options.get("workspace") else []
+        drawn: list[Any] = [(shape, "-") for shape in boxes]
+        for name in ("approach_region", "contact_region"):
+            region = options.get(name) or {}
+            drawn += [(shape, "-") for shape in region.get("include", ())]
+            drawn += [(shape, ":") for shape in region.get("exclude", ())]
+        for shape, style in drawn:
+            for line in _lines_of(shape):
+                pixels, _ = self.view.project(line)
+                self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
+
+    def grasps(self, grasps: Sequence[Drawable]) -> None:
+        """Draw a fork for every grasp, the best last, and the scale of their scores."""
+        from matplotlib import colormaps
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
+
+        scale: Any = ScalarMappable(Normalize(0.0, 1.0), colormaps[MAP])
+        for rank, grasp in reversed(list(enumerate(grasps))):
+            self._fork(fork(grasp.T_cloud_hand, grasp.width), scale.to_rgba(grasp.score))
+            if rank < LABELLED and len(grasps) > 1:
+                self._label(grasp, str(rank + 1))
+        if len(grasps) > 1:
+            axes = self._figure.add_axes((0.78, 0.62 * self._foot, 0.2, 0.16 * self._foot))
+            bar = self._figure.colorbar(
+                scale, cax=axes, orientation="horizontal", ticks=[0, 0.5, 1]
+            )
+            bar.set_label("score: probability that the grasp holds", fontsize=8, labelpad=1)
+            bar.ax.tick_params(labelsize=8, length=2, pad=1)
+
+    def _fork(self, pieces: Points, color: Any) -> None:
+        """Draw a fork, (4, 2, 3); faint where the cloud hides it."""
+        _, depth = self.view.project(pieces)
+        bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
+        for width, shade in ((bar + 1.6, OUTLINE), (bar, color)):
+            for start, end in pieces:
+                along = start + np.linspace(0, 1, 17)[:, None] * (end - start)
+                pixels, far = self.view.project(along)
+                hidden = far > self._depth_at(pixels) + BEHIND
+                for solid in (True, False):
+                    part = np.where((hidden ^ solid)[:, None], pixels, np.nan)
+                    alpha, cap = (1.0, "round") if solid else (0.25, "butt")
+                    self._axes.plot(
+                        *part.T, color=shade, linewidth=width, alpha=alpha, solid_capstyle=cap
+                    )
+
+    def _depth_at(self, pixels: Points) -> Points:
+        """Distance of the cloud at pixels (K, 2); NaN where there is none."""
+        column, row = np.rint(pixels).astype(int).T
+        rows, columns = self.view.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+        return np.where(inside, self._depth[at], np.nan)
+
+    def _label(self, grasp: Drawable, text: str) -> None:
+        (x, y), _ = self.view.project(fork(grasp.T_cloud_hand, grasp.width)[0, 0])
+        box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
+        self._axes.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True)
+
+    def save(self, path: Path | BinaryIO) -> None:
+        """Write it: a `.png` or `.jpg` file, whose folder must exist, or a PNG to a stream."""
+        rows, columns = self.view.shape
+        self._axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+        self._figure.savefig(path)
+
+
 def draw_grasps(
     path: Path | BinaryIO,
     cloud: ArrayLike,
@@ -44,51 +251,34 @@ def draw_grasps(
     camera_position: ArrayLike,
     title: str,
 ) -> None:
-    """Write a picture: the cloud and a fork for every gripper, seen by the camera and from above.
-
-    A fork is a gripper's outline at the grasp: a stem where the hand comes from, the palm's
-    surface, and the inner faces of the fingers at the opening they start from.
+    """Write a picture of a cloud and of grasps in it, as `Picture.save` does.
 
     Args:
         path: `.png` or `.jpg` file to write, whose folder must exist; or where to write a PNG.
         cloud: (N, 3) metres.
-        grasps: best first; coloured by score, the best one edged in red.
-        camera_position: (3,) metres, cloud frame; the first view looks from there.
-        title: one line above the picture.
+        grasps: best first.
+        camera_position: (3,) metres, cloud frame; the picture looks from there.
+        title: a line below it.
     """
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.figure import Figure
+    picture = Picture(View.of(cloud, camera_position), cloud, title=title)
+    picture.grasps(grasps)
+    picture.save(path)
 
-    points = np.asarray(cloud, dtype=np.float64)
-    if len(points) > MAX_CLOUD_POINTS:
-        points = points[np.linspace(0, len(points) - 1, MAX_CLOUD_POINTS).astype(int)]
-    camera = np.asarray(camera_position, dtype=np.float64)
-    forks = [fork(grasp.T_cloud_hand, grasp.width) for grasp in grasps]
-    scores = np.array([grasp.score for grasp in grasps] or [0.0])
-    colours = ScalarMappable(
-        Normalize(min(scores.min(), scores.max() - 0.01), scores.max()), colormaps["plasma"]
-    )
-    low = np.min([points.min(0), *(f.min((0, 1)) for f in forks)], axis=0) - MARGIN
-    high = np.max([points.max(0), *(f.max((0, 1)) for f in forks)], axis=0) + MARGIN
 
-    figure = Figure(figsize=(17, 8.4), dpi=110)
-    figure.suptitle(title, fontsize=16)
-    perspective: Any = figure.add_axes((0.01, 0.07, 0.52, 0.82), projection="3d")
-    above: Any = figure.add_axes((0.56, 0.10, 0.35, 0.76))
-    _draw_perspective(perspective, points, camera, low, high)
-    _draw_above(above, points, low, high)
-    for rank, lines in reversed(list(enumerate(forks))):
-        colour = colours.to_rgba(scores[rank])
-        for axes, dimensions in ((perspective, 3), (above, 2)):
-            draw_fork(axes, lines[..., :dimensions], colour, rank, labelled=len(forks) > 1)
-    figure.text(0.5, 0.015, CAPTION, fontsize=12, ha="center")
-    if len(forks) > 1:
-        bar = figure.colorbar(colours, cax=figure.add_axes((0.935, 0.14, 0.014, 0.68)))
-        bar.set_label("score: probability that the grasp holds", fontsize=13)
-        bar.ax.tick_params(labelsize=12)
-    figure.savefig(path)
+def lit(depth: NDArray[np.floating], fx: float, fy: float) -> Points:
+    """How bright a lamp over the camera makes what it sees, from 0 to 1: (H, W).
+
+    Args:
+        depth: (H, W) metres along the line of sight; NaN where there is nothing.
+        fx: pixels.
+        fy: pixels.
+    """
+    down, right = np.gradient(np.asarray(depth, dtype=np.float64))
+    x, y = right * fx / depth, down * fy / depth
+    # The surface's normal is (x, y, -1), not of unit length.
+    facing = (LAMP[0] * x + LAMP[1] * y - LAMP[2]) / np.sqrt(x**2 + y**2 + 1)
+    light: Points = np.clip(np.nan_to_num(facing), 0.0, 1.0)
+    return light
 
 
 def fork(T_cloud_hand: ArrayLike, width: float) -> Points:
@@ -115,70 +305,24 @@ def fork(T_cloud_hand: ArrayLike, width: float) -> Points:
     return in_cloud
 
 
-def _greys(points: Points) -> Points:
-    """Grey by height, lighter above, none so dark or light that a fork gets lost: (N, 3)."""
-    z = points[:, 2]
-    level = (z - z.min()) / max(float(np.ptp(z)), 1e-6)
-    greys: Points = np.repeat(0.42 + 0.4 * level[:, None], 3, axis=1)
-    return greys
-
-
-def _draw_perspective(axes: Any, points: Points, camera: Points, low: Points, high: Points) -> None:
-    from matplotlib.ticker import MultipleLocator
-
-    centre = (low + high) / 2
-    x, y, z = camera - centre
-    axes.set_proj_type("persp")
-    axes.computed_zorder = False  # grippers in front of the cloud
-    axes.view_init(
-        elev=np.degrees(np.arctan2(z, np.hypot(x, y))), azim=np.degrees(np.arctan2(y, x))
-    )
-    axes.scatter(*points.T, c=_greys(points), s=5)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.0)
-    axes.set_title(
-        "as seen from the camera at x {:.2f}, y {:.2f}, z {:.2f} m".format(*camera), fontsize=13
-    )
-    for name in "xyz":
-        getattr(axes, f"set_{name}label")(f"{name} (m)", fontsize=12, labelpad=8)
-        getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(TICKS))
-    axes.tick_params(labelsize=10)
-
-
-def _draw_above(axes: Any, points: Points, low: Points, high: Points) -> None:
-    from matplotlib.ticker import MultipleLocator
-
-    upward = points[np.argsort(points[:, 2])]
-    axes.scatter(*upward[:, :2].T, c=_greys(upward), s=7)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axes.set_title("from above, looking along -z", fontsize=13)
-    axes.set_xlabel("x (m)", fontsize=12)
-    axes.set_ylabel("y (m)", fontsize=12)
-    axes.xaxis.set_major_locator(MultipleLocator(TICKS))
-    axes.yaxis.set_major_locator(MultipleLocator(TICKS))
-    axes.tick_params(labelsize=11)
-    axes.grid(alpha=0.25)
-    axes.set_axisbelow(True)
-
-
-def draw_fork(axes: Any, lines: Points, colour: Any, rank: int, *, labelled: bool) -> None:
-    """Draw the pieces of a fork, (4, 2, 2) or (4, 2, 3), the best (rank 0) edged in red."""
-    best = rank == 0
-    layer = 1000 - rank
-    for width, shade in (
-        ((7.0, BEST_EDGE), (4.0, colour)) if best else ((3.2, OUTLINE), (2.0, colour))
-    ):
-        for piece in lines:
-            axes.plot(*piece.T, color=shade, linewidth=width, solid_capstyle="round", zorder=layer)
-    if labelled and rank < LABELLED:
-        axes.text(
-            *lines[0, 0],
-            "1 (best)" if best else str(rank + 1),
-            fontsize=13 if best else 11,
-            fontweight="bold",
-            color=BEST_EDGE if best else OUTLINE,
-            ha="center",
-            va="bottom",
-            zorder=2000,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
-        )
+def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
+    """Edges of a box, or circles of a ball, as lines (K, 3); nothing of other shapes."""
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    kind = shape.get("kind")
+    if kind == "sphere":
+        angle = np.linspace(0, 2 * np.pi, 60)
+        circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+        for turned in range(3):
+            yield shape["center"] + shape["radius"] * np.roll(circle, turned, axis=1)
+    elif kind in ("box", "oriented_box"):
+        if kind == "box":
+            low, high = np.asarray(shape["min"]), np.asarray(shape["max"])
+            corners = (low + high) / 2 + corners * (high - low) / 2
+        else:
+            x, y, z, w = shape.get("quaternion", (0.0, 0.0, 0.0, 1.0))
+            vector = np.array([x, y, z])
+            corners = corners * shape["half_extents"]
+            twice = 2 * np.cross(vector, corners)
+            corners = shape["center"] + corners + w * twice + np.cross(vector, twice)
+        for first, second in EDGES:
+            yield corners[[first, second]]

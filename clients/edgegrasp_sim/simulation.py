@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Self, TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_sim.camera import (
     CAMERA,
@@ -23,6 +23,7 @@ from edgegrasp_sim.camera import (
 from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
+from edgegrasp_sim.picture import lit
 from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
@@ -45,6 +46,19 @@ from edgegrasp_sim.surroundings import (
 )
 
 NOISE_STD = 0.001  # metres
+WOOD = np.array([168.0, 140.0, 110.0])  # colour of what never moves
+PAINTS = np.array(
+    [
+        (230, 72, 60),
+        (52, 132, 210),
+        (238, 128, 50),
+        (62, 176, 116),
+        (245, 240, 226),
+        (150, 96, 180),
+        (52, 66, 86),
+    ],
+    dtype=np.float64,
+)  # of objects; none is yellow, as good grasps are
 _CROP_MARGIN = 0.01  # metres; points further out cannot come back in by noise
 
 
@@ -294,6 +308,31 @@ class ClutterSimulation:
             pixels=np.flatnonzero(depth < FARTHEST * CAMERA.far) if whole else None,
         )
 
+    def color_image(self, T_world_camera: Matrix) -> NDArray[np.uint8]:
+        """The scene in colour from a pose (4, 4): (H, W, 3), each object of a paint of its own."""
+        depth = self.world.render_depth(T_world_camera, CAMERA)
+        seen = depth < FARTHEST * CAMERA.far
+        points = points_of(depth, T_world_camera, CAMERA)
+        numbers = {item.body.uid: number for number, item in enumerate(self._objects)}
+        row = np.flatnonzero(
+            np.any([_inside(points, *bounds) for bounds in self.object_bounds], axis=0)
+        )
+        # From a little before what is seen to a little behind: shapes may be filled hollows.
+        sight = points[row] - T_world_camera[:3, 3]
+        sight *= 0.003 / np.linalg.norm(sight, axis=1, keepdims=True)
+        painted = np.full((len(points), 3), WOOD)
+        for part in np.array_split(row, len(row) // 10_000 + 1):
+            ahead = sight[np.searchsorted(row, part)]
+            for reach in (2.0, 30.0):  # then all that lies there
+                hits = self.world.first_hits(points[part] - reach * ahead, points[part] + ahead)
+                found = np.array([numbers.get(uid, -1) for uid in hits])
+                painted[part[found >= 0]] = PAINTS[found[found >= 0] % len(PAINTS)]
+                part, ahead = part[found < 0], ahead[found < 0]
+        light = lit(np.where(seen, depth, np.nan), CAMERA.focal_length, CAMERA.focal_length)
+        image = np.full((*depth.shape, 3), 255.0)
+        image[seen] = painted * (0.45 + 0.55 * light[seen][:, None])
+        return image.astype(np.uint8)
+
     def save_state(self) -> int:
         """Keep the scene's present state; valid until an object is removed or the scene changes."""
         return self.world.save_state()
@@ -410,3 +449,9 @@ class ClutterSimulation:
         if self._rest_state is not None:
             self.world.remove_state(self._rest_state)
             self._rest_state = None
+
+
+def _inside(points: Matrix, low: Matrix, high: Matrix) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie in a box or within 3 mm of it."""
+    inside = (points > low - 0.003) & (points < high + 0.003)
+    return np.asarray(inside.all(axis=1))

@@ -95,6 +95,10 @@ class Settings(BaseModel):
         None, description="tokens that may reload weights too, one a line; none: SIGHUP only"
     )
     grace_seconds: Wait = Field(10.0, description="for requests in flight when stopping, seconds")
+    playground: bool = Field(True, description="whether / is the playground; else it is /docs")
+    samples: Path | None = Field(
+        None, description="folder of scenes the playground offers, open to all; samples.json in it"
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="least severe records logged"
     )

@@ -99,17 +99,17 @@ def test_clouds_show_the_same_scene_as_depth_images(scene: Path, tmp_path: Path)
     organised = {"points": turned.reshape(*SHAPE, 3), "support_normal": NORMAL * (1, -1, -1)}
     rest = {name: arrays[name] for name in ("labels", "support_offset")}
     np.savez(tmp_path / "organised.npz", **rest, **organised)
-    assert load_scene(tmp_path / "organised.npz").camera == pytest.approx(
-        (-INTRINSICS[0], *INTRINSICS[1:]), abs=0.01
-    )
+    camera = load_scene(tmp_path / "organised.npz").camera
+    wanted = pytest.approx((-INTRINSICS[0], *INTRINSICS[1:]), abs=0.01)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == wanted
     seen = np.isfinite(image.points).all(axis=1)
     flat = {"points": image.points[seen], "labels": arrays["labels"].ravel()[seen]}
     beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
     np.savez(tmp_path / "flat.npz", **flat, **beside)
     virtual = load_scene(tmp_path / "flat.npz")
-    column, row = virtual.camera.pixels(virtual.points).T
-    assert (column.min() >= 0) & (column.max() < virtual.shape[1])
-    assert (row.min() >= 0) & (row.max() < virtual.shape[0])
+    column, row = virtual.camera.project(virtual.points)[0].T
+    assert (column.min() >= 0) & (column.max() < virtual.camera.shape[1])
+    assert (row.min() >= 0) & (row.max() < virtual.camera.shape[0])
 
 
 def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:

@@ -105,6 +105,29 @@ def test_a_depth_image_is_grasped_where_its_mask_is(camera_files, dummy_server, 
         assert json.loads(run("detect", *flags, "--server", address))["counts"]["points"] == 768
 
 
+def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
+    camera_files, file, dummy_server, run, tmp_path
+) -> None:
+    depth, _, color, *camera = camera_files
+    asked = ("--server", dummy_server.http_url, "--picture")
+    clouds = {"depth": (depth, *camera), "color": (depth, color, *camera), "cloud": (file,)}
+    ball = '{"include":[{"kind":"sphere","center":[0,0,0],"radius":0.05}]}'
+    clouds["region"] = (file, "--contact-region", ball)
+    pictures = {}
+    for name, flags in clouds.items():
+        drawn = tmp_path / f"seen_{name}.png"
+        run("detect", *flags, *asked, drawn)
+        with Image.open(drawn) as picture:
+            pictures[name] = np.asarray(picture.convert("RGB")).astype(int)
+    white = {name: (pixels.min(axis=2) > 250).mean() for name, pixels in pictures.items()}
+    assert white["color"] > white["depth"]  # the mask's white is the image's
+    assert 1 - white["cloud"] > 0.02
+    cyan = {
+        name: np.abs(pixels - (76, 201, 240)).max(axis=2) < 30 for name, pixels in pictures.items()
+    }
+    assert cyan["region"].sum() > 200 > cyan["cloud"].sum()
+
+
 def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
     depth, mask, *_ = camera_files
     for flags, sentence in (

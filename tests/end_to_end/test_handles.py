@@ -148,8 +148,8 @@ def test_the_examples_grasp_what_was_marked(start_server, shipped, tmp_path: Pat
     examples = Path(__file__).parents[2] / "examples"
     intrinsics = ",".join(str(number) for number in (focal, focal, *centre))
     files = {
-        "05_handle_of_the_red_mug.py": ["depth.npy", "handle.png", intrinsics],
-        "06_object_and_scene.py": ["handle.npy", "scene.npy"],
+        "12_handle_of_the_red_mug.py": ["depth.npy", "handle.png", intrinsics],
+        "13_object_and_scene.py": ["handle.npy", "scene.npy"],
     }
     with start_server("--log-level", "warning") as server:
         for example, words in files.items():

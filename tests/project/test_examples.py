@@ -1,14 +1,18 @@
 """The examples run as their first lines say."""
 
 import json
+import os
 import re
-import shutil
 import subprocess
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
+
+from edgegrasp_client.conversions import pose_from_moveit_grasp, read_isaac_grasps
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -24,9 +28,10 @@ def cloud_file(tmp_path: Path) -> Path:
     return path
 
 
-def run(*command: object) -> subprocess.CompletedProcess[str]:
+def run(*command: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(word) for word in command],
+        env=env,
         capture_output=True,
         text=True,
         check=False,
@@ -50,7 +55,7 @@ def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_p
 
 
 def test_python_example_prints_five_grasps(dummy_server, cloud_file: Path) -> None:
-    example = EXAMPLES / "01_detect_from_python.py"
+    example = EXAMPLES / "01_post_a_cloud.py"
     over_grpc = run(sys.executable, example, cloud_file, dummy_server.grpc_address)
     over_rest = run(sys.executable, example, cloud_file, dummy_server.http_url)
     assert over_grpc.stdout.count("score 0.") == 5, over_grpc.stderr
@@ -62,18 +67,25 @@ def test_stream_example_prints_a_grasp_of_each_cloud_and_goes_on(dummy_server, c
     np.save(empty, np.zeros((0, 3), np.float32))
     names = [str(cloud_file), str(empty), str(cloud_file)]
     for address in (dummy_server.grpc_address, dummy_server.http_url):
-        done = run(sys.executable, EXAMPLES / "04_stream_of_clouds.py", *names, "--server", address)
+        done = run(sys.executable, EXAMPLES / "10_stream_of_clouds.py", *names, "--server", address)
         first, second, third = done.stdout.splitlines()
         assert first == third
         assert first.startswith(f"{cloud_file}: score 0.")
         assert second.startswith(f"{empty}: cloud: got ")
 
 
-@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
-def test_curl_example_prints_five_grasps(dummy_server, cloud_file: Path) -> None:
-    done = run("bash", EXAMPLES / "02_detect_over_rest.sh", cloud_file, dummy_server.http_url)
+@pytest.fixture(scope="module")
+def address(start_server) -> Iterator[str]:
+    """A server with the weights that ship."""
+    with start_server("--workers", "1") as server:
+        yield server.grpc_address
+
+
+def example(name: str, *words: object) -> str:
+    """What an example prints."""
+    done = run(sys.executable, EXAMPLES / name, *words)
     assert done.returncode == 0, done.stderr
-    assert len(json.loads(done.stdout)["grasps"]) == 5
+    return done.stdout
 
 
 def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Path) -> None:
@@ -94,3 +106,79 @@ def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Pat
     wrong = run(build / "detect", depth, 99, *camera[2:], dummy_server.grpc_address)
     assert wrong.returncode == 1
     assert wrong.stderr.startswith("error 3: depth_images.0")
+
+
+def test_region_on_a_handle(address: str) -> None:
+    shown = example("02_region_on_a_handle.py", address)
+    contacts = re.findall(r"contact point at (\S+), (\S+), (\S+) m", shown)
+    assert len(contacts) == 5
+    apart = np.array(contacts, dtype=float) - (0.122, 0.098, 0.497)
+    assert np.linalg.norm(apart, axis=1).max() < 0.023
+
+
+def test_your_gripper(address: str) -> None:
+    small, panda = example("03_your_gripper.py", address).split("panda:")
+    openings = [int(text) for text in re.findall(r"opening (\d+) mm", small)]
+    assert len(openings) == panda.count("score") == 5
+    assert max(openings) <= 50
+
+
+def test_depth_camera(tmp_path: Path) -> None:
+    shown = example("04_depth_camera.py", tmp_path)
+    assert shown.count("score 0.") == 5
+    with Image.open(tmp_path / "depth.png") as depth, Image.open(tmp_path / "color.png") as color:
+        assert depth.mode == "I;16"
+        assert depth.size == color.size == (640, 480)
+
+
+def test_several_views(address: str) -> None:
+    counts = re.findall(r"(\d) views: (\d+) points", example("05_several_views.py", address))
+    (one, few), (three, many) = counts
+    assert (one, three) == ("1", "3")
+    assert int(many) > 2 * int(few)
+
+
+def test_pick_and_place(address: str) -> None:
+    shown = example("06_pick_and_place.py", "--server", address, "--picks", 2)
+    assert "2 of 4 things in the tray" in shown
+
+
+def test_your_planner(tmp_path: Path) -> None:
+    program = "from edgegrasp_cli.main import main; main()"
+    asked = ("benchmark", "--planner", "07_your_planner:plan", "--scene", "packed", "--rounds", "2")
+    flags = ("--seed", "0", "--workers", "1", "--no-report", "--output", tmp_path)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(EXAMPLES)])}
+    done = run(sys.executable, "-c", program, *asked, *flags, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "07_your_planner:plan: GSR" in done.stdout
+    assert json.loads((tmp_path / "summary.json").read_text())["attempts"] > 0
+
+
+def test_training_on_your_objects(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 5) for y in (0, 4) for z in (0, 9))
+    quads = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+    block = corners + "".join(f"f {quad}\n" for quad in quads)
+    for split in ("train", "test"):
+        folder = tmp_path / "objects" / "packed" / split
+        folder.mkdir(parents=True)
+        (folder / "block.obj").write_text(block)
+    programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    words = (tmp_path / "objects", tmp_path / "out", 1, 1)
+    environment = os.environ | {"PATH": programs}
+    done = run("bash", EXAMPLES / "08_train_on_your_objects.sh", *words, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "run" / "edgegrasp-plus.safetensors").is_file()
+    assert "GSR" in done.stdout
+
+
+def test_export(address: str, tmp_path: Path) -> None:
+    assert example("09_export.py", tmp_path, address).startswith("10 grasps in ")
+    messages = json.loads((tmp_path / "moveit.json").read_text())
+    read = read_isaac_grasps((tmp_path / "isaac.yaml").read_text())
+    assert len(messages) == len(read) == 10
+    pose = pose_from_moveit_grasp(messages[0])
+    assert np.allclose(pose, read[0].T_object_gripper, atol=1e-5)
+
+
+def test_without_a_server() -> None:
+    assert example("11_without_a_server.py").count("score 0.") == 5

@@ -2,11 +2,13 @@
 
 import os
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+INSTALL = Path(__file__).parents[2] / "scripts" / "install.py"
 SCRIPT = Path(__file__).parents[2] / "scripts" / "system_packages.sh"
 VENV_CHECK = "import ensurepip, venv"
 
@@ -64,3 +66,12 @@ def test_what_is_missing_is_installed_by_root_and_told_to_others(
         ]
     elif lacks == "none":
         assert done.stdout + done.stderr == ""
+
+
+def test_an_install_says_whether_it_went_well(tmp_path: Path) -> None:
+    constraints = INSTALL.parents[1] / "constraints.txt"
+    for wanted, code in (("numpy", 0), (tmp_path / "absent", 1)):
+        command = [sys.executable, INSTALL, constraints, "--dry-run", "--no-index", wanted]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stderr
+        assert ("absent" in done.stderr) == (code != 0)

@@ -11,13 +11,22 @@ import pytest
 def test_pages_work_without_internet(dummy_server) -> None:
     """Row 13."""
     with httpx.Client(base_url=dummy_server.http_url, follow_redirects=True) as http:
-        page = http.get("/")
-        assert page.url.path == "/docs"
-        links = re.findall(r'(?:src|href)="([^"]+)"', page.text)
-        assert any(link.endswith(".js") for link in links)
-        for link in links:
-            assert link.startswith("/"), "it would be fetched from elsewhere"
-            assert http.get(link).status_code == 200
+        for path in ("/", "/docs"):
+            page = http.get(path)
+            links = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+            assert any(link.endswith(".js") for link in links)
+            for link in links:
+                assert not link.startswith(("http", "//")), "it would be fetched from elsewhere"
+                assert http.get(page.url.join(link)).status_code == 200
+
+
+def test_the_front_page_is_the_playground_or_that_of_the_api(dummy_server, start_dummy) -> None:
+    front = httpx.get(dummy_server.http_url, follow_redirects=True)
+    assert front.url.path == "/playground/"
+    assert "default-src 'none'" in front.headers["content-security-policy"]
+    with start_dummy("--no-playground") as server:
+        assert httpx.get(server.http_url, follow_redirects=True).url.path == "/docs"
+        assert httpx.get(f"{server.http_url}/playground/").status_code == 404
 
 
 def test_head_is_get_without_the_body(dummy_server) -> None:

@@ -12,10 +12,12 @@ from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse,
 from fastapi_offline import FastAPIOffline
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
+from edgegrasp_model.gripper import gripper_names, load_gripper
 from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
 from edgegrasp_service.front.http_protocol import problem_document
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
@@ -23,6 +25,12 @@ from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, cu
 from edgegrasp_service.worker.job import Answer, Job, Method
 
 ASSETS = "/docs/assets"
+PLAYGROUND = "/playground/"
+PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
+OWN_ONLY = (  # what the playground may load, and who may show it
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
 CHALLENGE = 'Bearer realm="edgegrasp"'
 TIMEOUT = "X-Request-Timeout"
 
@@ -60,7 +68,8 @@ class HttpMiddleware:
             name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]
         }
         path = scope["path"]
-        method = METHODS.get(path, "Docs" if path.startswith(f"{ASSETS}/") else "other")
+        page = path.startswith((f"{ASSETS}/", PLAYGROUND))
+        method = METHODS.get(path, "Docs" if page else "other")
         peer = scope["client"][0] if scope["client"] else ""
         whole = headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
         call = Call("http", method, headers.get(REQUEST_ID_HEADER, ""), peer)
@@ -111,6 +120,7 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         metrics: What /metrics shows.
         reloader: What reloads.
     """
+    settings = service.settings
     app: FastAPI = FastAPIOffline(
         title="EdgeGrasp", redoc_url=None, static_url=ASSETS, redirect_slashes=False
     )
@@ -157,9 +167,30 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
 
     @app.get("/")
     async def index() -> Response:
-        return RedirectResponse("/docs")
+        return RedirectResponse(PLAYGROUND if settings.playground else "/docs")
 
+    if settings.playground:
+        grippers = {name: load_gripper(name) for name in gripper_names()}
+        grippers |= {file.stem: load_gripper(file) for file in settings.grippers}
+
+        @app.get(f"{PLAYGROUND}grippers.json")
+        async def show_grippers() -> dict[str, Any]:
+            return grippers
+
+        samples = settings.samples or PLAYGROUND_FILES / "samples"
+        app.mount(f"{PLAYGROUND}samples", _Pages(directory=samples))
+        app.mount(PLAYGROUND.rstrip("/"), _Pages(directory=PLAYGROUND_FILES, html=True))
     return app
+
+
+class _Pages(StaticFiles):
+    """Files of the playground."""
+
+    def file_response(self, *args: Any, **named: Any) -> Response:
+        response = super().file_response(*args, **named)
+        response.headers["content-security-policy"] = OWN_ONLY
+        response.headers["x-content-type-options"] = "nosniff"
+        return response
 
 
 class _GraspResponse(Response):

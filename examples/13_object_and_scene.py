@@ -1,6 +1,6 @@
 """Grasps of one object, whose cloud comes apart from that of its scene.
 
-usage: python examples/06_object_and_scene.py object.npy scene.npy [address]
+usage: python examples/13_object_and_scene.py object.npy scene.npy [address]
 
 Both are (N, 3) metres in the frame of the camera, which stands at its origin. The scene may hold
 the object too. Needs only the base install, `pip install edgegrasp`.

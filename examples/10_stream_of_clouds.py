@@ -1,6 +1,6 @@
 """A controller's loop: one stream, cloud after cloud, the best grasp of each.
 
-usage: python examples/04_stream_of_clouds.py cloud.ply [another.ply ...] [--server ADDRESS]
+usage: python examples/10_stream_of_clouds.py cloud.ply [another.ply ...] [--server ADDRESS]
 
 ADDRESS is host:port for gRPC (127.0.0.1:50051 unless given) or a URL for REST. Needs only the base
 install, `pip install edgegrasp`.

@@ -1,6 +1,6 @@
 """Grasps of what a segmenter marked in a depth image, such as "the handle of the red mug".
 
-usage: python examples/05_handle_of_the_red_mug.py depth.png handle.png fx,fy,cx,cy [address]
+usage: python examples/12_handle_of_the_red_mug.py depth.png handle.png fx,fy,cx,cy [address]
 
 The mask is an image of the same size that is not 0 on the handle: any segmenter's will do (Grounded
 SAM and its like take the words). What is not marked stays an obstacle. Needs Pillow.

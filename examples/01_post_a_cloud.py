@@ -1,6 +1,6 @@
 """Grasps of a cloud file, from a running server.
 
-usage: python examples/01_detect_from_python.py cloud.ply [address]
+usage: python examples/01_post_a_cloud.py cloud.ply [address]
 
 The address is host:port for gRPC (127.0.0.1:50051 unless given) or a URL for REST. Needs only the
 base install, `pip install edgegrasp`.

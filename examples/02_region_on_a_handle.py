@@ -1,0 +1,34 @@
+"""Grasps of a mug by its handle: both points of every grasp lie in a region.
+
+usage: python examples/02_region_on_a_handle.py [ADDRESS]
+
+The image is the playground's sample; a region is drawn there with the mouse, too.
+"""
+
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+from edgegrasp_client import DepthImage, GraspClient, Region
+
+SAMPLE = Path(str(files("edgegrasp_service"))) / "playground/samples/depth.png"
+IMAGE: DepthImage = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
+HANDLE: Region = {
+    "include": [{"kind": "sphere", "center": (0.122, 0.098, 0.497), "radius": 0.022}]
+}  # metres, camera frame
+
+
+def main(address: str = "127.0.0.1:50051") -> None:
+    """Print the grasps whose approach point and contact point lie on the handle."""
+    with GraspClient(address) as client:
+        detection = client.detect(
+            depth_images=[IMAGE], approach_region=HANDLE, contact_region=HANDLE, top_k=5
+        )
+    for grasp in detection.grasps:
+        x, y, z = grasp.contact_point
+        print(f"score {grasp.score:.3f}, contact point at {x:.3f}, {y:.3f}, {z:.3f} m")
+    print("counts:", detection.counts)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

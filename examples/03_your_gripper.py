@@ -1,0 +1,39 @@
+"""Grasps for a gripper of your own, which no weights were trained for.
+
+usage: python examples/03_your_gripper.py [ADDRESS]
+
+Lengths are metres in the hand frame: z out of the palm, y the closing direction. docs/frames.md
+describes the fields; `edgegrasp serve --grippers FILE.toml` gives them a name.
+"""
+
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+from edgegrasp_client import DepthImage, GraspClient, GripperGeometry
+
+SAMPLE = Path(str(files("edgegrasp_service"))) / "playground/samples/depth.png"
+IMAGE: DepthImage = {"depth": SAMPLE, "intrinsics": (540.0, 540.0, 320.0, 239.0)}
+SMALL: GripperGeometry = {
+    "name": "small",
+    "max_opening": 0.05,
+    "tip_z": 0.085,  # fingertips
+    "contact_z": 0.080,  # where contacts are put
+    "tcp_z": 0.080,
+    "hand": {"boxes": [((-0.02, -0.04, 0.0), (0.02, 0.04, 0.045))]},
+    "finger": {"boxes": [((-0.006, 0.0, 0.045), (0.006, 0.010, 0.085))]},  # inner face at y = 0
+}
+
+
+def main(address: str = "127.0.0.1:50051") -> None:
+    """Print the best grasps for a small gripper and for the one the weights were trained for."""
+    with GraspClient(address) as client:
+        for gripper in (SMALL, "panda"):
+            detection = client.detect(depth_images=[IMAGE], gripper=gripper, top_k=5)
+            print("panda:" if gripper == "panda" else "small:")
+            for grasp in detection.grasps:
+                print(f"  score {grasp.score:.3f}, opening {1000 * grasp.width:.0f} mm")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

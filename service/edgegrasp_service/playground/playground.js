@@ -1,0 +1,464 @@
+// The page: what is asked, of the same API as anyone's, and what is shown of the answer.
+
+import { NeedsCamera, readScene } from "./files.js";
+import { View, colorOf } from "./view.js";
+
+const API = new URL("..", import.meta.url).href.replace(/\/$/, ""); // the server's own address
+const MOST_REJECTED = 300; // shown; more would hide the cloud
+const REASONS = {
+  direction: "moves in a way not allowed", support: "goes below the support", "not-checked": "left out, not checked",
+  collision: "collides", "not-scored": "left out, not scored", "low-score": "scores too low",
+  suppressed: "near a better one", "beyond-top-k": "beyond top_k",
+};
+const $ = (id) => document.getElementById(id);
+const state = { files: [], scene: null, answer: null, fresh: true, shapes: {}, grippers: {}, chosen: null, busy: null };
+const view = new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn });
+
+start();
+
+async function start() {
+  state.grippers = await (await fetch("grippers.json")).json();
+  for (const name of Object.keys(state.grippers)) $("gripper").add(new Option(name, name));
+  $("gripper").add(new Option("default", ""), 0);
+  $("gripper").value = "";
+  await listSamples();
+  if (await listModels()) await openSample();
+}
+
+// Scenes
+
+async function listSamples() {
+  const answer = await fetch("samples/samples.json");
+  state.samples = answer.ok ? await answer.json() : [];
+  for (const [row, { name }] of state.samples.entries()) $("sample").add(new Option(name, row));
+  $("sample").closest("label").hidden = !state.samples.length;
+}
+
+/** Show the chosen sample, and ask for its grasps. */
+async function openSample() {
+  const sample = state.samples[$("sample").value];
+  if (!sample) return say("Open a point cloud or a depth image.");
+  for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = sample[field] ?? "";
+  const files = await Promise.all(sample.files.map(async (name) => {
+    const blob = await (await fetch(`samples/${encodeURIComponent(name)}`)).blob();
+    return new File([blob], name);
+  }));
+  if (await open(files)) await ask();
+}
+
+/** Read files and show them; whether that went well. */
+async function open(files) {
+  state.files = files;
+  [state.answer, state.scene, state.fresh] = [null, null, true];
+  const image = files.some(({ name }) => /\.png$/i.test(name));
+  $("camera").hidden = !image;
+  try {
+    busy(`Reading ${files.map(({ name }) => name).join(", ")}…`);
+    const scene = await readScene(files, { intrinsics: $("intrinsics").value, depth_scale: $("depth_scale").value });
+    scene.viewpoint = numbers($("viewpoint").value, 3);
+    view.showScene(scene);
+    state.scene = scene;
+    if (scene.image) Object.entries(scene.image).forEach(([name, value]) => name === "depth" || ($(name).value = value));
+  } catch (error) {
+    if (error instanceof NeedsCamera) $("camera").hidden = false;
+    say(error.message, true);
+    return false;
+  } finally {
+    busy(null);
+  }
+  $("camera").hidden = !state.scene.image;
+  $("viewpoint_row").hidden = Boolean(state.scene.image);
+  for (const name of Object.keys(state.shapes)) setShape(name, null);
+  showAnswer();
+  say(`${(state.scene.points.length / 3).toLocaleString("en")} points of ${state.scene.name}.`);
+  return true;
+}
+
+// The request
+
+/** The options that differ from the API's defaults. */
+function options() {
+  const found = {};
+  const viewpoint = numbers($("viewpoint").value, 3);
+  if (viewpoint && !state.scene?.image) found.viewpoint = viewpoint;
+  for (const name of ["model", "gripper"]) if ($(name).value) found[name] = $(name).value;
+  const { cone, region, workspace } = state.shapes;
+  if (cone) found.approach_direction = { cones: [rounded(cone)] };
+  else if ($("approach").value) found.approach_direction = { preset: $("approach").value };
+  if (region) {
+    const asked = { [$("region_kind").value]: [{ kind: "oriented_box", ...rounded(region) }] };
+    Object.assign(found, { approach_region: asked, contact_region: asked });
+  }
+  if (workspace) {
+    const corner = (sign) => workspace.center.map((value, axis) => value + sign * workspace.half_extents[axis]);
+    found.workspace = rounded({ min: corner(-1), max: corner(1) });
+  }
+  if ($("debug").checked) found.debug = true;
+  const more = $("more").value.trim();
+  return more ? { ...found, ...JSON.parse(more) } : found;
+}
+
+function rounded(shape) {
+  return JSON.parse(JSON.stringify(shape, (_, value) => (typeof value === "number" ? +value.toFixed(5) : value)));
+}
+
+/** A request, as `fetch` takes it. */
+function request(asked) {
+  const { cloud, image } = state.scene;
+  if (cloud) {
+    const format = cloud.name.split(".").pop().toLowerCase();
+    return { path: `/v1/grasps${query(asked)}`, headers: { "content-type": `application/x-${format}` }, body: cloud };
+  }
+  const body = new FormData();
+  body.append("depth", image.depth, image.depth.name);
+  body.append("intrinsics", image.intrinsics);
+  if (image.depth_scale) body.append("depth_scale", image.depth_scale);
+  body.append("options", JSON.stringify(asked));
+  return { path: "/v1/grasps", headers: {}, body };
+}
+
+function query(asked) {
+  const parts = Object.entries(asked).map(([name, value]) => {
+    const text = typeof value === "string" ? value : JSON.stringify(value);
+    return `${name}=${encodeURIComponent(text).replace(/%2C/g, ",")}`;
+  });
+  return parts.length ? `?${parts.join("&")}` : "";
+}
+
+/** Ask for grasps, and show them; the newest request wins. */
+async function ask() {
+  if (!state.scene && !(state.files.length && (await open(state.files)))) return;
+  let asked;
+  try {
+    asked = options();
+  } catch {
+    return say("More options: no valid JSON.", true);
+  }
+  state.busy?.abort();
+  const stop = (state.busy = new AbortController());
+  busy("Looking for grasps…");
+  try {
+    showCode(asked);
+    const start = performance.now();
+    const { path, ...rest } = request(asked);
+    const answer = await call(path, { method: "POST", signal: stop.signal, ...rest });
+    state.answer = answer;
+    view.showAnswer(answer, gripperOf(asked, answer.model), state.fresh);
+    state.fresh = false;
+    showAnswer();
+    say(`${((performance.now() - start) / 1000).toFixed(2)} s, of which ${answer.seconds.total.toFixed(2)} s detecting, by ${answer.model}.`);
+  } catch (error) {
+    if (error.name !== "AbortError") say(error.message, true);
+  } finally {
+    if (state.busy === stop) busy((state.busy = null));
+  }
+}
+
+function gripperOf(asked, model) {
+  if (asked.gripper && typeof asked.gripper === "object") {
+    const { hand, finger, swing, ...rest } = asked.gripper;
+    const palm_z = Math.max(...hand.boxes.map(([, high]) => high[2]).filter((z) => z < rest.contact_z));
+    return { ...rest, hand_boxes: hand.boxes, finger_boxes: finger.boxes, linkage: swing ?? null, palm_z };
+  }
+  const own = state.models.find(({ name }) => name === model)?.gripper;
+  return state.grippers[asked.gripper || own] ?? state.grippers.panda;
+}
+
+/** What the API answers; its errors are thrown with their own words. */
+async function call(path, { headers = {}, ...rest } = {}) {
+  const token = $("token").value.trim();
+  if (token) headers = { ...headers, authorization: `Bearer ${token}` };
+  const answer = await fetch(API + path, { headers, ...rest });
+  if (answer.status === 401) {
+    $("token_row").hidden = false;
+    $("token").focus();
+    throw new Error(token ? "The server does not know this token." : "This server asks for a token.");
+  }
+  const body = await answer.json();
+  if (!answer.ok) throw Object.assign(new Error(body.detail ?? `${answer.status}`), { kind: body.type });
+  return body;
+}
+
+/** Fill the list of models; whether the server answers. */
+async function listModels() {
+  try {
+    state.models = (await call("/v1/models")).models;
+  } catch (error) {
+    say(error.message, true);
+    if (error.kind !== "urn:edgegrasp:error:not-ready") return false;
+    await new Promise((done) => setTimeout(done, 1000));
+    return listModels();
+  }
+  const names = state.models.map(({ name, default: first }) => new Option(name, first ? "" : name));
+  $("model").replaceChildren(...names);
+  $("model").value = "";
+  return true;
+}
+
+// The answer
+
+function showAnswer() {
+  const { answer } = state;
+  const grasps = answer?.grasps ?? [];
+  state.chosen = null;
+  $("summary").textContent = answer
+    ? `${grasps.length} grasp${grasps.length === 1 ? "" : "s"} on ${answer.objects.filter((o) => o.best_score !== null).length} of ${answer.objects.length} objects`
+    : "No grasps yet";
+  $("warnings").replaceChildren(...(answer?.warnings ?? []).map((text) => element("li", text)));
+  if (answer && !answer.support) $("warnings").append(element("li", "No support plane was found."));
+  if (answer) $("count").max = Math.max(grasps.length, 1);
+  $("grasps").replaceChildren(...grasps.map(line));
+  const counts = Object.entries(answer?.counts ?? {});
+  $("counts").replaceChildren(...counts.map(([name, count]) => {
+    const row = element("tr", "");
+    row.append(element("td", name.replaceAll("_", " ")), element("td", count.toLocaleString("en")));
+    return row;
+  }));
+  showReasons();
+  filter();
+  choose(null);
+}
+
+function line(grasp, row) {
+  const button = element("button", "");
+  button.type = "button";
+  const meter = Object.assign(element("meter", ""), { min: 0, max: 1, value: grasp.score });
+  meter.style.setProperty("--tint", `#${colorOf(grasp.score).getHexString()}`);
+  const where = grasp.object === null ? "" : `object ${grasp.object}`;
+  button.append(element("span", row + 1), element("span", grasp.score.toFixed(3)), meter, element("small", where));
+  button.addEventListener("click", () => choose(row === state.chosen ? null : row));
+  const item = element("li", "");
+  item.append(button);
+  return item;
+}
+
+/** Show what the sliders let through. */
+function filter() {
+  const [least, most] = [Number($("min_score").value), Number($("count").value)];
+  $("min_score_value").textContent = least.toFixed(2);
+  $("count_value").textContent = most;
+  const grasps = state.answer?.grasps ?? [];
+  const rows = grasps.map((_, row) => row).filter((row) => grasps[row].score >= least).slice(0, most);
+  [...$("grasps").children].forEach((item, row) => (item.hidden = !rows.includes(row)));
+  if (state.answer) view.showHands(rows, grasps, $("whole").checked);
+}
+
+function choose(row) {
+  state.chosen = row;
+  const grasp = row === null ? null : state.answer.grasps[row];
+  if (state.answer) view.choose(grasp);
+  [...$("grasps").children].forEach((item, each) => item.firstChild.setAttribute("aria-pressed", each === row));
+  $("chosen").hidden = !grasp;
+  if (!grasp) return;
+  $("grasps").children[row].scrollIntoView({ block: "nearest" });
+  $("rank").textContent = row + 1;
+  const metres = (values) => `${values.map((value) => value.toFixed(3)).join(", ")} m`;
+  const facts = {
+    score: grasp.score.toFixed(3),
+    TCP: metres(grasp.T_cloud_tcp.slice(0, 3).map((each) => each[3])),
+    approach: grasp.approach_direction.map((value) => value.toFixed(2)).join(", "),
+    width: `${(1000 * grasp.width).toFixed(1)} mm`,
+    "approach point": metres(grasp.approach_point),
+    "contact point": metres(grasp.contact_point),
+    clearance: `${(1000 * grasp.clearance).toFixed(1)} mm${grasp.collision_free ? "" : ", collides"}`,
+    object: grasp.object ?? "none",
+  };
+  $("numbers").replaceChildren(...Object.entries(facts).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
+  $("chosen_json").textContent = JSON.stringify(grasp, null, 1);
+}
+
+function showReasons() {
+  const debug = state.answer?.debug;
+  $("reasons_hint").hidden = Boolean(debug);
+  const found = {};
+  debug?.outcome.forEach((outcome, row) => outcome === "returned" || (found[outcome] ??= []).push(debug.T_cloud_hand[row]));
+  $("reasons").replaceChildren(...Object.entries(found).map(([outcome, poses]) => {
+    const button = element("button", `${REASONS[outcome] ?? outcome}: ${poses.length.toLocaleString("en")}`);
+    Object.assign(button, { type: "button" }).setAttribute("aria-pressed", "false");
+    button.addEventListener("click", () => {
+      const on = button.getAttribute("aria-pressed") === "false";
+      for (const each of $("reasons").children) each.setAttribute("aria-pressed", String(on && each === button));
+      const step = Math.ceil(poses.length / MOST_REJECTED);
+      view.showRejected(on ? poses.filter((_, row) => row % step === 0) : []);
+      if (on && step > 1) say(`One of every ${step} is shown.`);
+    });
+    return button;
+  }));
+}
+
+/** The request as anyone would make it. */
+function showCode(asked) {
+  const { cloud, image, note } = state.scene;
+  const token = $("token").value.trim();
+  const file = (cloud ?? image.depth).name;
+  const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
+  const { path, headers } = request(asked);
+  const parts = [`curl -sS ${quoted(API + path)}`];
+  if (token) parts.push('-H "Authorization: Bearer $EDGEGRASP_CLIENT_TOKEN"');
+  if (cloud) parts.push(`-H 'Content-Type: ${headers["content-type"]}'`, `--data-binary ${quoted(`@${file}`)}`);
+  else {
+    parts.push(`-F ${quoted(`depth=@${file}`)}`, `-F intrinsics=${image.intrinsics}`);
+    if (image.depth_scale) parts.push(`-F depth_scale=${image.depth_scale}`);
+    if (Object.keys(asked).length) parts.push(`-F ${quoted(`options=${JSON.stringify(asked)}`)}`);
+  }
+  $("curl").textContent = (note ? `# ${note}\n` : "") + parts.join(" \\\n  ");
+  const scale = image?.depth_scale ? `, "depth_scale": ${image.depth_scale}` : "";
+  const what = cloud
+    ? `"${file}"`
+    : `depth_images=[{"depth": "${file}", "intrinsics": (${image.intrinsics.split(",").map(Number).join(", ")})${scale}}]`;
+  const given = Object.entries(asked).map(([name, value]) => `,\n        ${name}=${inPython(value)}`).join("");
+  $("python").textContent = `${note ? `# ${note}\n` : ""}${token ? "import os\n\n" : ""}from edgegrasp_client import GraspClient
+
+with GraspClient("${API}"${token ? ', token=os.environ["EDGEGRASP_CLIENT_TOKEN"]' : ""}) as client:
+    detection = client.detect(
+        ${what}${given},
+    )
+for grasp in detection.grasps:
+    print(grasp.score, grasp.T_cloud_hand)`;
+}
+
+function inPython(value) {
+  if (value === null) return "None";
+  if (typeof value === "boolean") return value ? "True" : "False";
+  if (Array.isArray(value)) return `[${value.map(inPython).join(", ")}]`;
+  if (typeof value !== "object") return JSON.stringify(value);
+  return `{${Object.entries(value).map(([name, each]) => `"${name}": ${inPython(each)}`).join(", ")}}`;
+}
+
+// Shapes: region and workspace are boxes, the cone is one of directions
+
+function setShape(name, shape) {
+  if (shape) state.shapes[name] = shape;
+  else delete state.shapes[name];
+  view.setShape(name, shape);
+  $(`${name}_row`).hidden = !shape;
+  const clear = document.querySelector(`[data-clear="${name}"]`);
+  if (clear) clear.disabled = !shape;
+  if (name === "cone" && !shape && $("approach").value === "cone") $("approach").value = "";
+  press(null);
+  writeShape(name);
+}
+
+/** Put what the mouse made of a shape into its fields. */
+function readShape(name) {
+  Object.assign(state.shapes[name], view.shape(name));
+  writeShape(name);
+}
+
+function writeShape(name) {
+  const shape = state.shapes[name];
+  if (!shape) return;
+  const fields = name === "cone" ? ["direction"] : ["center", "half_extents"];
+  for (const field of fields) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(3)).join(",");
+}
+
+/** Take a shape from its fields. */
+function typeShape(name) {
+  const shape = { ...state.shapes[name] };
+  for (const field of name === "cone" ? ["direction"] : ["center", "half_extents"]) {
+    const values = numbers($(`${name}_${field}`).value, 3);
+    if (!values) return say("Three numbers are needed: x, y, z.", true);
+    shape[field] = values;
+  }
+  if (name === "cone") shape.max_angle = (Number($("cone_angle").value) * Math.PI) / 180;
+  state.shapes[name] = shape;
+  view.setShape(name, shape);
+  press(null);
+}
+
+function takeDrawn(points) {
+  const name = state.drawing;
+  press(null);
+  if (!points.length) return say("No points in there; draw around some.", true);
+  setShape(name, view.boxAround(points, name === "region"));
+  say(`A box around ${points.length.toLocaleString("en")} points; move or size it, then ask again.`);
+}
+
+/** Show which of the drawing and editing buttons is at work. */
+function press(button) {
+  for (const each of document.querySelectorAll("[data-draw], [data-edit]")) {
+    each.setAttribute("aria-pressed", String(each === button));
+  }
+  if (!button?.dataset.edit) view.edit(null);
+}
+
+// Wiring
+
+$("ask").addEventListener("submit", (event) => {
+  event.preventDefault();
+  ask();
+});
+$("files").addEventListener("change", ({ target }) => take([...target.files]));
+$("sample").addEventListener("change", openSample);
+$("token").addEventListener("change", async () => (await listModels()) && !state.scene && openSample());
+for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
+  $(name).addEventListener("change", () => state.files.length && open(state.files));
+}
+for (const name of ["min_score", "count", "whole"]) $(name).addEventListener("input", filter);
+$("approach").addEventListener("change", ({ target }) => {
+  const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
+  setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: Math.PI / 6 } : null);
+});
+for (const name of ["region", "workspace", "cone"]) {
+  $(`${name}_row`).addEventListener("change", ({ target }) => target.tagName === "INPUT" && typeShape(name));
+}
+document.addEventListener("click", ({ target }) => {
+  const { draw, edit, mode, clear, copy } = target.dataset ?? {};
+  if (draw && state.scene) {
+    state.drawing = draw;
+    press(target);
+    view.startDrawing();
+    say("Drag a rectangle around what is meant.");
+  } else if (edit) {
+    const on = target.getAttribute("aria-pressed") !== "true";
+    press(on ? target : null);
+    if (on) view.edit(edit, mode);
+  } else if (clear) setShape(clear, null);
+  else if (copy) copyText(target, $(copy).textContent);
+});
+document.addEventListener("change", ({ target }) => target.dataset.show && view.show(target.dataset.show, target.checked));
+for (const kind of ["dragover", "dragleave", "drop"]) {
+  document.addEventListener(kind, (event) => {
+    event.preventDefault();
+    document.body.classList.toggle("over", kind === "dragover");
+    if (kind === "drop" && event.dataTransfer.files.length) take([...event.dataTransfer.files]);
+  });
+}
+
+/** Files of the user: nothing of the sample's camera is theirs. */
+async function take(files) {
+  if (!files.length) return;
+  for (const field of ["intrinsics", "depth_scale", "viewpoint"]) $(field).value = "";
+  $("sample").selectedIndex = -1;
+  if (await open(files)) await ask();
+}
+
+async function copyText(button, text) {
+  const before = button.textContent;
+  try {
+    await navigator.clipboard.writeText(text);
+    button.textContent = "Copied";
+  } catch {
+    button.textContent = "Not allowed"; // no clipboard without TLS but on this machine
+  }
+  setTimeout(() => (button.textContent = before), 1200);
+}
+
+function numbers(text, count) {
+  const values = text.split(",").map(Number);
+  return text.trim() && values.length === count && values.every(Number.isFinite) ? values : null;
+}
+
+function element(tag, text) {
+  return Object.assign(document.createElement(tag), { textContent: text });
+}
+
+function say(text, bad = false) {
+  $("status").textContent = text;
+  $("status").classList.toggle("bad", bad);
+}
+
+function busy(text) {
+  $("status").classList.toggle("busy", Boolean(text));
+  if (text) say(text);
+}

@@ -1,0 +1,505 @@
+// What is seen: the cloud, the answer, and the shapes that the mouse edits.
+//
+// Everything stands in `root`, which is turned so that the cloud's up is the picture's.
+
+import * as THREE from "./vendor/three.module.min.js";
+import { OrbitControls } from "./vendor/OrbitControls.js";
+import { TransformControls } from "./vendor/TransformControls.js";
+
+const UP = new THREE.Vector3(0, 0, 1);
+const MOST_POINTS = 500_000; // drawn; more would only hide each other
+const BAR = 0.004; // metres, thickness of a hand's outline
+const STEM = 0.04; // metres drawn behind the palm
+const NEAR = 14; // pixels from a hand within which a click means it
+const CONE = 0.12; // metres, length of the approach cone
+const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"].map(
+  (hex) => new THREE.Color(hex),
+);
+const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
+const BOX = new THREE.BoxGeometry(1, 1, 1);
+const EDGES = new THREE.EdgesGeometry(BOX);
+const RIM = new THREE.LineBasicMaterial({ color: "#10151d", transparent: true, opacity: 0.55 });
+
+/** The colour of a score from 0 to 1. */
+export function colorOf(score) {
+  const place = Math.min(Math.max(score, 0), 1) * (VIRIDIS.length - 1);
+  const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
+  return VIRIDIS[low].clone().lerp(VIRIDIS[low + 1], place - low);
+}
+
+/** The picture.
+ * @param {HTMLElement} stage - it fills this
+ * @param {{picked: (index: number | null) => void, edited: (name: string) => void,
+ *   drawn: (points: number[]) => void}} tell
+ */
+export class View {
+  constructor(stage, tell) {
+    this.stage = stage;
+    this.tell = tell;
+    this.renderer = new THREE.WebGLRenderer({ antialias: true });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setClearColor("#0e131b");
+    this.canvas = this.renderer.domElement;
+    this.canvas.tabIndex = 0;
+    this.canvas.setAttribute("aria-label", "the scene: drag to turn, arrow keys to move, wheel to zoom");
+    stage.prepend(this.canvas);
+    this.camera = new THREE.PerspectiveCamera(45, 1, 0.01, 50);
+    this.camera.up.copy(UP);
+    this.world = new THREE.Scene();
+    this.root = new THREE.Group();
+    const sun = new THREE.DirectionalLight("white", 1.6);
+    sun.position.set(0.5, -1, 2);
+    this.world.add(this.root, new THREE.HemisphereLight("white", "#556", 2.2), sun);
+    this.groups = {};
+    for (const name of ["cloud", "plane", "objects", "hands", "points", "chosen", "rejected"]) {
+      this.root.add((this.groups[name] = new THREE.Group()));
+    }
+    this.shapes = {};
+    this.orbit = new OrbitControls(this.camera, this.canvas);
+    this.orbit.listenToKeyEvents(this.canvas);
+    this.orbit.addEventListener("change", () => this.draw());
+    this.gizmo = new TransformControls(this.camera, this.canvas);
+    this.gizmo.setSpace("local");
+    this.gizmo.setSize(0.7);
+    this.gizmo.addEventListener("change", () => this.draw());
+    this.gizmo.addEventListener("dragging-changed", ({ value }) => (this.orbit.enabled = !value));
+    this.gizmo.addEventListener("objectChange", () => tell.edited(this.gizmo.object.name));
+    this.world.add(this.gizmo.getHelper());
+    this._listen();
+    new ResizeObserver(() => this._resize()).observe(stage);
+    this._resize();
+  }
+
+  /** Draw soon; many calls are one picture. */
+  draw() {
+    this._due ??= requestAnimationFrame(() => {
+      this._due = null;
+      this.renderer.render(this.world, this.camera);
+      this._placeLabels();
+    });
+  }
+
+  _resize() {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    if (!width || !height) return;
+    this.renderer.setSize(width, height);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    this.draw();
+  }
+
+  // The cloud
+
+  /** Show another scene, from where its camera stood. */
+  showScene(scene) {
+    this.groups.cloud.children[0]?.geometry.dispose();
+    for (const group of Object.values(this.groups)) group.clear();
+    [this.labels, this.hands, this.target] = [[], [], null];
+    const count = scene.points.length / 3;
+    const step = Math.ceil(count / MOST_POINTS);
+    const [places, shades] = [[], []];
+    for (let row = 0; row < count; row += step) {
+      const place = scene.points.subarray(3 * row, 3 * row + 3);
+      if (!place.every(Number.isFinite)) continue;
+      places.push(...place);
+      const shade = scene.colors ? scene.colors.subarray(3 * row, 3 * row + 3) : [0.62, 0.68, 0.76];
+      shades.push(...new THREE.Color().setRGB(...shade, THREE.SRGBColorSpace));
+    }
+    if (!places.length) throw new Error(`${scene.name}: has no points`);
+    this.places = Float32Array.from(places);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(this.places, 3));
+    geometry.setAttribute("color", new THREE.Float32BufferAttribute(shades, 3));
+    const look = { vertexColors: true, size: 2.2 * this.renderer.getPixelRatio(), sizeAttenuation: false };
+    this.groups.cloud.add(new THREE.Points(geometry, new THREE.PointsMaterial(look)));
+    this.middle = [0, 1, 2].map((axis) => median(this.places.filter((_, i) => i % 3 === axis)));
+    this.root.quaternion.setFromUnitVectors(
+      scene.camera ? new THREE.Vector3(0, -1, 0) : UP, UP);
+    this.root.updateMatrixWorld();
+    this._lookFrom(scene);
+  }
+
+  _lookFrom({ camera, viewpoint }) {
+    const target = this._outside(this.middle);
+    this.camera.fov = 45;
+    if (camera) {
+      this.camera.fov = (2 * Math.atan(camera.height / 2 / camera.fy) * 180) / Math.PI;
+      this.camera.position.set(0, 0, 0);
+    } else if (viewpoint) {
+      this.camera.position.copy(this._outside(viewpoint));
+    } else {
+      this.camera.position.copy(target).add(new THREE.Vector3(0.25, -0.7, 0.6));
+    }
+    this.camera.updateProjectionMatrix();
+    this.orbit.target.copy(target);
+    this.orbit.update();
+    this.draw();
+  }
+
+  /** From the cloud's frame to the picture's. */
+  _outside(place) {
+    return this.root.localToWorld(new THREE.Vector3(...place));
+  }
+
+  /** Turn the picture upright, and look at the objects, the eye staying where it is. */
+  _turn(up, target) {
+    const eye = this.root.worldToLocal(this.camera.position.clone());
+    this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...up), UP);
+    this.root.updateMatrixWorld();
+    this.camera.position.copy(this.root.localToWorld(eye));
+    this.orbit.target.copy(this._outside(target));
+    this.orbit.update();
+  }
+
+  // The answer
+
+  /** Show what was found.
+   * @param {Object} answer - the API's
+   * @param {Object} gripper - its boxes and lengths
+   * @param {boolean} first - of this scene: look at what was found
+   */
+  showAnswer(answer, gripper, first) {
+    this.gripper = gripper;
+    this.hands = answer.grasps.map((grasp) => this._outline(grasp, colorOf(grasp.score)));
+    fill(this.groups.hands, this.hands);
+    fill(this.groups.points, answer.grasps.flatMap(ends));
+    this.groups.rejected.clear();
+    this._showObjects(answer.objects);
+    const middles = answer.objects.map((object) => object.center);
+    const target = middles.length ? [0, 1, 2].map((axis) => mean(middles.map((m) => m[axis]))) : this.middle;
+    this._showPlane(answer.support, target);
+    this.target = target;
+    if (first) this._turn(answer.up, target);
+    this.choose(null);
+  }
+
+  _showObjects(objects) {
+    this.groups.objects.clear();
+    this.labels = objects.map((object) => {
+      const box = new THREE.LineSegments(EDGES, new THREE.LineBasicMaterial({ color: "#8fd694" }));
+      box.position.set(...object.center);
+      box.quaternion.set(...object.quaternion);
+      box.scale.set(...object.half_extents).multiplyScalar(2);
+      this.groups.objects.add(box);
+      return { place: object.center, text: `${object.number}` };
+    });
+    this.stage.querySelector(".labels").replaceChildren(
+      ...this.labels.map(({ text }) => Object.assign(document.createElement("span"), { textContent: text })),
+    );
+  }
+
+  _placeLabels() {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    const spans = this.stage.querySelectorAll(".labels span");
+    (this.labels ?? []).forEach(({ place }, row) => {
+      const { x, y, z } = this._outside(place).project(this.camera);
+      spans[row].hidden = z > 1 || !this.groups.objects.visible;
+      spans[row].style.transform = `translate(${((x + 1) / 2) * width}px, ${((1 - y) / 2) * height}px)`;
+    });
+  }
+
+  _showPlane(support, target) {
+    this.groups.plane.clear();
+    if (!support) return;
+    const normal = new THREE.Vector3(...support.normal);
+    const grid = new THREE.GridHelper(0.6, 12, "#6ea8fe", "#6ea8fe");
+    Object.assign(grid.material, { transparent: true, opacity: 0.35 });
+    grid.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), normal);
+    const foot = new THREE.Vector3(...target);
+    grid.position.copy(foot.addScaledVector(normal, support.offset - foot.dot(normal)));
+    this.groups.plane.add(grid);
+  }
+
+  /** A slim hand: stem, palm and the fingers at their opening. */
+  _outline(grasp, color) {
+    const look = new THREE.MeshStandardMaterial({ color, roughness: 0.55, emissive: color, emissiveIntensity: 0.45 });
+    const [half, palm, tip] = this._reach(grasp.width);
+    const hand = new THREE.Group();
+    const bar = (y, z, dy, dz) => {
+      const mesh = new THREE.Mesh(BOX, look);
+      mesh.position.set(0, y, z);
+      mesh.scale.set(BAR, dy, dz);
+      mesh.add(new THREE.LineSegments(EDGES, RIM));
+      hand.add(mesh);
+    };
+    bar(0, palm - STEM / 2, BAR, STEM);
+    bar(0, palm, 2 * half + 2 * BAR, BAR);
+    for (const side of [-1, 1]) bar(side * (half + BAR / 2), (palm + tip) / 2, BAR, tip - palm);
+    return placed(hand, grasp.T_cloud_hand);
+  }
+
+  /** Half the opening, the palm, and the fingertips at that opening, metres. */
+  _reach(width) {
+    return [width / 2, this.gripper.palm_z, this.gripper.tip_z + this._advance(width)];
+  }
+
+  /** How far swinging fingertips are ahead of where they are in the open gripper, metres. */
+  _advance(width) {
+    const { linkage, max_opening: open } = this.gripper;
+    if (!linkage) return 0;
+    const { radius, reach } = linkage;
+    const outward = reach - (open - Math.min(Math.max(width, 0), open)) / 2;
+    return Math.sqrt(radius ** 2 - outward ** 2) - Math.sqrt(radius ** 2 - reach ** 2);
+  }
+
+  /** The gripper's own boxes at a grasp, as collisions are checked with. */
+  _body(grasp, color) {
+    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.2, depthWrite: false });
+    const line = new THREE.LineBasicMaterial({ color });
+    const hand = new THREE.Group();
+    const add = ([low, high], y, z) => {
+      for (const part of [new THREE.Mesh(BOX, look), new THREE.LineSegments(EDGES, line)]) {
+        part.position.set(...[0, y, z].map((shift, axis) => (low[axis] + high[axis]) / 2 + shift));
+        part.scale.set(...low.map((value, axis) => high[axis] - value));
+        hand.add(part);
+      }
+    };
+    for (const box of this.gripper.hand_boxes) add(box, 0, 0);
+    for (const [low, high] of this.gripper.finger_boxes) {
+      const mirrored = [[low[0], -high[1], low[2]], [high[0], -low[1], high[2]]];
+      add([low, high], grasp.width / 2, this._advance(grasp.width));
+      add(mirrored, -grasp.width / 2, this._advance(grasp.width));
+    }
+    return placed(hand, grasp.T_cloud_hand);
+  }
+
+  /** Show the hands of these rows; their own boxes where `whole`. */
+  showHands(rows, grasps, whole) {
+    const shown = new Set(rows);
+    this.hands.forEach((hand, row) => (hand.visible = shown.has(row)));
+    this.groups.points.children.forEach((each, row) => (each.visible = shown.has(row >> 1)));
+    this.groups.hands.children.slice(this.hands.length).forEach((body) => body.removeFromParent());
+    for (const row of whole ? rows : []) {
+      this.groups.hands.add(this._body(grasps[row], colorOf(grasps[row].score)));
+    }
+    this.draw();
+  }
+
+  /** Mark a grasp: its hand, both its points and the way in; null: none. */
+  choose(grasp) {
+    const group = this.groups.chosen.clear();
+    if (grasp) {
+      const outline = this._outline(grasp, new THREE.Color("white"));
+      outline.children.forEach((bar) => bar.scale.multiplyScalar(1.02));
+      const palm = new THREE.Vector3(0, 0, this.gripper.palm_z - STEM);
+      const tail = palm.clone().applyMatrix4(outline.matrix);
+      const way = new THREE.Vector3(...grasp.approach_direction);
+      const arrow = new THREE.ArrowHelper(way, tail.clone().addScaledVector(way, -0.08), 0.075, "white", 0.02, 0.012);
+      group.add(this._body(grasp, colorOf(grasp.score)), outline, arrow, ...ends(grasp, 0.004));
+    }
+    this.draw();
+  }
+
+  /** Show outlines of candidates as lines: `T_cloud_hand` of each. */
+  showRejected(poses) {
+    const [half, palm, tip] = this._reach(this.gripper.max_opening);
+    const ends = [[0, palm - STEM], [0, palm], [-half, palm], [half, palm], [-half, palm], [-half, tip],
+      [half, palm], [half, tip]];
+    const places = poses.flatMap((pose) =>
+      ends.flatMap(([y, z]) => [0, 1, 2].map((row) => pose[row][1] * y + pose[row][2] * z + pose[row][3])),
+    );
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(places, 3));
+    const look = { color: "#ff6b6b", transparent: true, opacity: 0.45 };
+    this.groups.rejected.clear().add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look)));
+    this.draw();
+  }
+
+  show(name, visible) {
+    this.groups[name].visible = visible;
+    this.draw();
+  }
+
+  // Shapes to edit
+
+  /** Show a box or the cone, or take it away.
+   * @param {"region" | "workspace" | "cone"} name
+   * @param {Object | null} shape - center, half_extents, quaternion; or direction, max_angle
+   */
+  setShape(name, shape) {
+    if (this.shapes[name]) {
+      if (this.gizmo.object === this.shapes[name]) this.gizmo.detach();
+      this.shapes[name].removeFromParent();
+      delete this.shapes[name];
+    }
+    if (shape) {
+      const made = name === "cone" ? this._cone(shape) : boxShape(shape, HUES[name]);
+      made.name = name;
+      this.root.add((this.shapes[name] = made));
+    }
+    this.draw();
+  }
+
+  _cone({ direction, max_angle }) {
+    const spread = Math.min(max_angle, 1.4);
+    const surface = new THREE.ConeGeometry(CONE * Math.tan(spread), CONE, 40, 1, true);
+    surface.rotateX(Math.PI / 2).translate(0, 0, -CONE / 2); // its tip at 0, open toward -z
+    const look = { color: HUES.cone, transparent: true, opacity: 0.3, side: THREE.DoubleSide, depthWrite: false };
+    const cone = new THREE.Mesh(surface, new THREE.MeshBasicMaterial(look));
+    const start = new THREE.Vector3(0, 0, -1.4 * CONE);
+    cone.add(new THREE.ArrowHelper(UP, start, 1.3 * CONE, HUES.cone, 0.03, 0.018));
+    cone.position.set(...(this.target ?? this.middle));
+    cone.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...direction).normalize());
+    return cone;
+  }
+
+  /** What a shape is now: as `setShape` takes it, but for the cone's angle. */
+  shape(name) {
+    const made = this.shapes[name];
+    if (name === "cone") return { direction: UP.clone().applyQuaternion(made.quaternion).toArray() };
+    return {
+      center: made.position.toArray(),
+      half_extents: made.scale.toArray().map((size) => Math.max(Math.abs(size) / 2, 0.001)),
+      quaternion: made.quaternion.toArray(),
+    };
+  }
+
+  /** Let the mouse move, size or turn a shape; null: none. */
+  edit(name, mode) {
+    if (name && this.shapes[name]) {
+      this.gizmo.attach(this.shapes[name]);
+      this.gizmo.setMode({ move: "translate", size: "scale", turn: "rotate" }[mode]);
+    } else {
+      this.gizmo.detach();
+    }
+    this.draw();
+  }
+
+  /** The box around points, turned as the picture is or as the cloud's frame.
+   * @param {number[][]} points - cloud frame
+   * @param {boolean} upright - along the picture's axes
+   */
+  boxAround(points, upright) {
+    const turn = upright ? this.root.quaternion.clone() : new THREE.Quaternion();
+    const box = new THREE.Box3();
+    for (const point of points) box.expandByPoint(new THREE.Vector3(...point).applyQuaternion(turn));
+    const back = turn.clone().invert();
+    return {
+      center: box.getCenter(new THREE.Vector3()).applyQuaternion(back).toArray(),
+      half_extents: box.getSize(new THREE.Vector3()).toArray().map((size) => size / 2 + 0.005),
+      quaternion: back.toArray(),
+    };
+  }
+
+  // The mouse
+
+  /** Let the next drag draw a rectangle, whose points `tell.drawn` gets. */
+  startDrawing() {
+    this.drawing = true;
+    this.orbit.enabled = false;
+    this.stage.classList.add("drawing");
+  }
+
+  _listen() {
+    const band = this.stage.querySelector(".band");
+    let from = null;
+    const place = ({ clientX, clientY }) => {
+      const { left, top } = this.canvas.getBoundingClientRect();
+      return [clientX - left, clientY - top];
+    };
+    this.canvas.addEventListener("pointerdown", (event) => {
+      from = place(event);
+    });
+    this.canvas.addEventListener("pointermove", (event) => {
+      if (!this.drawing || !from) return;
+      const to = place(event);
+      Object.assign(band.style, { left: `${Math.min(from[0], to[0])}px`, top: `${Math.min(from[1], to[1])}px`,
+        width: `${Math.abs(to[0] - from[0])}px`, height: `${Math.abs(to[1] - from[1])}px` });
+      band.hidden = false;
+    });
+    this.canvas.addEventListener("pointerup", (event) => {
+      if (!from) return;
+      const [start, end] = [from, place(event)];
+      from = null;
+      if (this.drawing) {
+        this.drawing = false;
+        this.orbit.enabled = true;
+        band.hidden = true;
+        this.stage.classList.remove("drawing");
+        this.tell.drawn(this._within(start, end));
+      } else if (Math.hypot(end[0] - start[0], end[1] - start[1]) < 4 && !this.gizmo.dragging) {
+        this._pick(end);
+      }
+    });
+  }
+
+  /** The hand nearest to the mouse, if it is near. */
+  _pick([x, y]) {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    let [found, nearest] = [null, NEAR];
+    (this.hands ?? []).forEach((hand, row) => {
+      for (const bar of hand.visible ? hand.children : []) {
+        for (const along of [-0.5, -0.25, 0, 0.25, 0.5]) {
+          const place = new THREE.Vector3(0, 0, 0).setComponent(bar.scale.y > bar.scale.z ? 1 : 2, along);
+          const { x: right, y: up } = bar.localToWorld(place).project(this.camera);
+          const away = Math.hypot(((right + 1) / 2) * width - x, ((1 - up) / 2) * height - y);
+          if (away < nearest) [found, nearest] = [row, away];
+        }
+      }
+    });
+    this.tell.picked(found);
+  }
+
+  /** The points in a rectangle, pixels: of what is in front, and not of the plane. */
+  _within(start, end) {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    const [left, right] = [start[0], end[0]].sort((a, b) => a - b);
+    const [top, bottom] = [start[1], end[1]].sort((a, b) => a - b);
+    const found = [];
+    const grid = this.groups.plane.children[0];
+    const normal = grid && new THREE.Vector3(0, 1, 0).applyQuaternion(grid.quaternion);
+    const place = new THREE.Vector3();
+    for (let at = 0; at < this.places.length; at += 3) {
+      place.fromArray(this.places, at);
+      if (grid && place.clone().sub(grid.position).dot(normal) < 0.006) continue;
+      const distance = this.root.localToWorld(place.clone()).distanceTo(this.camera.position);
+      const { x, y, z } = this.root.localToWorld(place).project(this.camera);
+      const [column, row] = [((x + 1) / 2) * width, ((1 - y) / 2) * height];
+      if (z < 1 && column >= left && column <= right && row >= top && row <= bottom) {
+        found.push({ distance, point: [...this.places.subarray(at, at + 3)] });
+      }
+    }
+    found.sort((a, b) => a.distance - b.distance);
+    const nearest = found[Math.floor(found.length / 50)]?.distance ?? 0; // not a stray point
+    return found.filter(({ distance }) => distance < nearest + 0.25).map(({ point }) => point);
+  }
+}
+
+function placed(hand, pose) {
+  hand.matrixAutoUpdate = false;
+  hand.matrix.set(...pose.flat());
+  return hand;
+}
+
+function boxShape({ center, half_extents, quaternion }, color) {
+  const look = { color, transparent: true, opacity: 0.16, depthWrite: false };
+  const box = new THREE.Mesh(BOX, new THREE.MeshBasicMaterial(look));
+  box.add(new THREE.LineSegments(EDGES, new THREE.LineBasicMaterial({ color })));
+  box.position.set(...center);
+  box.quaternion.set(...quaternion);
+  box.scale.set(...half_extents).multiplyScalar(2);
+  return box;
+}
+
+function fill(group, children) {
+  group.clear();
+  for (const child of children) group.add(child);
+}
+
+/** The approach point and the contact point of a grasp. */
+function ends({ approach_point, contact_point }, radius = 0.0025) {
+  return [[approach_point, "#4cc9f0"], [contact_point, "#ff4d6d"]].map(([place, color]) => {
+    const look = new THREE.MeshBasicMaterial({ color });
+    const made = new THREE.Mesh(new THREE.SphereGeometry(radius, 12, 8), look);
+    made.position.set(...place);
+    return made;
+  });
+}
+
+function median(values) {
+  return values.sort()[values.length >> 1]; // typed arrays sort by number
+}
+
+function mean(values) {
+  return values.reduce((sum, value) => sum + value, 0) / values.length;
+}

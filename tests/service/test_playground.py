@@ -1,0 +1,194 @@
+"""The playground, in a browser without a screen."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from edgegrasp_service import server
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+
+SAMPLES = Path(server.__file__).parent / "playground" / "samples"
+FLAGS = (
+    *("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+)
+PATIENCE = 60_000  # milliseconds; longer than anything takes
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_page(browser) -> Iterator[Callable[..., Any]]:
+    """Open a server's front page; no page may complain, or ask anybody else for anything."""
+    pages, trouble, asked = [], [], []
+
+    def open_page(url: str, width: int = 1600, height: int = 900) -> Any:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(PATIENCE)
+        page.on("console", lambda message: trouble.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: trouble.append(str(error)))
+        page.on(
+            "request", lambda sent: sent.url.startswith((url, "blob:")) or trouble.append(sent.url)
+        )
+        page.goto(url)
+        pages.append(page)
+        return page
+
+    yield open_page
+    for page in pages:
+        page.close()
+    assert [each for each in trouble if "401 (Unauthorized)" not in each] == []
+    assert [each for each in asked if not each.startswith(("http://127.0.0.1:", "blob:"))] == []
+
+
+def shown(page: Any) -> list[Any]:
+    """The grasps in the list, once there are any."""
+    page.locator("#grasps li").first.wait_for()
+    return page.locator("#grasps li:visible").all()
+
+
+def bright(page: Any) -> int:
+    """Pixels of the picture that have the colour of a good score."""
+    picture = Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB")
+    red, green, blue = np.moveaxis(np.asarray(picture).astype(int), 2, 0)
+    return int(((red > 150) & (green > 140) & (blue < 0.45 * green)).sum())
+
+
+def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
+    real_server, open_page, tmp_path: Path
+) -> None:
+    page = open_page(real_server.http_url)
+    assert len(shown(page)) == 12
+    assert "grasps on" in page.inner_text("#summary")
+    with_hands = bright(page)
+    page.locator("#min_score").fill("1")
+    assert page.locator("#grasps li:visible").count() == 0
+    assert with_hands > bright(page) + 500
+    page.locator("#min_score").fill("0")
+
+    page.locator("#grasps button").first.click()
+    chosen = json.loads(page.locator("#chosen_json").text_content())
+    assert page.inner_text("#numbers").startswith(f"score\n{chosen['score']:.3f}")
+
+    stage = page.locator("#stage").bounding_box()
+    page.locator("[data-draw=region]").click()
+    page.mouse.move(stage["x"] + 0.55 * stage["width"], stage["y"] + 0.5 * stage["height"])
+    page.mouse.down()
+    page.mouse.move(stage["x"] + 0.72 * stage["width"], stage["y"] + 0.8 * stage["height"])
+    page.mouse.up()
+    center = page.locator("#region_center")
+    drawn = center.input_value()
+    page.locator("[data-edit=region][data-mode=move]").click()
+    center.fill(",".join(f"{float(part) + 0.005:.3f}" for part in drawn.split(",")))
+    center.press("Tab")
+    page.locator("#debug").check()
+    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
+        page.get_by_text("Find grasps").click()
+    answer = answered.value.json()
+    page.locator("#reasons button").first.click()
+    region = np.array([float(part) for part in center.input_value().split(",")])
+    contacts = np.array([grasp["contact_point"] for grasp in answer["grasps"]])
+    assert 0 < len(contacts) <= 50
+    assert np.linalg.norm(contacts - region, axis=1).max() < 0.1
+
+    for text, command in (("#curl", ["bash", "-c"]), ("#python", [sys.executable, "-c"])):
+        code = page.locator(text).text_content()
+        done = subprocess.run([*command, code], cwd=SAMPLES, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        if text == "#curl":
+            assert json.loads(done.stdout)["grasps"] == answer["grasps"]
+        else:
+            assert done.stdout.count("[[") == len(contacts)
+
+
+def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
+    """Clouds in every format that the API takes, and images; each with its number of points."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.3, 0.5, (640, 3)).astype(np.float32)
+    colors = rng.integers(0, 256, (640, 3), dtype=np.uint8)
+    np.save(folder / "cloud.npy", points[:601])
+    np.savez_compressed(folder / "cloud.npz", points=points[:602], colors=colors[:602])
+    np.savetxt(folder / "cloud.xyz", points[:603])
+    rows = [f"{x} {y} {z}\n" for x, y, z in points]
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 604\n{axes}end_header\n"
+    (folder / "cloud.ply").write_text(head + "".join(rows[:604]))
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 605\nHEIGHT 1\n"
+    (folder / "cloud.pcd").write_text(f"{head}POINTS 605\nDATA ascii\n{''.join(rows[:605])}")
+    for number, name in enumerate(("npy", "npz", "xyz", "ply", "pcd"), start=601):
+        yield number, [folder / f"cloud.{name}"]
+    depth, camera = rng.integers(400, 600, (20, 30)).astype(np.uint16), (30.0, 30.0, 15.0, 10.0)
+    rgb = colors[:600].reshape(20, 30, 3)
+    np.savez(folder / "camera.npz", depth=depth, intrinsics=np.array(camera, np.float32), rgb=rgb)
+    yield 600, [folder / "camera.npz"]
+    depth, rgb = depth.reshape(15, 40), rgb.reshape(15, 40, 3)
+    depth[0, 0] = 0  # a hole
+    Image.fromarray(depth).save(folder / "depth.png")
+    Image.fromarray(rgb).save(folder / "color.png")
+    yield 599, [folder / "depth.png", folder / "color.png"]
+
+
+def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_path: Path) -> None:
+    page = open_page(dummy_server.http_url)
+    shown(page)
+    for points, files in scenes(tmp_path):
+        page.set_input_files("#files", files)
+        if files[0].name == "depth.png":
+            page.get_by_text("give the camera's fx, fy, cx, cy").wait_for()
+            page.locator("#intrinsics").fill("30,30,15,10")
+            page.get_by_text("Find grasps").click()
+        page.locator("#counts td").get_by_text(str(points), exact=True).first.wait_for()
+        assert len(shown(page)) == 10
+    page.set_input_files("#files", [tmp_path / "color.png"])
+    page.get_by_text("add the depth image").wait_for()
+
+
+def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path: Path) -> None:
+    (tmp_path / "tokens").write_text("a-token-of-this-test\n")
+    with start_dummy("--token-file", str(tmp_path / "tokens")) as server:
+        page = open_page(server.http_url)
+        page.get_by_text("This server asks for a token.").wait_for()
+        page.locator("#token").fill("a-token-of-this-test")
+        page.locator("#token").press("Enter")
+        assert len(shown(page)) == 10
+        assert "Authorization: Bearer $EDGEGRASP_CLIENT_TOKEN" in page.inner_text("#curl")
+        assert "a-token" not in page.inner_text("#curl")
+
+
+def test_a_narrow_page_has_all_and_the_keyboard_reaches_it(dummy_server, open_page) -> None:
+    page = open_page(dummy_server.http_url, 400, 800)
+    shown(page)
+    controls = page.locator(
+        "button:visible, input:visible, select:visible, textarea:visible, pre:visible"
+    )
+    boxes = [control.bounding_box() for control in controls.all()]
+    assert all(box["x"] >= 0 and box["x"] + box["width"] <= 400 for box in boxes)
+    reached = set()
+    for _ in range(80):
+        page.keyboard.press("Tab")
+        focused = page.locator(":focus")
+        reached.add(focused.get_attribute("id") or focused.inner_text() if focused.count() else "")
+    wanted = {"files", "sample", "model", "approach", "more", "debug", "min_score", "count", "curl"}
+    assert wanted | {"Draw", "Find grasps", "Copy"} <= reached
+    page.locator("#grasps button").nth(1).focus()
+    page.keyboard.press("Enter")
+    assert page.inner_text("#rank") == "2"

@@ -1,0 +1,71 @@
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from edgegrasp_sim.camera import CAMERA, look_at
+from edgegrasp_sim.picture import Picture, View, draw_grasps
+from edgegrasp_sim.simulation import PAINTS, ClutterSimulation
+
+
+@dataclass
+class Planned:
+    T_cloud_hand: np.ndarray
+    score: float = 1.0
+    width: float = 0.08
+
+
+def pixels(written: io.BytesIO) -> np.ndarray:
+    with Image.open(written) as picture:
+        return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def test_a_colour_image_shows_every_object_in_a_paint_of_its_own(
+    simulation: ClutterSimulation,
+) -> None:
+    placed = simulation.reset("packed", np.random.default_rng(0), num_objects=4)
+    pose = look_at(np.array([0.15, -0.3, 0.5]), np.array([0.15, 0.15, 0.08]))
+    image = simulation.color_image(pose)
+    assert image.shape == (CAMERA.height, CAMERA.width, 3)
+    hues = image / np.maximum(image.sum(axis=2, keepdims=True), 1)
+    for paint in PAINTS[:placed]:
+        like = np.abs(hues - paint / paint.sum()).max(axis=2) < 0.02
+        assert like.sum() > 150
+
+
+def test_the_nearest_point_is_seen_at_a_pixel() -> None:
+    view = View((3, 3), 1.0, 1.0, 1.0, 1.0)
+    points = [(0.0, 0.0, 2.0), (0.0, 0.0, 1.0), (np.nan, 0.0, 1.0), (0.0, 0.0, -1.0)]
+    assert view.rows_of_pixels(points)[1, 1] == 1
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_what_the_cloud_hides_of_a_hand_is_faint(behind: bool) -> None:
+    """A wall, and a hand that points down before or behind it."""
+    side = np.linspace(-0.3, 0.3, 200)
+    x, z = (grid.ravel() for grid in np.meshgrid(side, side))
+    wall = np.stack([x, np.zeros_like(x), z], axis=1)
+    T = np.eye(4)
+    T[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
+    T[:3, 3] = (0.0, 0.2 if behind else -0.2, 0.1)
+    stream = io.BytesIO()
+    draw_grasps(stream, wall, [Planned(T)], camera_position=(0.0, -1.0, 0.0), title="")
+    red, green, blue = np.moveaxis(pixels(stream), 2, 0)
+    strong = ((red > 220) & (green > 200) & (blue < 80)).sum()
+    assert (strong < 50) == behind
+
+
+def test_regions_are_drawn_where_they_are() -> None:
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (2000, 3))
+    view, stream = View.of(points, (0.0, -1.0, 0.3)), io.BytesIO()
+    picture = Picture(view, points)
+    ball = {"kind": "sphere", "center": (0.1, 0.0, 0.0), "radius": 0.03}
+    picture.regions({"contact_region": {"include": [ball]}})
+    picture.save(stream)
+    drawn = pixels(stream)
+    row, column = np.nonzero(np.abs(drawn - (76, 201, 240)).max(axis=2) < 30)
+    (x, y), _ = view.project((0.1, 0.0, 0.0))
+    scale = drawn.shape[1] / view.shape[1]
+    assert np.hypot(column.mean() / scale - x, row.mean() / scale - y) < 10
