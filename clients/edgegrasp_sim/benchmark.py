@@ -1,5 +1,6 @@
 """Many rounds of clutter removal, resumable: in this process, in several, or on a Ray cluster."""
 
+import ctypes
 import importlib
 import multiprocessing
 import os
@@ -39,6 +40,7 @@ CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module,
     (hand, ("min_opening",)),
     (trial, ("min_points",)),
 )
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
 LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
@@ -280,12 +282,18 @@ def _run_in_processes(
             pool.shutdown(cancel_futures=True)
 
 
+def end_with_parent() -> None:
+    """Have this process ended when its parent ends, however that comes about."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 _worker: RoundRunner | None = None  # of a worker process, made by its initialiser
 
 
 def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
     global _worker
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    end_with_parent()
     _worker = RoundRunner(config, make_planner)
 
 

@@ -30,6 +30,7 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
+from edgegrasp_sim.benchmark import end_with_parent
 from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import ObjectSet, SceneKind
@@ -160,13 +161,18 @@ def generate(
             yield index, *generate_scene(folder, objects, options, index)
         return
     with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+        workers, mp_context=get_context("spawn"), initializer=_start_worker
     ) as pool:
         futures = {
             pool.submit(generate_scene, folder, objects, options, index): index for index in missing
         }
         for future in as_completed(futures):
             yield futures[future], *future.result()
+
+
+def _start_worker() -> None:
+    end_with_parent()
+    torch.set_num_threads(1)
 
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
