@@ -106,7 +106,7 @@ def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Pat
     assert done.stdout.count("score 0.") == 5, done.stderr
     wrong = run(build / "detect", depth, 99, *camera[2:], dummy_server.grpc_address)
     assert wrong.returncode == 1
-    assert wrong.stderr.startswith("error 3: depth_images.0")
+    assert "error 3: depth_images.0" in wrong.stderr
 
 
 def test_region_on_a_handle(address: str) -> None:
@@ -164,7 +164,7 @@ def test_training_on_your_objects(tmp_path: Path) -> None:
         folder.mkdir(parents=True)
         (folder / "block.obj").write_text(block)
     programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    words = (tmp_path / "objects", tmp_path / "out", 1, 1)
+    words = (tmp_path / "objects", tmp_path / "out", 2, 1)
     environment = os.environ | {"PATH": programs}
     done = run("bash", EXAMPLES / "08_train_on_your_objects.sh", *words, env=environment)
     assert done.returncode == 0, done.stderr
