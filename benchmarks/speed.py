@@ -58,6 +58,7 @@ LABELLED_GRASPS = 60
 SIMULATED = 4  # scenes and rounds
 VOXEL_SIZE = 0.0045  # metres
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "real_scenes"
+IMAGE = 480, 640  # rows and columns
 ENLARGED_NOISE = 0.0003  # metres
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"  # around the README's table
 
@@ -148,8 +149,8 @@ def camera() -> dict[str, float]:
     ours, seen = ModelCatalogue.load().get(""), demo_view()
     sent = {"the demo's scene": (seen.cloud, seen.camera_position)}
     for scene in load_scenes(SHARED) if SHARED.exists() else []:
-        if len(scene.points) == math.prod(scene.shape):
-            image = scene.points.reshape(*scene.shape, 3)
+        if len(scene.points) == math.prod(IMAGE):
+            image = scene.points.reshape(*IMAGE, 3)
             sent[f"640 x 480, {scene.name}"] = image, np.zeros(3)
             sent[f"1280 x 720, {scene.name}"] = enlarged(image), np.zeros(3)
     runs = {
