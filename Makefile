@@ -48,8 +48,8 @@ test: $(INSTALLED) ## run the tests, on every core
 fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
 	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz
 
-bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the README's table
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --readme README.md
+bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the tables of it
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --pages
 
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py

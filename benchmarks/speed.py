@@ -57,17 +57,20 @@ SHIPPED = ("edgegrasp-plus", "edgegrasp-small")
 LABELLED_GRASPS = 60
 SIMULATED = 4  # scenes and rounds
 VOXEL_SIZE = 0.0045  # metres
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "real_scenes"
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared" / "real_scenes"
 IMAGE = 480, 640  # rows and columns
 ENLARGED_NOISE = 0.0003  # metres
 BEGIN, END = "<!-- bench:begin -->", "<!-- bench:end -->"  # around the README's table
 
 
 def main() -> None:
-    """Measure everything, write the results and the README's table."""
+    """Measure everything, write the results and the pages' tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed")
     parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument("--readme", type=Path, help="file whose table to rewrite")
+    parser.add_argument(
+        "--pages", action="store_true", help="rewrite the tables of README.md and docs/speed.md"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     start = time.perf_counter()
@@ -87,8 +90,9 @@ def main() -> None:
         print(name, results[name], flush=True)
     results["minutes"] = (time.perf_counter() - start) / 60
     write_results(given.output, "speed", results)
-    if given.readme is not None:
-        write_table(given.readme, results)
+    if given.pages:
+        write_table(ROOT / "README.md", camera_table(results))
+        write_table(ROOT / "docs" / "speed.md", table(results))
 
 
 def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str, Any]:
@@ -265,21 +269,21 @@ def _sampled_poses(observation: Observation) -> np.ndarray:
     return prepared.scene.frame.poses_in_cloud(prepared.sample.candidates.T_cloud_hand)
 
 
-def write_table(readme: Path, results: dict[str, Any]) -> None:
-    """Put the table between the markers.
+def write_table(page: Path, written: str) -> None:
+    """Put a table between a page's markers.
 
     Raises:
         ValueError: The file does not hold both markers.
     """
     place = re.compile(f"{BEGIN}.*{END}", re.DOTALL)
-    text, count = place.subn(lambda _: f"{BEGIN}\n{table(results)}\n{END}", readme.read_text())
+    text, count = place.subn(lambda _: f"{BEGIN}\n{written}\n{END}", page.read_text())
     if not count:
-        raise ValueError(f"{readme} holds no {BEGIN} … {END}")
-    readme.write_text(text)
+        raise ValueError(f"{page} holds no {BEGIN} … {END}")
+    page.write_text(text)
 
 
-def table(results: dict[str, Any]) -> str:
-    """The table and what it was measured on."""
+def camera_table(results: dict[str, Any]) -> str:
+    """What the images of cameras take."""
     rows = [
         "| `edgegrasp-plus`, what a camera sends to ranked grasps | one thread |",
         "| --- | --- |",
@@ -291,7 +295,12 @@ def table(results: dict[str, Any]) -> str:
             rows.append(
                 f"| {size} | {statistics.median(of):.0f} ms{spread if len(of) > 1 else ''} |"
             )
-    rows += ["", "| | ours | textbook | times faster |", "| --- | --- | --- | --- |"]
+    return "\n".join(rows)
+
+
+def table(results: dict[str, Any]) -> str:
+    """All the others, and what they were measured on."""
+    rows = ["| | ours | textbook | times faster |", "| --- | --- | --- | --- |"]
     for name, paper in results["paper"].items():
         for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
             seconds, faster = paper[part]["seconds"], paper[part]["times_faster"]
