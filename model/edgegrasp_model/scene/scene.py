@@ -38,6 +38,7 @@ from edgegrasp_model.scene.things import (
     BOX_FLOOR,
     CELL,
     FINE_CELL,
+    FIXED,
     UNKNOWN,
     PlaneView,
     find_things,
@@ -125,8 +126,9 @@ def select_points(
     floor = standing.number == BOX_FLOOR
     if floor.sum() > MIN_BOX_FLOOR and not isinstance(options.support, SupportPlane):
         # Things in an open box stand on its floor.
+        walls = standing.sent.row[standing.number == FIXED]
         support, said = raised(support, standing.seen.take(np.flatnonzero(floor))), []
-        standing = _standing_on(support, sent, seen, inside, options, said)
+        standing = _standing_on(support, sent, seen, inside, options, said, walls)
     warnings += said
     counts["above_support"] = int(standing.inside.sum())
     kept = near_things(standing.plan, standing.number)
@@ -150,7 +152,9 @@ def _standing_on(
     inside: Bools,
     options: DetectOptions,
     warnings: list[str],
+    walls: Int64 | None = None,
 ) -> _Standing:
+    """What stands on a support; of points that are known as walls, nothing does."""
     height, margin, thick = support.heights(seen)
     # Where the cloud was cut off above the support, what is near it does not tell its outline.
     near = (np.abs(height) < thick) & math.isfinite(support.spread)
@@ -158,8 +162,12 @@ def _standing_on(
     on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
     plan = support.plan(sent.points)
-    view = PlaneView(plan, height[above], margin[above], on_plan, seen.at_border)
-    number = _numbers(view, sent, seen, inside, options, warnings)
+    height, margin = height[above], margin[above]
+    number = np.full(len(plan), FIXED)
+    rest = np.flatnonzero(~np.isin(sent.row, [] if walls is None else walls))
+    border = None if seen.at_border is None else seen.at_border[rest]
+    view = PlaneView(plan[rest], height[rest], margin[rest], on_plan, border)
+    number[rest] = _numbers(view, sent.take(rest), seen.take(rest), inside[rest], options, warnings)
     return _Standing(sent, seen, inside, plan, number)
 
 
