@@ -101,15 +101,11 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
         if np.percentile(view.height[some] / view.margin[some], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[some], view.height[some])
-        sides = np.zeros(0) if view.beyond is None else np.unique(view.beyond[mine])
         if view.beyond is not None and (view.beyond[mine] == 0).mean() > SURE:
             number[mine], found = found, found + 1
             continue
-        contents: Contents | None = None
-        if np.count_nonzero(sides) >= AROUND and view.beyond is not None:
-            inside = view.beyond[mine] == 0
-            contents = Contents(inside, ~inside, inside, ~inside & False)
-        elif length > MIN_BOX:
+        contents = _around_workspace(mine, view)
+        if contents is None and length > MIN_BOX:
             contents = box_contents(view.plan[mine], view.height[mine])
         if contents is not None:
             number[mine[contents.walls]] = FIXED
@@ -236,10 +232,18 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None
         return None
     lowest = np.percentile(height[inside], 3)
     floor = inside & (height < lowest + FLOOR)
-    size = from_side[::2].max(axis=1) + from_side[1::2].min(axis=1)
+    size = from_side[::2, 0] + from_side[1::2, 0]
     if len(np.unique(_cells(plan[floor]))) * CELL**2 < MIN_FLOOR * size.prod():
         floor[:] = False
     return Contents(inside & ~floor, walls, deep, floor)
+
+
+def _around_workspace(rows: Int64, view: PlaneView) -> Contents | None:
+    """What of a cluster lies in the caller's workspace; None where it does not go on around it."""
+    if view.beyond is None or np.count_nonzero(np.unique(view.beyond[rows])) < AROUND:
+        return None
+    inside = view.beyond[rows] == 0
+    return Contents(inside, walls=~inside, deep=inside, floor=np.zeros(len(rows), dtype=bool))
 
 
 def _dense(plan: Float64) -> Bools:
