@@ -255,7 +255,7 @@ def _dense(plan: Float64) -> Bools:
 
 def occupied_cells(plan: Float64, size: float = CELL) -> int:
     """How many cells of a size points (M, 2) lie in."""
-    return np.count_nonzero(np.bincount(_cells(plan, size)))
+    return int(np.count_nonzero(np.bincount(_cells(plan, size))))
 
 
 def _cells(plan: Float64, size: float = CELL) -> Int64:
