@@ -70,7 +70,7 @@ def bright(page: Any) -> int:
     """Pixels of the picture that have the colour of a good score."""
     picture = Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB")
     red, green, blue = np.moveaxis(np.asarray(picture).astype(int), 2, 0)
-    return int(((red > 150) & (green > 140) & (blue < 0.45 * green)).sum())
+    return int(((red > 150) & (blue > 150) & (green < 0.6 * red)).sum())
 
 
 def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(

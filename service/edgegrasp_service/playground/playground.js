@@ -206,7 +206,7 @@ function showAnswer() {
     : "No grasps yet";
   $("warnings").replaceChildren(...(answer?.warnings ?? []).map((text) => element("li", text)));
   if (answer && !answer.support) $("warnings").append(element("li", "No support plane was found."));
-  if (answer) $("count").max = Math.max(grasps.length, 1);
+  if (answer) $("count").max = Math.max(grasps.length, 12);
   $("grasps").replaceChildren(...grasps.map(line));
   const counts = Object.entries(answer?.counts ?? {});
   $("counts").replaceChildren(...counts.map(([name, count]) => {
@@ -394,6 +394,10 @@ $("token").addEventListener("change", async () => (await listModels()) && !state
 for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
   $(name).addEventListener("change", () => state.files.length && open(state.files));
 }
+$("at_origin").addEventListener("click", async () => {
+  $("viewpoint").value = "0,0,0";
+  if (state.files.length && (await open(state.files))) await ask();
+});
 for (const name of ["min_score", "count", "whole"]) $(name).addEventListener("input", filter);
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
