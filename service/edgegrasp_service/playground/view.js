@@ -284,9 +284,13 @@ export class View {
     this.draw();
   }
 
-  /** Mark a grasp: its hand, both its points and the way in; null: none. */
+  /** Mark a grasp: its hand, both its points and the way in, the others pale; null: none. */
   choose(grasp) {
     const group = this.groups.chosen.clear();
+    for (const bar of this.hands.flatMap((hand) => hand.children)) {
+      Object.assign(bar.material, { transparent: Boolean(grasp), opacity: grasp ? 0.3 : 1, needsUpdate: true });
+      bar.children[0].visible = !grasp; // its rim
+    }
     if (grasp) {
       const outline = this._outline(grasp, new THREE.Color("white"));
       outline.children.forEach((bar) => bar.scale.multiplyScalar(1.02));
