@@ -1,8 +1,10 @@
 # EdgeGrasp: `make help` lists what there is.
 #
 # PYTHON names the interpreter that makes .venv: make PYTHON=python3.12 venv
+# TORCH is what pip is given for it: a build without CUDA; with CUDA: make TORCH=torch venv
 
 PYTHON ?= python3
+TORCH ?= --no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -24,6 +26,7 @@ $(TO_LOOK): EXTRA := service
 $(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.sh
 	scripts/system_packages.sh $(PYTHON)
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python scripts/install.py constraints.txt $(TORCH)
 	$(BIN)/python scripts/install.py constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
