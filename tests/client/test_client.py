@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import grpc
 import numpy as np
 
 import edgegrasp_client
@@ -113,13 +112,6 @@ def test_models_and_readiness(either_client) -> None:
     assert (model.name, model.default, model.gripper) == ("dummy", True, "panda")
     assert either_client.ready()
     either_client.wait_until_ready(5)
-
-
-def test_injected_channel_stays_open(dummy_server, cloud) -> None:
-    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
-        for _ in range(2):
-            with GraspClient(channel=channel) as client:
-                assert client.detect(cloud).grasps
 
 
 async def test_async_context_manager(dummy_server, cloud) -> None:
