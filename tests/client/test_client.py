@@ -107,11 +107,11 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
     assert_same(client.detect(cloud, **options), client.detect(cloud))
 
 
-def test_models_and_readiness(either_client) -> None:
-    (model,) = either_client.models()
+def test_models_and_readiness(client) -> None:
+    (model,) = client.models()
     assert (model.name, model.default, model.gripper) == ("dummy", True, "panda")
-    assert either_client.ready()
-    either_client.wait_until_ready(5)
+    assert client.ready()
+    client.wait_until_ready(5)
 
 
 async def test_async_context_manager(dummy_server, cloud) -> None:
