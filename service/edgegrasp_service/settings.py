@@ -180,11 +180,7 @@ def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str
     name = str(first["loc"][0])
     origin = next(source for source, fields in sources.items() if name in fields)
     if first["type"] == "extra_forbidden":
-        return f"{one_line(name)}: no such setting. It comes from {origin}."
+        name = "".join(letter if letter.isprintable() else "?" for letter in name)
+        return f"{name}: no such setting. It comes from {origin}."
     path = ".".join(str(part) for part in first["loc"])
     return f"{path}: got {first['input']!r}. {message}. It comes from {origin}."
-
-
-def one_line(text: str) -> str:
-    """A text from outside as it may stand in a message."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)

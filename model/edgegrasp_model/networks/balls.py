@@ -1,7 +1,7 @@
 """The batch that the ball networks score: the neighbourhoods of the approach points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -146,16 +146,8 @@ class BallBatch:
 
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
-        return BallBatch(
-            points=self.points.to(device),
-            normals=self.normals.to(device),
-            neighbors=self.neighbors.to(device),
-            ball_of_point=self.ball_of_point.to(device),
-            num_balls=self.num_balls,
-            contact=self.contact.to(device),
-            approach=self.approach.to(device),
-            depth=self.depth.to(device),
-        )
+        tensors = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
 
 def _float_tensor(array: NDArray[np.floating]) -> Tensor:

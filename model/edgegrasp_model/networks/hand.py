@@ -88,11 +88,8 @@ class HandBatch:
     @staticmethod
     def concatenate(batches: Sequence["HandBatch"]) -> "HandBatch":
         """Join batches into one, as training does; scores come out in the same order."""
-        return HandBatch(
-            torch.cat([batch.description for batch in batches]),
-            torch.cat([batch.points for batch in batches]),
-            torch.cat([batch.point_count for batch in batches]),
-        )
+        parts = zip(*(vars(batch).values() for batch in batches), strict=True)
+        return HandBatch(*map(torch.cat, parts))
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
@@ -109,11 +106,7 @@ class HandBatch:
 
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
-        return HandBatch(
-            self.description.to(device),
-            self.points.to(device),
-            self.point_count.to(device),
-        )
+        return HandBatch(*(tensor.to(device) for tensor in vars(self).values()))
 
 
 def hand_batch(
