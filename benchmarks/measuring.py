@@ -113,12 +113,7 @@ class Served:
 
 @contextmanager
 def served(*flags: str, program: Sequence[str] = SERVE) -> Iterator[Served]:
-    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts.
-
-    Args:
-        flags: Of `edgegrasp serve`.
-        program: What Python is to run as `edgegrasp`.
-    """
+    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
     quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
     with local_server(*quiet, *flags, program=(sys.executable, *program)) as own:
         yield Served(own.http_url, own.grpc_address, psutil.Process(own.pid))

@@ -233,10 +233,6 @@ def planner_title(planner: dict[str, Any]) -> str:
 def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     """Differences of GSR and DR over the scenes that two benchmarks share.
 
-    Args:
-        first: the reference.
-        second: compared with it.
-
     Returns:
         Figures ready for JSON: for `grasp_success_rate` and `declutter_rate` the value and
         interval of each and the difference, second minus first, with its paired 95 % interval.

@@ -94,14 +94,7 @@ class Packed(NamedTuple):
 def tried_grasps(
     view: LabelledView, config: NetworkConfig, gripper: Gripper, *, viewpoint_known: bool = True
 ) -> TriedGrasps:
-    """Build the tried candidates of a view, with the inputs of a hand network.
-
-    Args:
-        view: The view.
-        config: The network to prepare for.
-        gripper: It tried them.
-        viewpoint_known: Whether the request gave the camera's position.
-    """
+    """Build the tried candidates of a view, with the inputs of a hand network."""
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
     candidates = _candidates(view, cloud, rows, gripper)

@@ -112,9 +112,7 @@ def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
 def made_object(name: str, folder: Path) -> ObjectModel:
     """Write a computed object into a folder.
 
-    Args:
-        name: One of HOLLOW_NAMES or DRAWN_NAMES.
-        folder: Created if missing.
+    One of HOLLOW_NAMES or DRAWN_NAMES.
     """
     surface = revolved(HOLLOW[name]) if name in HOLLOW else drawn_shape(DRAWN_NAMES.index(name))
     return ObjectModel(name, write_object(name, surface, folder))

@@ -41,16 +41,11 @@ class NotReady(ServiceError):  # noqa: N818
 
 
 class Overloaded(ServiceError):  # noqa: N818
-    """As many requests as the server takes are in it already.
-
-    Args:
-        message: The whole sentence.
-        retry_after: Seconds until it is worth another try.
-    """
+    """As many requests as the server takes are in it already."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
         super().__init__(message)
-        self.retry_after = retry_after
+        self.retry_after = retry_after  # seconds
 
 
 class RequestTimeout(InvalidRequest):

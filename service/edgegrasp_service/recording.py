@@ -13,9 +13,7 @@ logger = logging.getLogger(__name__)
 class Recorder:
     """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
-    Args:
-        folder: Made if it is not there.
-        most: Bytes of all files; the oldest are deleted.
+    Beyond `most` bytes of all files the oldest are deleted.
     """
 
     def __init__(self, folder: Path, most: int) -> None:

@@ -159,9 +159,7 @@ def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
 def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
     """Builds a network with random weights.
 
-    Args:
-        config: Its architecture and widths.
-        generator: Source of the weights; without one, those of seed 0.
+    From the generator, or without one from seed 0.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # The layers first initialise themselves from the global stream: leave it as it was.
