@@ -244,7 +244,11 @@ class _GrpcTransport:
     """Calls over one channel; raises GraspClientErrors."""
 
     def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
-        self._channel = _open_channel(address, tls)
+        if tls is None:
+            self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
+        else:
+            credentials = channel_credentials(tls)
+            self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
         self._metadata = token_metadata(token)
         self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
@@ -361,9 +365,3 @@ class _RestTransport:
 
     async def close(self) -> None:
         await self._http.aclose()
-
-
-def _open_channel(address: str, tls: Tls | None) -> grpc.aio.Channel:
-    if tls is None:
-        return grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
-    return grpc.aio.secure_channel(address, channel_credentials(tls), CHANNEL_OPTIONS)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -146,7 +146,8 @@ class BallBatch:
 
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
-        tensors = {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
+        parts = vars(self).items()
+        tensors: dict[str, Any] = {name: part for name, part in parts if isinstance(part, Tensor)}
         return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
 
