@@ -326,10 +326,7 @@ def paired_difference(
 
     Scenes are resampled, so that differences between scenes cancel out.
 
-    Args:
-        numerators: (2, S) counts of each run in each scene.
-        denominators: (2, S) likewise.
-        rng: source of the resampling.
+    Counts are (2, S): of each run in each scene.
 
     Returns:
         Second run's ratio minus the first's, and its 95 % interval; None if a run has no counts.

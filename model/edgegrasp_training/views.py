@@ -147,10 +147,7 @@ def split_by_scene(
 
     A scene keeps its side when scenes are added, so that a run may resume with more data.
 
-    Args:
-        paths: View files.
-        validation_share: Share of the scenes to hold out; at least one is.
-        seed: Which ones.
+    At least one scene is held out.
     """
     place = {
         scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)

@@ -115,9 +115,7 @@ class Settings(BaseModel):
 def load_settings(config: Path | None = None, **given: object) -> Settings:
     """Settings from defaults, a TOML file, the environment and arguments, the latter winning.
 
-    Args:
-        config: The file; None: the one EDGEGRASP_CONFIG names, if it does.
-        given: Settings by name.
+    Without `config`, the file is the one EDGEGRASP_CONFIG names, if it does.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.

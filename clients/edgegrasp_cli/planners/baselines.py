@@ -219,10 +219,6 @@ def paper_grasps(
 def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
     """Outliers dropped, normals estimated, then voxels; None where too few points are left.
 
-    Args:
-        points: (N, 3) dense cloud above the table, metres.
-        voxel_size: metres.
-
     Returns:
         The mean of the points and normals in each voxel; normals are of either sign.
     """

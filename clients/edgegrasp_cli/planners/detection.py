@@ -105,13 +105,8 @@ class ServerPlanner:
 class InProcessPlanner:
     """Takes the best grasp of a detector in this process.
 
-    Args:
-        weights: files or folders besides those that ship.
-        model: weights to use; empty: the default.
-        rules: of the protocol.
-        options: of each request, besides the protocol's.
-        voxel_size: metres, in place of what the weights were trained on.
-        flipped_normals: share of the processed cloud's normals to turn around at random.
+    A voxel size, metres, takes the place of what the weights were trained on; a share of the
+    normals is turned around at random.
 
     Raises:
         EdgeGraspError: the weights cannot be loaded.

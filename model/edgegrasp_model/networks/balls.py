@@ -25,12 +25,6 @@ def nearest_in_ball(
     The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
     row fills the rest, which changes no maximum over neighbours.
 
-    Args:
-        points: The cloud (N, 3), metres.
-        approach_index: Rows (A,) of `points`, as given to `crop_balls`.
-        crop: P ball points.
-        k: Neighbours per point, itself included.
-
     Returns:
         (P, k) rows of `crop.ball_rows`, nearest (the point itself) first.
 
@@ -72,15 +66,7 @@ class BallBatch:
     ) -> Self:
         """Packs a cloud and its balls.
 
-        Args:
-            points: The cloud (N, 3), metres.
-            normals: Its normals (N, 3).
-            approach_index: Rows (A,) of `points`, as given to `crop_balls`.
-            crop: The balls.
-            contact: Rows (E,) of `crop.ball_rows`, not of the cloud: a contact has a ball.
-            approach: Outward approach directions (E, 3), unit length.
-            depth: Depths (E,), metres.
-            k: Neighbours per point, itself included.
+        Contacts are rows of the crop, not of the cloud: a contact has a ball.
         """
         centre = points[approach_index][crop.ball_of_point]
         return cls(
