@@ -12,12 +12,15 @@ import httpx
 from typing_extensions import Self
 
 from edgegrasp_client.async_client import AsyncGraspClient
-from edgegrasp_client.connection import DEFAULT_ADDRESS, Tls
+from edgegrasp_client.connection import DEFAULT_ADDRESS, Tls, is_rest
+from edgegrasp_client.errors import invalid
 from edgegrasp_client.requests import StreamRequest
 from edgegrasp_client.results import StreamAnswer
 
 Parameters = ParamSpec("Parameters")
 Answer = TypeVar("Answer")
+
+_ASKED_OVER_GRPC: set[int] = set()  # this process, and those that it was forked from
 
 
 def _waiting(
@@ -48,6 +51,12 @@ class GraspClient:
         tls: Tls | None = None,
         http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
+        if not is_rest(address):
+            _ASKED_OVER_GRPC.add(os.getpid())
+            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait for ever, for threads of the parent's
+                fix = "Start processes by `spawn`, or ask over REST."
+                raise invalid("address", "gRPC in a fork of a process that has used it", fix)
+
         async def make() -> AsyncGraspClient:
             return AsyncGraspClient(
                 address,
@@ -83,7 +92,7 @@ class GraspClient:
             while (answer := _run(following())) is not None:
                 yield answer
         finally:  # not waited for: the garbage collector may come here in the loop's own thread
-            asyncio.run_coroutine_threadsafe(end(), _loop())
+            asyncio.run_coroutine_threadsafe(end(), _loop_of(os.getpid()))
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -95,19 +104,16 @@ class GraspClient:
 
 
 @cache
-def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of all clients of this process."""
+def _loop_of(process: int) -> asyncio.AbstractEventLoop:
+    """The event loop of all clients of a process; a forked one has none of these threads."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="edgegrasp-client", daemon=True).start()
     return loop
 
 
-os.register_at_fork(after_in_child=_loop.cache_clear)  # a child has no such thread
-
-
 def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
     """What the work gives; where its caller is interrupted, it is cancelled."""
-    running = asyncio.run_coroutine_threadsafe(work, _loop())
+    running = asyncio.run_coroutine_threadsafe(work, _loop_of(os.getpid()))
     try:
         return running.result()
     except BaseException:
