@@ -5,7 +5,7 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
 from concurrent.futures import Future
-from functools import cache, wraps
+from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import httpx
@@ -20,6 +20,8 @@ from edgegrasp_client.results import StreamAnswer
 Parameters = ParamSpec("Parameters")
 Answer = TypeVar("Answer")
 
+_LOOPS: dict[int, asyncio.AbstractEventLoop] = {}  # by process
+_STARTING = threading.Lock()
 _ASKED_OVER_GRPC: set[int] = set()  # this process, and those that it was forked from
 
 
@@ -92,7 +94,7 @@ class GraspClient:
             while (answer := _run(following())) is not None:
                 yield answer
         finally:  # not waited for: the garbage collector may come here in the loop's own thread
-            asyncio.run_coroutine_threadsafe(end(), _loop_of(os.getpid()))
+            asyncio.run_coroutine_threadsafe(end(), _loop())
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -103,17 +105,18 @@ class GraspClient:
         self.close()
 
 
-@cache
-def _loop_of(process: int) -> asyncio.AbstractEventLoop:
-    """The event loop of all clients of a process; a forked one has none of these threads."""
-    loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, name="edgegrasp-client", daemon=True).start()
-    return loop
+def _loop() -> asyncio.AbstractEventLoop:
+    """The event loop of all clients of this process; a forked one has none of its parent's."""
+    with _STARTING:
+        if os.getpid() not in _LOOPS:
+            loop = _LOOPS[os.getpid()] = asyncio.new_event_loop()
+            threading.Thread(target=loop.run_forever, name="edgegrasp-client", daemon=True).start()
+        return _LOOPS[os.getpid()]
 
 
 def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
     """What the work gives; where its caller is interrupted, it is cancelled."""
-    running = asyncio.run_coroutine_threadsafe(work, _loop_of(os.getpid()))
+    running = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
         return running.result()
     except BaseException:
