@@ -32,7 +32,7 @@ class PlannerChoice:
     weights: tuple[Path, ...] = ()  # files or folders besides those that ship
     server: str | None = None  # `host:port` or `http://host:port`; None: one is started
     connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
-    # Of each request, in place of the protocol's and of collision `penalise`.
+    # Of each request, in place of the protocol's.
     options: dict[str, Any] = field(default_factory=dict)
     voxel_size: float | None = None  # metres, in place of the weights' own; `in-process` only
     flipped_normals: float = 0.0  # share turned around at random; `in-process` only
@@ -123,14 +123,13 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.weights_and_model()
-    options = {"collision": "penalise"} | choice.options
     flags = [text for path in weights for text in ("--weights", str(path))]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
         address = addresses.grpc_address
         with connect(address, CONNECT_SECONDS, **choice.connection) as client:
             used = model_used(client, model)
-        asked = {"model": model, **options}
+        asked = {"model": model, **choice.options}
         yield ChosenPlanner(
             partial(ServerPlanner, address, rules, asked, used.digest, choice.connection),
             {
@@ -138,7 +137,7 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
                 "model": used.name,
                 "digest": used.digest,
                 "voxel_size": used.voxel_size,
-                "options": options,
+                "options": choice.options,
             },
         )
 
@@ -176,8 +175,7 @@ def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlann
         changes["voxel_size"] = choice.voxel_size
     if choice.flipped_normals > 0:
         changes["flipped_normals"] = choice.flipped_normals
-    options = {"collision": "penalise"} | choice.options
-    facts |= {"model": used.name, "digest": used.digest, "options": options, **changes}
+    facts |= {"model": used.name, "digest": used.digest, "options": choice.options, **changes}
     return ChosenPlanner(
-        partial(InProcessPlanner, weights, model, rules, options, **changes), facts
+        partial(InProcessPlanner, weights, model, rules, choice.options, **changes), facts
     )
