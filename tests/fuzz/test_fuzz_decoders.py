@@ -42,7 +42,7 @@ MAX_POINTS = 5000
 @pytest.fixture(scope="module", autouse=True)
 def open3d_is_loaded() -> None:
     """Its import is no memory of a request."""
-    pytest.importorskip("open3d")
+    pytest.importorskip("open3d", exc_type=ImportError)
 
 
 def decode(size: int, **fields: Any) -> None:

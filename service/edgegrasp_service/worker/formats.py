@@ -328,8 +328,11 @@ def _read_compressed_pcd(
     if unpacked > MAX_UNPACKED:
         fix = f"Send at most {MAX_UNPACKED} bytes, or fields x, y and z alone."
         raise PayloadTooLarge("cloud", f"a PCD file of {unpacked} bytes once unpacked", fix)
-    import open3d  # it takes a second, and is needed for nothing else
-
+    try:
+        import open3d  # it takes a second, and is needed for nothing else
+    except ImportError:
+        fix = "Send a PCD file of DATA binary or ascii."
+        raise UnsupportedMediaType("cloud", "DATA binary_compressed, without Open3D", fix) from None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cloud.pcd"
         path.write_bytes(data)

@@ -1,5 +1,6 @@
 import io
 import struct
+import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import PayloadTooLarge
+from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
 from edgegrasp_service.worker.formats import read_file, read_png
 from edgegrasp_service.worker.request_cloud import decode_points
 
@@ -168,6 +169,16 @@ def test_compressed_pcd_with_sizes_that_lie() -> None:
     for sizes in ((4, 10**9), (10**9, 840)):
         with pytest.raises(InvalidRequest):
             read_file("pcd", head + mark + struct.pack("<II", *sizes) + bytes(4), MANY)
+
+
+def test_compressed_pcd_where_there_is_no_open3d(monkeypatch) -> None:
+    """As where its wheel is too new for the system's C library: the rest is read without it."""
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    head, mark, _ = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
+    with pytest.raises(UnsupportedMediaType) as caught:
+        read_file("pcd", head + mark + struct.pack("<II", 4, 840) + bytes(4), MANY)
+    assert "binary or ascii" in caught.value.fix
+    assert len(read_file("pcd", pcd(POINTS, "binary"), MANY).points) == 40
 
 
 NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)
