@@ -2,11 +2,15 @@
 # What a newcomer sees: `make demo` and `make test` of what is committed here, on a Debian with
 # nothing but Python, make, git and certificates. Prints a row of CONTRIBUTING's table.
 #
-# usage: scripts/newcomer.sh SUITE    bookworm: Python 3.11; trixie: 3.13. As root, with debootstrap.
+# usage: scripts/newcomer.sh SUITE [PYTHON]    as root, with debootstrap
+#
+# SUITE: bookworm: Python 3.11; trixie: 3.13; testing: 3.14. PYTHON: another's folder on this machine,
+# used in the place of the suite's own, e.g. ~/.pyenv/versions/3.12.1.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/bare_debian.sh
-suite=${1:?usage: $0 SUITE}
+suite=${1:?usage: $0 SUITE [PYTHON]}
+other=${2:-}
 if [ "$(id -u)" != 0 ] || ! command -v debootstrap apt-get >/dev/null; then
     echo "newcomer: needs root, and Debian with debootstrap" >&2
     exit 1
@@ -29,11 +33,11 @@ share() { # PATH of this machine, read-only where it is in the other
 
 bare_debian "$root" python3,python3-venv,make,git,ca-certificates "$suite"
 pip_settings "$root/etc/pip.conf"
-for path in /proc /dev /dev/shm /dev/pts $(pip_paths "$root/etc/pip.conf"); do share "$path"; done
+for path in /proc /dev /dev/shm /dev/pts $other $(pip_paths "$root/etc/pip.conf"); do share "$path"; done
 git clone --quiet . "$root/edgegrasp"
 
 inside() {
-    chroot "$root" env -i HOME=/root LANG=C.UTF-8 PATH=/usr/sbin:/usr/bin:/sbin:/bin \
+    chroot "$root" env -i HOME=/root LANG=C.UTF-8 PATH="${other:+$other/bin:}/usr/sbin:/usr/bin:/sbin:/bin" \
         bash -c "cd /edgegrasp && $1"
 }
 minutes() { # COMMAND: runs it and prints the minutes, or that it failed
@@ -47,7 +51,8 @@ minutes() { # COMMAND: runs it and prints the minutes, or that it failed
 }
 version=$(inside 'python3 -c "import platform; print(platform.python_version())"')
 demo=$(minutes 'make demo')
+engine=$(sed -n 's/^engine: \([a-z]*\).*/\1/p' "$work/log")
 tests=$(minutes 'make test')
 summary=$(grep -o -E '[0-9]+ passed.*' "$work/log" | tail -n 1 | sed 's/ in .*//')
 size=$(du -sm "$root/edgegrasp/.venv" | cut -f 1)
-echo "| $suite | $version | $demo | $tests: ${summary:-no summary} | $size MB |"
+echo "| $suite | $version | $engine | $demo | $tests: ${summary:-no summary} | $size MB |"

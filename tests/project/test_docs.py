@@ -8,6 +8,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -155,6 +156,7 @@ def test_the_commands_of_the_pages_exist_and_have_their_flags(monkeypatch) -> No
     assert {"edgegrasp", "make", "python", "curl"} <= seen
 
 
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_the_requests_by_curl_are_answered(dummy_server, tmp_path: Path) -> None:
     (tmp_path / "demo_output").mkdir()
     rows = "".join(f"{x} {y} 0.5\n" for x in range(20) for y in range(20))

@@ -140,6 +140,7 @@ def test_several_views(address: str) -> None:
 
 
 def test_pick_and_place(address: str) -> None:
+    pytest.importorskip("pybullet", reason="pybullet is not installed")
     shown = example("06_pick_and_place.py", "--server", address, "--picks", 2)
     assert "2 of 4 things in the tray" in shown
 
