@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from edgegrasp_sim.trial import Round
 
 Option = typer.Option
-MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
 
-# Flags that `experiment` has too.
+# Flags that other commands have too.
 Seeds = Annotated[
     list[int] | None, Option("--seed", help="Seed of scenes, views and noise; may be repeated.")
 ]
@@ -37,9 +36,7 @@ Engine = Annotated[
     str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
 ]
 Split = Annotated[str, Option(help="Which of its objects: test or train.")]
-Workers = Annotated[
-    int | None, Option(help="Processes that simulate; else one for each core. Same results.")
-]
+Workers = Annotated[int | None, Option(help="Processes; else one for each core. Same results.")]
 Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
 # Options of a detection that the simulation, the protocol or another flag decides.
 DECIDED = (
@@ -125,9 +122,13 @@ def benchmark(
             chosen.name,
         )
         own_server = planner == "server" and server is None
-        processes = _processes(workers, ray=ray, own_server=own_server)
+        if ray not in (None, "local") and own_server:
+            raise ValueError(
+                f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
+                "--server, or --planner in-process"
+            )
         folder = ResultFolder(output) if output is not None else None
-        done, title = run_rounds(config, choice, folder, workers=processes, ray=ray)
+        done, title = run_rounds(config, choice, folder, workers=workers, ray=ray)
     summary = {
         "scene": scene,
         "engine": chosen.name,
@@ -195,8 +196,8 @@ def run_rounds(
     choice: "PlannerChoice",
     folder: "ResultFolder | None",
     *,
-    workers: int,
-    ray: str | None = None,
+    workers: int | None,
+    ray: str | None,
 ) -> "tuple[list[Round], str]":
     """Run what is left of a benchmark behind a progress bar.
 
@@ -250,24 +251,6 @@ def _progress(
             progress.update(bar, advance=1, description=text)
 
         yield on_round
-
-
-def _processes(workers: int | None, *, ray: str | None, own_server: bool) -> int:
-    """How many worker processes to use.
-
-    Raises:
-        ValueError: flags that do not go together.
-    """
-    from edgegrasp_sim.benchmark import available_cores
-
-    if ray not in (None, "local") and own_server:
-        raise ValueError(
-            f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
-            "--server, or --planner in-process"
-        )
-    if workers is None:
-        return MAX_RAY_WORKERS if ray is not None else available_cores()
-    return workers
 
 
 def _print_summary(summary: dict[str, Any], planner: str) -> None:

@@ -1,16 +1,13 @@
 """Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -30,14 +27,14 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
-from edgegrasp_sim.benchmark import end_with_parent
 from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.engine import choose_engine
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
 from edgegrasp_training.views import LabelledView, engine_of, support_as_array
@@ -131,21 +128,27 @@ class Chosen(NamedTuple):
 
 
 def generate(
-    folder: Path, objects: Path | None, options: GenerationOptions, workers: int = 1
+    folder: Path,
+    objects: Path | None,
+    options: GenerationOptions,
+    workers: int | None = 1,
+    ray: str | None = None,
 ) -> Iterator[tuple[int, int, int]]:
-    """Generate the scenes that are missing, in any order; the number of workers changes nothing.
+    """Generate the scenes that are missing, in any order; who makes them changes nothing.
 
     Args:
         folder: Where the views go, one file each.
         objects: Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
         options: What to generate.
-        workers: Processes.
+        workers: How many scenes at a time, and
+        ray: Address of a Ray cluster to make them on: see `run_tasks`. Views come back to `folder`.
 
     Yields:
         For each finished scene its index, the grasps tried in it and those that held.
 
     Raises:
         ValueError: The folder holds views of another engine.
+        RuntimeError: Workers keep dying, or there is no such Ray cluster.
     """
     folder.mkdir(parents=True, exist_ok=True)
     options = replace(options, engine=choose_engine(options.engine).name)
@@ -156,23 +159,16 @@ def generate(
             "choose another folder"
         )
     missing = missing_scenes(folder, options)
-    if workers == 1:
-        for index in missing:
-            yield index, *generate_scene(folder, objects, options, index)
-        return
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_start_worker
-    ) as pool:
-        futures = {
-            pool.submit(generate_scene, folder, objects, options, index): index for index in missing
-        }
-        for future in as_completed(futures):
-            yield futures[future], *future.result()
-
-
-def _start_worker() -> None:
-    end_with_parent()
-    torch.set_num_threads(1)
+    sets = {}
+    if objects is not None:
+        sets = {kind: ObjectSet.from_folder(objects, kind, "train") for kind in CLUTTER}
+    digests = [drawn.digest for drawn in sets.values()]
+    make_runner = partial(_scene_maker, sets, digests, options)
+    for index, views in run_tasks(make_runner, missing, workers=workers, ray=ray):
+        for number, view in enumerate(views):
+            view.save(view_path(folder, index, number, options))
+        tried = sum(len(view.tried()) for view in views)
+        yield index, tried, sum(int((view.success == 1).sum()) for view in views)
 
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
@@ -193,25 +189,31 @@ def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -
     return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
 
 
+def _scene_maker(
+    sets: dict[SceneKind, ObjectSet], digests: list[str], options: GenerationOptions
+) -> Callable[[int], list[LabelledView]]:
+    for drawn, digest in zip(sets.values(), digests, strict=True):
+        drawn.check_same(digest)
+    return partial(generate_scene, sets, options)
+
+
 def generate_scene(
-    folder: Path, objects: Path | None, options: GenerationOptions, index: int
-) -> tuple[int, int]:
-    """Generate all views of one scene; returns how many grasps were tried and how many held."""
+    sets: dict[SceneKind, ObjectSet], options: GenerationOptions, index: int
+) -> list[LabelledView]:
+    """Generate all views of one scene, of the built-in objects where there are no sets."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
     kind = options.kind_of(index)
     # Some scenes are made of the other kind's objects.
     source = kind.objects
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
         source = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
-    tried = held = 0
+    views = []
     with TemporaryDirectory() as shapes:
-        drawn = None
-        if objects is not None:
-            drawn = ObjectSet.from_folder(objects, source, "train")
-            if streams[SHAPE_STREAM].random() < VARIED_SHARE:
-                drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
-        sets = None if drawn is None else {kind: drawn}
-        with ClutterSimulation(sets, engine=options.engine) as simulation:
+        drawn = sets.get(source)
+        if drawn is not None and streams[SHAPE_STREAM].random() < VARIED_SHARE:
+            drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
+        made_of = None if drawn is None else {kind: drawn}
+        with ClutterSimulation(made_of, engine=options.engine) as simulation:
             hard = _make_scene(simulation, kind, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
@@ -221,10 +223,8 @@ def generate_scene(
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 engine = simulation.world.name
                 view = replace(view, engine=engine, objects=names, object_digests=digests)
-                view.save(view_path(folder, index, number, options))
-                tried += len(view.tried())
-                held += int((view.success == 1).sum())
-    return tried, held
+                views.append(view)
+    return views
 
 
 def _make_scene(
