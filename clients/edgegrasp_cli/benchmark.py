@@ -36,6 +36,10 @@ Objects = Annotated[
 Engine = Annotated[
     str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
 ]
+Hand = Annotated[
+    str | None,
+    Option("--gripper", help="Hand to grasp with: a gripper's name or .toml file; else the Panda."),
+]
 Split = Annotated[str, Option(help="Which of its objects: test or train.")]
 Workers = Annotated[
     int | None, Option(help="Processes that simulate; else one for each core. Same results.")
@@ -66,6 +70,7 @@ def benchmark(
     objects: Objects = None,
     split: Split = "test",
     engine: Engine = None,
+    gripper: Hand = None,
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
@@ -106,13 +111,15 @@ def benchmark(
         rules = load_protocol(protocol)
         chosen = choose_engine(engine, rules.engine)
         print(chosen)
+        hand = fields_of(gripper)
+        asked = parse_option_flags(options)
         choice = PlannerChoice(
             planner,
             model,
             tuple(path.resolve() for path in weights or ()),
             server,
             connection,
-            parse_option_flags(options),
+            asked if hand is None else asked | {"gripper": hand},
         )
         config = BenchmarkConfig(
             SceneKind(scene),
@@ -123,6 +130,7 @@ def benchmark(
             split,
             patience,
             chosen.name,
+            hand,
         )
         own_server = planner == "server" and server is None
         processes = _processes(workers, ray=ray, own_server=own_server)
@@ -146,6 +154,13 @@ def benchmark(
         if below := below_gate(summary, gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
         print("not below the gate")
+
+
+def fields_of(gripper: str | None) -> dict[str, Any] | None:
+    """The fields of a gripper's file; None for the Panda, whose hand has shapes of its own."""
+    from edgegrasp_model.gripper import gripper_fields
+
+    return None if gripper in (None, "panda") else gripper_fields(gripper)
 
 
 def compare(
