@@ -101,6 +101,7 @@ def benchmark(
     Options of the detection are the protocol's, with collision penalise, unless a flag is given.
     """
     from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
@@ -111,7 +112,8 @@ def benchmark(
         rules = load_protocol(protocol)
         chosen = choose_engine(engine, rules.engine)
         print(chosen)
-        hand = fields_of(gripper)
+        # The Panda's hand has shapes of its own.
+        hand = gripper_fields(gripper) if gripper not in (None, "panda") else None
         asked = parse_option_flags(options)
         choice = PlannerChoice(
             planner,
@@ -154,13 +156,6 @@ def benchmark(
         if below := below_gate(summary, gate):
             sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
         print("not below the gate")
-
-
-def fields_of(gripper: str | None) -> dict[str, Any] | None:
-    """The fields of a gripper's file; None for the Panda, whose hand has shapes of its own."""
-    from edgegrasp_model.gripper import gripper_fields
-
-    return None if gripper in (None, "panda") else gripper_fields(gripper)
 
 
 def compare(
@@ -301,6 +296,8 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
+    if summary["too_wide"]:
+        console.print(f"{summary['too_wide']} objects are wider than the hand opens")
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")
     if summary["planner_retries"]:

@@ -32,6 +32,10 @@ def generate_data(
         Option(help="Network that chooses half of the grasps: its best, and its least certain."),
     ] = None,
     engine: Engine = None,
+    gripper: Annotated[
+        str,
+        Option(help="Hand that tries them: a gripper's name or .toml file; random: one a scene."),
+    ] = "panda",
     workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
@@ -49,7 +53,7 @@ def generate_data(
     chosen = choose_engine(engine)
     print(chosen)
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name
+        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name, gripper
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0

@@ -142,6 +142,7 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
             **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
             "no candidate": sum(item.no_grasp for item in rounds),
         },
+        "too_wide": sum(item.too_wide for item in rounds),
         "wrong_object_successes": sum(attempt.wrong_object for attempt in attempts),
         "start_contacts": sum(attempt.start_contact for attempt in attempts),
         "round_ends": dict(Counter(item.end.value for item in rounds)),
@@ -184,10 +185,10 @@ def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
 
 
 def attempts_digest(rounds: Sequence[Round]) -> str:
-    """SHA-256 of everything but wall-clock times; equal for equal attempts."""
+    """SHA-256 of all but wall-clock times and the objects' widths; equal for equal attempts."""
     tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
     for table in tables:
-        del table["retries"], table["waited_seconds"]
+        del table["retries"], table["waited_seconds"], table["too_wide"]
         for attempt in table["attempts"]:
             del attempt["planning_seconds"]
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()

@@ -21,6 +21,7 @@ from edgegrasp_sim.camera import (
     seen_box,
 )
 from edgegrasp_sim.engine import make_world
+from edgegrasp_sim.engine.urdf import least_width, read_urdf
 from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.picture import lit
@@ -159,6 +160,13 @@ class ClutterSimulation:
     def object_models(self) -> list[ObjectModel]:
         """Models of the objects that are left."""
         return [item.model for item in self._objects]
+
+    @property
+    def too_wide(self) -> int:
+        """How many of the objects are wider at their narrowest than the hand opens."""
+        shapes = (read_urdf(i.model.urdf, i.scale * i.model.scale) for i in self._objects)
+        opening = self._hand.model.max_opening
+        return sum(least_width(shape) > opening for shape in shapes)
 
     @property
     def object_bounds(self) -> Matrix:
