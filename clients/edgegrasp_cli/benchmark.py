@@ -283,7 +283,7 @@ def _processes(workers: int | None, *, ray: str | None, own_server: bool) -> int
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from rich.console import Console
 
-    from edgegrasp_sim.results import over_seeds, percent
+    from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
     gsr, dr = (
@@ -296,8 +296,13 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
-    if summary["too_wide"]:
-        console.print(f"{summary['too_wide']} objects are wider than the hand opens")
+    wide = summary["too_wide"]
+    if wide["objects"]:
+        gsr, dr = (percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
+        console.print(
+            f"{wide['objects']} objects are wider than the hand opens; of the others: "
+            f"GSR {gsr} %, DR {dr} %"
+        )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")
     if summary["planner_retries"]:

@@ -162,11 +162,14 @@ class ClutterSimulation:
         return [item.model for item in self._objects]
 
     @property
-    def too_wide(self) -> int:
-        """How many of the objects are wider at their narrowest than the hand opens."""
-        shapes = (read_urdf(i.model.urdf, i.scale * i.model.scale) for i in self._objects)
-        opening = self._hand.model.max_opening
-        return sum(least_width(shape) > opening for shape in shapes)
+    def too_wide(self) -> list[ObjectModel]:
+        """Models of the objects that are wider at their narrowest than the hand opens."""
+        return [
+            model
+            for model, scale in ((item.model, item.scale) for item in self._objects)
+            if least_width(read_urdf(model.urdf, scale * model.scale))
+            > self._hand.model.max_opening
+        ]
 
     @property
     def object_bounds(self) -> Matrix:

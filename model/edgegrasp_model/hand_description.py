@@ -20,6 +20,7 @@ from edgegrasp_model.hand_view import (
     hand_views,
     mirror_sides,
     reach_of,
+    seen_part,
 )
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
@@ -72,11 +73,12 @@ def describe_hands(
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
     mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    seen = _look(view, cloud.normals, mirrored, side, at_side, gripper)
+    ends = seen_part(gripper)
+    seen = _look(view, cloud.normals, mirrored, side, at_side, ends)
     depth = None
     if viewpoint is not None and len(cloud.points):
         depth = DepthMap.of_cloud(cloud.points, viewpoint, up)
-    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, gripper)
+    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, ends)
     columns = [
         *seen.hits.T,
         *seen.between.T,
