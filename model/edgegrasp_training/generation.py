@@ -416,7 +416,8 @@ def choose_grasps(
         scene = build_scene(selected, request, VOXEL_SIZE, {})
         if scene is not None and scene.approach_allowed.any():
             gripper = choose_gripper(request, load_gripper(), {})
-            sample = sample_candidates(scene, request, gripper, CROP_RADIUS, {})
+            radius = max(CROP_RADIUS, gripper.max_opening / 2)
+            sample = sample_candidates(scene, request, gripper, radius, {})
     else:
         prepared = guide.prepare(observation.cloud, request)
         selected, scene, sample = prepared.selected, prepared.scene, prepared.sample

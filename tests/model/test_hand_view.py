@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
+from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
     HAND_DESCRIPTION_SIZE,
     describe_hands,
@@ -49,10 +50,11 @@ def look(
     camera: np.ndarray | None = CAMERA,
     support: SupportPlane | None = None,
     limit: int = 400,
+    gripper: Gripper = PANDA,
 ) -> HandBatch:
     support = support or plane(UP, -0.05)
     up = np.array(support.normal, dtype=np.float32)
-    return HandBatch.from_cloud(cloud, candidates, PANDA, up, support, camera, None, limit)
+    return HandBatch.from_cloud(cloud, candidates, gripper, up, support, camera, None, limit)
 
 
 def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
@@ -221,6 +223,23 @@ def test_what_is_just_behind_is_hidden_by_degrees() -> None:
     found = behind(plate(), ABOVE, places)
     np.testing.assert_allclose(found, depth, atol=5e-4)
     np.testing.assert_allclose(unseen(found), [0.0, 0.5, 1.0], atol=0.02)
+
+
+def test_between_its_fingertips_a_hand_with_long_fingers_sees_what_the_panda_does() -> None:
+    cloud, candidates = scene(2)
+    (((x, y, z), (far_x, far_y, _)),) = PANDA.finger_boxes
+    tip = PANDA.tip_z + 0.05
+    long = replace(PANDA, tip_z=tip, finger_boxes=(((x, y, z), (far_x, far_y, tip)),))
+    back = candidates.T_cloud_hand.copy()
+    back[:, :3, 3] -= 0.05 * back[:, :3, 2]
+    others = look(cloud, replace(candidates, T_cloud_hand=back), gripper=long)
+    panda = look(cloud, candidates)
+    between = slice(7, 36)
+    torch.testing.assert_close(
+        others.description[:, between], panda.description[:, between], atol=1e-4, rtol=1e-4
+    )
+    torch.testing.assert_close(others.points, panda.points, atol=1e-5, rtol=0.0)
+    assert (others.description[:, 72] - panda.description[:, 72]).numpy() == pytest.approx(0.05)
 
 
 def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
