@@ -6,21 +6,25 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# What `make view` needs, which is installed sooner.
+TO_LOOK := $(VENV)/.to_look
 GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
 	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
 .DEFAULT_GOAL := help
-.PHONY: help venv lint format test bench fuzz demo image-test proto constraints clean
+.PHONY: help venv lint format test bench fuzz view demo docs image-test proto constraints clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 venv: $(INSTALLED) ## make .venv with everything, and the system libraries it needs
 
-$(INSTALLED): pyproject.toml constraints.txt scripts/system_packages.sh
+$(INSTALLED): EXTRA := dev
+$(TO_LOOK): EXTRA := service
+$(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.sh
 	scripts/system_packages.sh $(PYTHON)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python scripts/install.py constraints.txt --editable '.[dev]'
+	$(BIN)/python scripts/install.py constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
 lint: $(INSTALLED) ## style, types, import boundaries, generated code
@@ -51,8 +55,14 @@ fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect
 bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the tables of it
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --pages
 
+view: $(or $(wildcard $(INSTALLED)),$(TO_LOOK)) ## look at a scene and its grasps in the browser: make view FILE=scene.npz
+	$(BIN)/edgegrasp view $(FILE)
+
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
+
+docs: $(INSTALLED) ## build the site of docs/ into build/site, without network; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 image-test: $(INSTALLED) ## build the container image, run it locked up (root, Debian: podman)
 	docker/test_image.sh $(BIN)/python

@@ -3,7 +3,7 @@
 First come, first served, by as many workers as a machine has: times of service are those measured
 with as many clients as workers, where nobody waits. What follows for more clients is compared with
 what the load benchmark measures of them; then, for requests that come at random, how many a machine
-may get for a bound on the wait, and how many machines a rate needs. docs/scaling.md reads it.
+may get for a bound on the wait, and how many machines a rate needs. docs/scaling.md has them.
 """
 
 import argparse

@@ -64,6 +64,8 @@ def main(constraints: str, *arguments: str) -> int:
                 chosen.add(rest.split(" ")[0])
                 shown.show(f"choosing {rest.split(' ')[0]}", len(chosen), 0)
             elif line.startswith("Installing collected packages"):
+                shown.packages = len(chosen)  # an extra alone needs fewer than all
+                shown.bar.update(shown.task, total=2 * shown.packages)
                 unpacking.set()
         watcher.join()
         if pip.returncode == 0:

@@ -94,10 +94,9 @@ class Teacher:
         crop = crop_balls(cloud.points, balls, self.crop_radius)
         pairs = balls[crop.ball_of_point], crop.ball_rows
         every = np.arange(len(crop.ball_rows))
-        wanted = np.ones(len(cloud.points), dtype=bool)
         across = [
             outline_grasps(cloud.points, crop, balls, every, seen, support, view.hand)
-            for seen in outlines(cloud.points, view.camera_position, wanted)
+            for seen in outlines(cloud.points, view.camera_position, np.unique(crop.ball_rows))
         ]
         both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand), *across])
         if support is not None:

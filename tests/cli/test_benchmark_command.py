@@ -52,7 +52,6 @@ def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tm
     benchmark(tmp_path, "in-process", *few, "--gate", SMOKE_GATE, rounds=4)
     planner = json.loads((tmp_path / "manifest.json").read_text())["run"]["planner"]
     assert planner["options"] == {
-        "collision": "penalise",
         "num_approach_points": 16,
         "num_candidates": 400,
     }

@@ -47,8 +47,7 @@ def grasps_of(
     points = points.astype(np.float32)
     approach = np.arange(0, len(points), 4)
     crop = crop_balls(points, approach, 0.045)
-    everywhere = np.ones(len(points), dtype=bool)
-    seen = outlines(points, viewpoint, everywhere)[view]
+    seen = outlines(points, viewpoint, np.arange(len(points)))[view]
     every = np.arange(len(crop.ball_rows))
     return points, outline_grasps(points, crop, approach, every, seen, FLOOR, PANDA)
 

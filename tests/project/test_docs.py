@@ -1,53 +1,207 @@
-"""The pages name what there is."""
+"""The pages name what there is, their blocks run, and they make a site that needs no network."""
 
+import contextlib
+import importlib.util
+import io
+import json
+import os
 import re
+import runpy
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
+import httpx
 import numpy as np
+import pytest
+from PIL import Image
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
-from edgegrasp_client import conversions
+from edgegrasp_cli.main import load_command
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+PAGES = {page.name: page.read_text() for page in (*DOCS.glob("*.md"), *ROOT.glob("*.md"))}
+ALL_DOCS = "\n".join(PAGES[page.name] for page in DOCS.glob("*.md"))
+
+# Python that is compiled only: cameras that no machine has, a server with TLS (tests/service has
+# one), and a page whose blocks stand on each other (test_integrations.py).
+ABSENT = {"pyrealsense2", "pyk4a", "pyorbbecsdk", "zivid", "harvesters"}
+COMPILED = ("Tls(", *(f"import {name}" for name in ABSENT), *(f"from {name}" for name in ABSENT))
+ELSEWHERE = {"integrations.md"}
+# Commands of other programs, which change the machine or need what it has not.
+OTHERS = {".", "apt-get", "cd", "colcon", "docker", "git", "ln", "openssl", "pip", "ray", "rosdep"}
+OTHERS |= {"ros2", "serve"}
+DIAGRAMS = {"architecture.md"}  # pages with blocks of no language
+
+
+def blocks(language: str) -> Iterator[tuple[str, str]]:
+    """The name of the page and the text of each block in a language."""
+    for name, text in PAGES.items():
+        for found in re.finditer(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+            if found[1] == language:
+                yield name, found[2]
+
+
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """The name of the page and the words of each command that it shows."""
+    for name, block in blocks("console"):
+        for line in re.findall(r"^[$#] ((?:.*\\\n)*.*)$", block, re.MULTILINE):
+            told = re.sub(r"\s#.*", "", line.replace("\\\n", " "))
+            for command in re.split(r"&&|;", told):
+                words = shlex.split(command)
+                while words and re.match(r"[A-Z_]+=", words[0]):
+                    words.pop(0)
+                yield name, words
 
 
 def test_files_and_folders_that_pages_link_to_exist() -> None:
-    for page in (ROOT / "README.md", *DOCS.glob("*.md")):
+    for page in (*ROOT.glob("*.md"), *DOCS.glob("*.md")):
         for name in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text()):
             assert (page.parent / name).exists(), f"{page.name}: {name}"
-    readme = (ROOT / "README.md").read_text()
-    folders = re.findall(r"^\| `([a-z_/0-9]+/[a-z_/0-9]*)` \|", readme, flags=re.MULTILINE)
+    folders = re.findall(r"^\| `([a-z_/0-9]+/[a-z_/0-9]*)` \|", PAGES["README.md"], re.MULTILINE)
     assert len(folders) >= 5
     assert [name for name in folders if not (ROOT / name).exists()] == []
 
 
 def test_variables_that_the_pages_name_exist() -> None:
     known = {f"EDGEGRASP_{name.upper()}" for name in Settings.model_fields}
-    beside = [ROOT / name for name in ("README.md", "Dockerfile", "docker/compose.yaml")]
-    for page in (*DOCS.glob("*.md"), *beside):
-        named = set(re.findall(r"\bEDGEGRASP_[A-Z_]+", page.read_text()))
-        assert named <= {*known, "EDGEGRASP_CONFIG", TOKEN_VARIABLE, "EDGEGRASP_"}, page.name
+    beside = [(ROOT / name).read_text() for name in ("Dockerfile", "docker/compose.yaml")]
+    for text in (*PAGES.values(), *beside):
+        named = set(re.findall(r"\bEDGEGRASP_[A-Z_]+", text))
+        assert named <= {*known, "EDGEGRASP_CONFIG", TOKEN_VARIABLE, "EDGEGRASP_"}
 
 
-def test_the_requests_of_cameras_can_be_made(dummy_server) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "cameras.md").read_text(), flags=re.DOTALL)
+def test_every_option_setting_error_and_metric_is_in_a_page(dummy_server) -> None:
+    served = httpx.get(f"{dummy_server.http_url}/metrics").text
+    metrics = set(re.findall(r"^# TYPE (edgegrasp_\w+)", served, re.MULTILINE))
+    metrics = {name for name in metrics if not name.endswith("_created")}
+    assert len(metrics) > 10
+    kinds = {kind_of(error) for error in STATUS}
+    wanted = kinds | metrics | set(Settings.model_fields) | set(DetectOptions.model_fields)
+    assert [name for name in sorted(wanted) if f"`{name}`" not in ALL_DOCS] == []
+
+
+def test_tables_that_a_script_writes_are_up_to_date() -> None:
+    written = runpy.run_path(str(DOCS / "make_tables.py"))["pages"]()
+    assert [page.name for page, text in written.items() if page.read_text() != text] == []
+
+
+def test_the_python_of_the_pages_runs(dummy_server, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
     depth = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
-    given = {"depth": depth, "intrinsics": (60.0, 60.0, 15.5, 11.5), "depth_scale": 0.001}
-    given |= {"mask": depth > 550, "points": depth[..., None] * np.full(3, 0.001)}
-    requests = [block for block in blocks if "GraspClient(" in block]
-    assert len(requests) >= 4
-    for block in blocks:
-        code = compile(block.replace("127.0.0.1:50051", dummy_server.grpc_address), block, "exec")
-        if block in requests:
-            names = {"T_base_camera": np.eye(4), **given}
-            exec(code, names)
-            assert names["detection"].grasps
+    points = depth[..., None] * np.full(3, 0.001, np.float32)
+    np.save("scene.npy", points.reshape(-1, 3))
+    Image.fromarray(depth).save("depth.png")
+    given = {"depth": depth, "depth_scale": 0.001, "intrinsics": (60.0, 60.0, 15.5, 11.5)}
+    given |= {"points": points, "mask": depth > 550, "T_base_camera": np.eye(4)}
+    given |= {"camera": lambda: [points.reshape(-1, 3)], "use": print}
+    image = {"height": 24, "width": 32, "step": 64, "data": depth.tobytes(), "encoding": "16UC1"}
+    given |= {"message": SimpleNamespace(**image), "info": SimpleNamespace(k=np.eye(3))}
+    addresses = r"127\.0\.0\.1:50051|unix:/run/edgegrasp/grpc\.sock"
+    ran = 0
+    for name in PAGES:
+        names = dict(given)
+        for page, block in blocks("python"):
+            if page != name:
+                continue
+            code = re.sub(addresses, dummy_server.grpc_address, block)
+            code = code.replace("(615, 615, 320, 240)", "(60, 60, 15.5, 11.5)")
+            compiled = compile(code, f"{name}: {code}", "exec")
+            if name in ELSEWHERE or any(text in block for text in COMPILED):
+                continue
+            if "detection.grasps" in code and "detection =" not in code:
+                from edgegrasp_client import GraspClient
+
+                with GraspClient(dummy_server.grpc_address) as client:
+                    names["detection"] = client.detect(points, viewpoint=(0.0, 0.0, 0.0))
+            with contextlib.redirect_stdout(io.StringIO()):
+                exec(compiled, names)
+            ran += 1
+    assert ran >= 12
 
 
-def test_the_example_of_conversions_names_what_there_is() -> None:
-    frames = (DOCS / "frames.md").read_text()
-    imported = re.search(r"conversions import \(\n(.*?)\n\)", frames, flags=re.DOTALL)
-    assert imported is not None
-    assert all(hasattr(conversions, name) for name in re.findall(r"\w+", imported[1]))
+def test_the_commands_of_the_pages_exist_and_have_their_flags(monkeypatch) -> None:
+    monkeypatch.chdir(ROOT)
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    seen = set()
+    for page, words in commands():
+        program = words[0]
+        seen.add(program)
+        told = f"{page}: {' '.join(words)}"
+        if program == "edgegrasp":
+            command = load_command(words[1])
+            if hasattr(command, "commands") and words[2] in command.commands:
+                command = command.commands[words[2]]
+            flags = {flag for each in command.params for flag in (*each.opts, *each.secondary_opts)}
+            used = {word.partition("=")[0] for word in words if word.startswith("--")}
+            assert used - {"--help"} <= flags, told
+        elif program == "make":
+            asked = [word for word in words[1:] if "=" not in word]
+            assert set(asked) <= set(targets), told
+        elif program in ("python", ".venv/bin/python"):
+            module = words[1] == "-m"
+            here = importlib.util.find_spec(words[2]) if module else (ROOT / words[1]).exists()
+            assert here, told
+        else:
+            assert program in OTHERS | {"curl"}, told
+    assert {"edgegrasp", "make", "python", "curl"} <= seen
+
+
+def test_the_requests_by_curl_are_answered(dummy_server, tmp_path: Path) -> None:
+    (tmp_path / "demo_output").mkdir()
+    rows = "".join(f"{x} {y} 0.5\n" for x in range(20) for y in range(20))
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 400\n{axes}end_header\n"
+    (tmp_path / "demo_output" / "scene.ply").write_text(head + rows)
+    Image.fromarray(np.full((480, 640), 600, np.uint16)).save(tmp_path / "depth.png")
+    (tmp_path / "tokens").write_text("0123456789abcdef")
+    lines = {
+        line
+        for _, block in blocks("console")
+        for line in re.findall(r"^\$ (curl (?:.*\\\n)*.*)$", block, re.MULTILINE)
+    }
+    assert len(lines) >= 3
+    for line in lines:
+        asked = re.sub(r"--unix-socket \S+ http://localhost", dummy_server.http_url, line)
+        asked = asked.replace("http://127.0.0.1:8000", dummy_server.http_url)
+        done = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True)
+        answer = json.loads(done.stdout)
+        assert {"grasps", "models"} & answer.keys(), line + done.stdout + done.stderr
+
+
+def test_other_blocks_can_be_read() -> None:
+    for page, block in blocks("json"):
+        assert json.loads(block), page
+    for page, block in blocks("toml"):
+        assert tomllib.loads(block), page
+    known = {"python", "console", "json", "toml"}
+    named = {(name, lang) for name, text in PAGES.items() for lang in fences(text)}
+    assert {lang for name, lang in named if name not in DIAGRAMS} <= known
+
+
+def fences(text: str) -> list[str]:
+    return re.findall(r"^```(\w*)\n.*?^```", text, re.DOTALL | re.MULTILINE)
+
+
+def test_the_site_is_built_without_a_warning_and_asks_nobody(tmp_path: Path) -> None:
+    pytest.importorskip("material", reason="the extra `docs` is not installed")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 15
+    loaded = r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=\"?(?:https?:)?//[^>]*>"
+    assert [found for page in pages for found in re.findall(loaded, page.read_text())] == []

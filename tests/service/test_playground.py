@@ -70,7 +70,7 @@ def bright(page: Any) -> int:
     """Pixels of the picture that have the colour of a good score."""
     picture = Image.open(io.BytesIO(page.locator("#stage").screenshot())).convert("RGB")
     red, green, blue = np.moveaxis(np.asarray(picture).astype(int), 2, 0)
-    return int(((red > 150) & (green > 140) & (blue < 0.45 * green)).sum())
+    return int(((red > 150) & (blue > 150) & (green < 0.6 * red)).sum())
 
 
 def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
@@ -162,6 +162,24 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
     page.get_by_text("add the depth image").wait_for()
 
 
+@pytest.mark.parametrize("name", ["mustard_bottle", "milk_clorox"])  # an image; a cloud
+def test_grasps_of_a_real_camera_are_seen(real_server, open_page, shared_dir, name) -> None:
+    page = open_page(real_server.http_url)
+    shown(page)
+    with page.expect_response(f"{real_server.http_url}/v1/grasps*"):
+        page.set_input_files("#files", shared_dir / "real_scenes" / f"{name}.npz")
+    page.get_by_text("detecting, by").wait_for()
+    assert page.locator("#grasps li:visible").count() == 12
+    with_hands = bright(page)
+    page.locator("#min_score").fill("1")
+    assert with_hands > bright(page) + 500
+    page.locator("#min_score").fill("0")
+    if name == "milk_clorox":
+        page.get_by_text("The camera is at 0, 0, 0").click()
+        page.locator("#warnings li").wait_for(state="detached")
+        assert len(shown(page)) == 12
+
+
 def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path: Path) -> None:
     (tmp_path / "tokens").write_text("a-token-of-this-test\n")
     with start_dummy("--token-file", str(tmp_path / "tokens")) as server:
@@ -189,6 +207,9 @@ def test_a_narrow_page_has_all_and_the_keyboard_reaches_it(dummy_server, open_pa
         reached.add(focused.get_attribute("id") or focused.inner_text() if focused.count() else "")
     wanted = {"files", "sample", "model", "approach", "more", "debug", "min_score", "count", "curl"}
     assert wanted | {"Draw", "Find grasps", "Copy"} <= reached
+    page.locator("[data-draw=region]").focus()
+    page.keyboard.press("Enter")
+    assert page.locator("#region_center").input_value().count(",") == 2
     page.locator("#grasps button").nth(1).focus()
     page.keyboard.press("Enter")
     assert page.inner_text("#rank") == "2"

@@ -34,7 +34,7 @@ class PlannerChoice:
         weights: files or folders besides those that ship.
         server: `host:port` or `http://host:port`; None: one is started.
         connection: keyword arguments of `connect`.
-        options: of each request, in place of the protocol's and of collision `penalise`.
+        options: of each request, in place of the protocol's.
         voxel_size: metres, in place of the weights' own; `in-process` only.
         flipped_normals: share of the normals turned around at random; `in-process` only.
     """
@@ -139,14 +139,13 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.weights_and_model()
-    options = {"collision": "penalise"} | choice.options
     flags = [text for path in weights for text in ("--weights", str(path))]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
         address = addresses.grpc_address
         with connect(address, CONNECT_SECONDS, **choice.connection) as client:
             used = model_used(client, model)
-        asked = {"model": model, **options}
+        asked = {"model": model, **choice.options}
         yield ChosenPlanner(
             partial(ServerPlanner, address, rules, asked, used.digest, choice.connection),
             {
@@ -154,7 +153,7 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
                 "model": used.name,
                 "digest": used.digest,
                 "voxel_size": used.voxel_size,
-                "options": options,
+                "options": choice.options,
             },
         )
 
@@ -195,8 +194,7 @@ def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlann
         changes["voxel_size"] = choice.voxel_size
     if choice.flipped_normals > 0:
         changes["flipped_normals"] = choice.flipped_normals
-    options = {"collision": "penalise"} | choice.options
-    facts |= {"model": used.name, "digest": used.digest, "options": options, **changes}
+    facts |= {"model": used.name, "digest": used.digest, "options": choice.options, **changes}
     return ChosenPlanner(
-        partial(InProcessPlanner, weights, model, rules, options, **changes), facts
+        partial(InProcessPlanner, weights, model, rules, choice.options, **changes), facts
     )

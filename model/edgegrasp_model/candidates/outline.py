@@ -48,25 +48,24 @@ class Outline:
     is_edge: Bools  # (N,)
 
 
-def outlines(points: Float32, viewpoint: Float32 | None, wanted: Bools) -> list[Outline]:
+def outlines(points: Float32, viewpoint: Float32 | None, rows: Int64) -> list[Outline]:
     """The outlines of a cloud from above and, where that is another direction, from the camera.
 
     Args:
         points: (N, 3) canonical frame, metres.
         viewpoint: (3,) the only camera; None where it is unknown, or there are several.
-        wanted: (N,) which points to look at.
+        rows: (M,) of the points to look at.
     """
-    seen = [_outline(points, np.broadcast_to(UP, points.shape), wanted)]
+    seen = [_outline(points, np.broadcast_to(UP, points.shape), rows)]
     if viewpoint is not None:
         toward = viewpoint - points
         toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-        seen.append(_outline(points, toward, wanted & (toward @ UP < ONE_VIEW)))
+        seen.append(_outline(points, toward, rows[toward[rows] @ UP < ONE_VIEW]))
     return seen
 
 
-def _outline(points: Float32, toward: Float32, wanted: Bools) -> Outline:
+def _outline(points: Float32, toward: Float32, rows: Int64) -> Outline:
     """A point is on the outline where its neighbours, at its height or above, lie to one side."""
-    rows = np.flatnonzero(wanted)
     heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
     least, outward, spread = level_spread(points, rows, toward[rows], OUTLINE_RADIUS, DROP)
     heading[rows] = least
@@ -148,15 +147,20 @@ def _inserted(
 
     Those for which that is before the contact is TIP_MARGIN inside the fingertips are left out.
     """
+    least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
+    if support is not None:
+        fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
+        room = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+        room = np.where(fall > LEVEL, room / np.maximum(fall, LEVEL), np.inf)
+        enough = np.flatnonzero(room >= least)
+        candidates, room = candidates.take(enough), room[enough]
     boxes = gripper.boxes(gripper.max_opening)
     boxes[:, 0] -= margin
     boxes[:, 1] += margin
     way = free_way(points, candidates.T_cloud_hand, boxes, APPROACH_LENGTH) - CLEARANCE
     if support is not None:
-        fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
-        room = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
-        way = np.minimum(way, np.where(fall > LEVEL, room / np.maximum(fall, LEVEL), np.inf))
-    row = np.flatnonzero(way >= gripper.contact_z + TIP_MARGIN - gripper.tip_z)
+        way = np.minimum(way, room)
+    row = np.flatnonzero(way >= least)
     hands = candidates.take(row)
     hands.T_cloud_hand[:, :3, 3] -= np.minimum(way[row], MAX_INSERTION)[:, None] * hands.approach
     return hands

@@ -17,7 +17,7 @@ from edgegrasp_model.candidates.edge_grasps import (
     retract,
     sample_approach_points,
 )
-from edgegrasp_model.candidates.outline import Outline, outline_grasps, outlines
+from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import distinct_hands
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
@@ -91,12 +91,11 @@ def sample_candidates(
     rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
     limit = OVERSAMPLING * options.num_candidates
-    seen = outlines(scene.cloud.points, scene.viewpoint, scene.contact_allowed)
     attempts: list[Attempt] = []
     while True:
         approach_index = approach_points(scene, approach_rows, options, rng_approach)
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, seen, approach_index, crop, options, gripper, counts, centre)
+        this = _constrained(scene, approach_index, crop, options, gripper, counts, centre)
         attempts.append(this)
         passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
         row = passed[random_rows(len(passed), limit, rng_candidates)]
@@ -114,7 +113,9 @@ def sample_candidates(
         exhausted = len(approach_rows) <= len(approach_index) and len(passed) <= limit
         if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
             break
-    new = distinct_hands(candidates.T_cloud_hand @ gripper.T_hand_tcp, free, *alike(options))
+    new = free | (options.collision.mode != "avoid")
+    T_cloud_tcp = candidates.T_cloud_hand[new] @ gripper.T_hand_tcp
+    new[new] = distinct_hands(T_cloud_tcp, free[new], *alike(options))
     scored = rows_to_score(free, new, options, rng_candidates)
     this.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
@@ -168,7 +169,6 @@ def approach_points(
 
 def _constrained(
     scene: Scene,
-    seen: list[Outline],
     approach_index: Int64,
     crop: BallCrop,
     options: DetectOptions,
@@ -190,7 +190,7 @@ def _constrained(
     points, margin = scene.cloud.points, options.collision.margin
     across = [
         outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-        for each in seen
+        for each in outlines(points, scene.viewpoint, np.unique(pairs[1]))
     ]
     candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_model.kernels import heights_and_distances, least_spread
 from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane
-from edgegrasp_model.scene.things import PlaneView, find_things, plan_axes
+from edgegrasp_model.scene.things import PlaneView, find_things, occupied_cells, plan_axes
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -239,12 +239,15 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
     weight = 1.0 / tree.query_ball_point(points, CROWD_RADIUS, return_length=True)
     weight /= weight.sum()
     left = np.arange(len(points))
+    places, ways, limits = (each.astype(np.float32) for each in (points, normals, thick))
     planes: list[_Plane] = []
     while len(planes) < MAX_PLANES and len(left) >= NEIGHBORS:
         corner = rng.choice(left, min(JUDGED, len(left)), replace=False)
         offset = np.einsum("td,td->t", normals[corner], points[corner])
-        held = np.abs(points[left] @ normals[corner].T - offset) < thick[left, None]
-        held &= normals[left] @ normals[corner].T > SAME_WAY
+        apart = places[left] @ ways[corner].T
+        apart -= offset.astype(np.float32)
+        held = np.abs(apart, out=apart) < limits[left, None]
+        held &= ways[left] @ ways[corner].T > SAME_WAY
         share = weight[left] @ held
         best = int(share.argmax())
         if share[best] < MIN_SHARE:
@@ -333,16 +336,16 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
     if seen.viewpoint is not None and plane.heights(seen.viewpoint) < thick[on].mean():
         return 0.0
     far = float(np.median(distance[on]))
-    below = (height < -3 * thick) & (height > -NEAR_BELOW)
+    if size / far**2 <= least:  # were everything on it a thing, it would not be worth more
+        return 0.0
     axes = plan_axes(plane.normal, seen.viewpoint, seen.points)
     plan = seen.points @ axes.T
-    area = _area(plan[on])
+    area = occupied_cells(plan[on], CELL) * CELL**2
     if area < MIN_AREA:
         return 0.0
+    below = (height < -3 * thick) & (height > -NEAR_BELOW)
     near_below = _over_hull(plan[on], plan[below])
     if near_below > MAX_BELOW * (near_below + size):
-        return 0.0
-    if size / far**2 <= least:  # were everything on it a thing, it would not be worth more
         return 0.0
     out = np.flatnonzero(height > 2 * thick)
     border = None if seen.at_border is None else seen.at_border[out]
@@ -354,12 +357,6 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
     worth = math.sqrt((min(things, size) + NOTHING_ON_IT * size) * size) / far**2
     worth *= 1.0 if things else UNUSED
     return max(worth * size / (size + near_below) - through / far**2, 0.0)
-
-
-def _area(plan: Float64) -> float:
-    """Square metres of the cells that points (N, 2) of a plane lie in."""
-    cells = np.unique(np.floor(plan / CELL).astype(np.int64), axis=0)
-    return len(cells) * CELL**2
 
 
 def _over_hull(on: Float64, others: Float64) -> int:

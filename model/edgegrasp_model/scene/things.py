@@ -233,7 +233,7 @@ def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None
     lowest = np.percentile(height[inside], 3)
     floor = inside & (height < lowest + FLOOR)
     size = from_side[::2, 0] + from_side[1::2, 0]
-    if len(np.unique(_cells(plan[floor]))) * CELL**2 < MIN_FLOOR * size.prod():
+    if occupied_cells(plan[floor]) * CELL**2 < MIN_FLOOR * size.prod():
         floor[:] = False
     return Contents(inside & ~floor, walls, deep, floor)
 
@@ -253,11 +253,16 @@ def _dense(plan: Float64) -> Bools:
     return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
 
 
-def _cells(plan: Float64) -> Int64:
+def occupied_cells(plan: Float64, size: float = CELL) -> int:
+    """How many cells of a size points (M, 2) lie in."""
+    return int(np.count_nonzero(np.bincount(_cells(plan, size))))
+
+
+def _cells(plan: Float64, size: float = CELL) -> Int64:
     """The number (M,) of the cell that each point (M, 2) is in."""
     if len(plan) == 0:
         return np.zeros(0, dtype=np.int64)
-    cell = np.floor((plan - plan.min(axis=0)) / CELL).astype(np.int64)
+    cell = np.floor((plan - plan.min(axis=0)) / size).astype(np.int64)
     return np.asarray(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1])
 
 

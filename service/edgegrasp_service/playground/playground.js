@@ -12,9 +12,18 @@ const REASONS = {
 };
 const $ = (id) => document.getElementById(id);
 const state = { files: [], scene: null, answer: null, fresh: true, shapes: {}, grippers: {}, chosen: null, busy: null };
-const view = new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn });
+const view = picture();
 
 start();
+
+function picture() {
+  try {
+    return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn });
+  } catch (error) {
+    say("The picture needs WebGL, which this browser does not have or has switched off.", true);
+    throw error;
+  }
+}
 
 async function start() {
   state.grippers = await (await fetch("grippers.json")).json();
@@ -206,7 +215,7 @@ function showAnswer() {
     : "No grasps yet";
   $("warnings").replaceChildren(...(answer?.warnings ?? []).map((text) => element("li", text)));
   if (answer && !answer.support) $("warnings").append(element("li", "No support plane was found."));
-  if (answer) $("count").max = Math.max(grasps.length, 1);
+  if (answer) $("count").max = Math.max(grasps.length, 12);
   $("grasps").replaceChildren(...grasps.map(line));
   const counts = Object.entries(answer?.counts ?? {});
   $("counts").replaceChildren(...counts.map(([name, count]) => {
@@ -394,6 +403,10 @@ $("token").addEventListener("change", async () => (await listModels()) && !state
 for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
   $(name).addEventListener("change", () => state.files.length && open(state.files));
 }
+$("at_origin").addEventListener("click", async () => {
+  $("viewpoint").value = "0,0,0";
+  if (state.files.length && (await open(state.files))) await ask();
+});
 for (const name of ["min_score", "count", "whole"]) $(name).addEventListener("input", filter);
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
@@ -402,9 +415,14 @@ $("approach").addEventListener("change", ({ target }) => {
 for (const name of ["region", "workspace", "cone"]) {
   $(`${name}_row`).addEventListener("change", ({ target }) => target.tagName === "INPUT" && typeShape(name));
 }
-document.addEventListener("click", ({ target }) => {
+document.addEventListener("click", ({ target, detail }) => {
   const { draw, edit, mode, clear, copy } = target.dataset ?? {};
-  if (draw && state.scene) {
+  if (draw && state.scene && !detail) { // by the keyboard
+    const around = view.boxAround([view.target ?? view.middle], draw === "region");
+    setShape(draw, { ...around, half_extents: [0.05, 0.05, 0.05] });
+    $(`${draw}_center`).focus();
+    say("A box of 10 cm; type where and how large, then ask again.");
+  } else if (draw && state.scene) {
     state.drawing = draw;
     press(target);
     view.startDrawing();

@@ -12,19 +12,16 @@ const BAR = 0.004; // metres, thickness of a hand's outline
 const STEM = 0.04; // metres drawn behind the palm
 const NEAR = 14; // pixels from a hand within which a click means it
 const CONE = 0.12; // metres, length of the approach cone
-const VIRIDIS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"].map(
-  (hex) => new THREE.Color(hex),
-);
+const RIM = 0.0009; // metres of dark rim around a bar: hands stand out from things of any colour
 const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
 const BOX = new THREE.BoxGeometry(1, 1, 1);
 const EDGES = new THREE.EdgesGeometry(BOX);
-const RIM = new THREE.LineBasicMaterial({ color: "#10151d", transparent: true, opacity: 0.55 });
+const DARK = new THREE.MeshBasicMaterial({ color: "#0a0d13", side: THREE.BackSide });
 
-/** The colour of a score from 0 to 1. */
+/** The colour of a score from 0 to 1: cyan to magenta, which things rarely have. */
 export function colorOf(score) {
-  const place = Math.min(Math.max(score, 0), 1) * (VIRIDIS.length - 1);
-  const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
-  return VIRIDIS[low].clone().lerp(VIRIDIS[low + 1], place - low);
+  const share = Math.min(Math.max(score, 0), 1);
+  return new THREE.Color().setRGB(share, 1 - share, 1, THREE.SRGBColorSpace);
 }
 
 /** The picture.
@@ -98,11 +95,12 @@ export class View {
     const count = scene.points.length / 3;
     const step = Math.ceil(count / MOST_POINTS);
     const [places, shades] = [[], []];
+    const grey = scene.colors ? null : greyOf(scene.points);
     for (let row = 0; row < count; row += step) {
       const place = scene.points.subarray(3 * row, 3 * row + 3);
       if (!place.every(Number.isFinite)) continue;
       places.push(...place);
-      const shade = scene.colors ? scene.colors.subarray(3 * row, 3 * row + 3) : [0.62, 0.68, 0.76];
+      const shade = scene.colors ? scene.colors.subarray(3 * row, 3 * row + 3) : grey(place[2]);
       shades.push(...new THREE.Color().setRGB(...shade, THREE.SRGBColorSpace));
     }
     if (!places.length) throw new Error(`${scene.name}: has no points`);
@@ -120,7 +118,7 @@ export class View {
   }
 
   _lookFrom({ camera, viewpoint }) {
-    const target = this._outside(this.middle);
+    this.eyeKnown = Boolean(camera || viewpoint);
     this.camera.fov = 45;
     if (camera) {
       this.camera.fov = (2 * Math.atan(camera.height / 2 / camera.fy) * 180) / Math.PI;
@@ -128,12 +126,20 @@ export class View {
     } else if (viewpoint) {
       this.camera.position.copy(this._outside(viewpoint));
     } else {
-      this.camera.position.copy(target).add(new THREE.Vector3(0.25, -0.7, 0.6));
+      this._lookAt(this.middle);
     }
     this.camera.updateProjectionMatrix();
-    this.orbit.target.copy(target);
+    this.orbit.target.copy(this._outside(this.middle));
     this.orbit.update();
     this.draw();
+  }
+
+  /** Look aslant from the side of the cloud's origin, where cameras and robots mostly are. */
+  _lookAt(place) {
+    const target = this._outside(place);
+    const aside = this._outside([0, 0, 0]).sub(target).setZ(0);
+    if (aside.length() < 0.1) aside.set(0.25, -0.7, 0);
+    this.camera.position.copy(target).add(aside.setLength(0.75)).setZ(target.z + 0.6);
   }
 
   /** From the cloud's frame to the picture's. */
@@ -141,12 +147,13 @@ export class View {
     return this.root.localToWorld(new THREE.Vector3(...place));
   }
 
-  /** Turn the picture upright, and look at the objects, the eye staying where it is. */
+  /** Turn the picture upright, and look at the objects, from where the camera stood if it is known. */
   _turn(up, target) {
     const eye = this.root.worldToLocal(this.camera.position.clone());
     this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...up), UP);
     this.root.updateMatrixWorld();
-    this.camera.position.copy(this.root.localToWorld(eye));
+    if (this.eyeKnown) this.camera.position.copy(this.root.localToWorld(eye));
+    else this._lookAt(target);
     this.orbit.target.copy(this._outside(target));
     this.orbit.update();
   }
@@ -219,7 +226,9 @@ export class View {
       const mesh = new THREE.Mesh(BOX, look);
       mesh.position.set(0, y, z);
       mesh.scale.set(BAR, dy, dz);
-      mesh.add(new THREE.LineSegments(EDGES, RIM));
+      const rim = new THREE.Mesh(BOX, DARK);
+      rim.scale.set(...mesh.scale.toArray().map((size) => 1 + (2 * RIM) / size));
+      mesh.add(rim);
       hand.add(mesh);
     };
     bar(0, palm - STEM / 2, BAR, STEM);
@@ -275,9 +284,13 @@ export class View {
     this.draw();
   }
 
-  /** Mark a grasp: its hand, both its points and the way in; null: none. */
+  /** Mark a grasp: its hand, both its points and the way in, the others pale; null: none. */
   choose(grasp) {
     const group = this.groups.chosen.clear();
+    for (const bar of this.hands.flatMap((hand) => hand.children)) {
+      Object.assign(bar.material, { transparent: Boolean(grasp), opacity: grasp ? 0.3 : 1, needsUpdate: true });
+      bar.children[0].visible = !grasp; // its rim
+    }
     if (grasp) {
       const outline = this._outline(grasp, new THREE.Color("white"));
       outline.children.forEach((bar) => bar.scale.multiplyScalar(1.02));
@@ -465,6 +478,16 @@ export class View {
   }
 }
 
+/** A shade for each z of a cloud without colours, so that its shape is seen. */
+function greyOf(points) {
+  const z = points.filter((value, i) => i % 3 === 2 && Number.isFinite(value)).sort();
+  const [low, high] = [z[Math.floor(0.02 * z.length)], z[Math.floor(0.98 * z.length)]];
+  return (value) => {
+    const shade = 0.25 + 0.65 * Math.min(Math.max((high - value) / (high - low || 1), 0), 1);
+    return [0.85 * shade, 0.92 * shade, shade];
+  };
+}
+
 function placed(hand, pose) {
   hand.matrixAutoUpdate = false;
   hand.matrix.set(...pose.flat());
@@ -488,7 +511,7 @@ function fill(group, children) {
 
 /** The approach point and the contact point of a grasp. */
 function ends({ approach_point, contact_point }, radius = 0.0025) {
-  return [[approach_point, "#4cc9f0"], [contact_point, "#ff4d6d"]].map(([place, color]) => {
+  return [[approach_point, "#4cc9f0"], [contact_point, "#ff9f1c"]].map(([place, color]) => {
     const look = new THREE.MeshBasicMaterial({ color });
     const made = new THREE.Mesh(new THREE.SphereGeometry(radius, 12, 8), look);
     made.position.set(...place);

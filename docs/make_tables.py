@@ -1,34 +1,33 @@
-"""Writes the tables of docs/results.md: `python docs/make_results.py [RESULTS_DIR]`.
+"""Writes the tables of settings.md and results.md: `python docs/make_tables.py [RESULTS_DIR]`.
 
-Results found below RESULTS_DIR (folders of `edgegrasp benchmark`, `edgegrasp experiment` and
-`edgegrasp train`) are first summarised in docs/results/, where they replace earlier results of the
-same name; the tables are written from that folder alone.
+What stands between `<!-- begin: NAME -->` and `<!-- end -->` is written anew. Results found below
+RESULTS_DIR (folders of `edgegrasp benchmark`, `experiment` and `train`) are first summarised in
+docs/results/, where they replace earlier results of the same name; the tables are written from that
+folder alone.
 """
 
 import csv
 import json
+import re
 import shlex
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
-from pages import filled, table
 
-from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_service.settings import Settings
 from edgegrasp_sim.experiments import experiment_table
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.report import published, published_rates
 from edgegrasp_sim.results import ResultFolder, percent, planner_title, record_of
-from edgegrasp_training.recipes import RECIPES
 
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
 
 DOCS = Path(__file__).parent
-PAGE = DOCS / "results.md"
+BLOCK = re.compile(r"(<!-- begin: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 KEPT_CURVE_POINTS = 40
 SCENES = ("packed", "pile")
 CAMERA_SCENES = ("bin", "table")  # by protocols of the same name
@@ -40,8 +39,6 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "robustness": (),
     "families": (),
 }
-# Counted in the authors' checkpoint files.
-AUTHORS_PARAMETERS = {"edgegrasp": "3,048,993", "vn-edgegrasp": "1,702,268"}
 NOT_YET = "Not measured yet.\n"
 
 
@@ -72,13 +69,53 @@ def collect(results: Path, kept: Path) -> None:
         curves_figure(drawn).savefig(kept / "curves.png")
 
 
-def page(kept: Path = DOCS / "results") -> str:
-    """The whole page, its tables from the folder of what is kept."""
-    return filled(PAGE.read_text(), blocks(kept))
+def pages() -> dict[Path, str]:
+    """The text of every page that has such tables.
+
+    Raises:
+        ValueError: a page lacks the place of a table, or has one for another.
+    """
+    settings = {"settings": table(("setting", "default", "range", "meaning"), _settings())}
+    return {
+        DOCS / "settings.md": _filled(DOCS / "settings.md", settings),
+        DOCS / "results.md": _filled(DOCS / "results.md", blocks(DOCS / "results")),
+    }
+
+
+def _filled(page: Path, blocks: Mapping[str, str]) -> str:
+    text = page.read_text()
+    places = [match[2] for match in BLOCK.finditer(text)]
+    if sorted(places) != sorted(blocks):
+        raise ValueError(f"{page.name} has places for {places}, and there are {list(blocks)}")
+    return BLOCK.sub(lambda match: f"{match[1]}\n{blocks[match[2]]}\n{match[3]}", text)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _settings() -> Iterator[list[str]]:
+    for name, field in Settings.model_json_schema()["properties"].items():
+        default = field.get("default")
+        shown = "none" if default in (None, [], "") else f"`{json.dumps(default)}`"
+        yield [f"`{name}`", shown, _range(field), field["description"]]
+
+
+def _range(field: Mapping[str, Any]) -> str:
+    if "enum" in field:
+        return ", ".join(f"`{word}`" for word in field["enum"])
+    low = field.get("minimum", field.get("exclusiveMinimum"))
+    high = field.get("maximum")
+    above = "above " if "exclusiveMinimum" in field else ""
+    if low is None:
+        return ""
+    return f"{above}{low:g} and more" if high is None else f"{above}{low} to {high}"
 
 
 def blocks(kept: Path) -> dict[str, str]:
-    """What the script writes into the page, by the name of its place."""
+    """What results.md gets, from the folder of what is kept, by the name of its place."""
     records = _read(kept / "benchmarks.json").values()
     written = {
         scene: _benchmark_table([r for r in records if r["scene"] == scene], scene)
@@ -89,7 +126,6 @@ def blocks(kept: Path) -> dict[str, str]:
         found = _read(kept / f"{name}.json")
         measured = _experiment(name, found) if found else [NOT_YET]
         written[name] = "\n".join([*_published_table(methods), *measured])
-    written["parameters"] = _parameters_table()
     written["training"] = _training(_read(kept / "curves.json"))
     return written
 
@@ -151,16 +187,6 @@ def _version(protocol: dict[str, Any]) -> str:
     """A protocol's name, and its version where it is not the present one."""
     name, version = protocol["name"], protocol["version"]
     return name if version == load_protocol(name).version else f"{name}, version {version}"
-
-
-def _parameters_table() -> str:
-    """How many numbers each network learns, beside the checkpoints of the paper's authors."""
-    lines = []
-    for name, config in RECIPES.items():
-        network = build_network(config, torch.Generator().manual_seed(0))
-        count = sum(parameter.numel() for parameter in network.parameters())
-        lines.append((name, f"{count:,}", AUTHORS_PARAMETERS.get(name, "")))
-    return table(("weights", "parameters", "in the authors' checkpoint"), lines)
 
 
 def _training(curves: Curves) -> str:
@@ -236,7 +262,8 @@ def main(arguments: Sequence[str]) -> None:
     """Collect results where a folder is named, then write the tables."""
     for folder in arguments:
         collect(Path(folder), DOCS / "results")
-    PAGE.write_text(page())
+    for page, text in pages().items():
+        page.write_text(text)
 
 
 if __name__ == "__main__":
