@@ -34,7 +34,6 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/mypy $(wildcard examples/*.py)
 	$(BIN)/mypy --python-version 3.10 --package edgegrasp_client
 	$(BIN)/lint-imports
-	$(BIN)/python scripts/unasync.py --check
 	$(BIN)/hadolint Dockerfile
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
 	mkdir -p build
@@ -44,7 +43,6 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 format: $(INSTALLED) ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/python scripts/unasync.py
 
 test: $(INSTALLED) ## run the tests, on every core
 	$(BIN)/pytest -q -n auto

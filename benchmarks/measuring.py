@@ -4,7 +4,6 @@ import json
 import os
 import platform
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+
+from edgegrasp_client.local_server import local_server
 
 RESULTS = Path(__file__).parent / "results"
 MIB = 2**20
@@ -87,7 +88,7 @@ class Served:
 
     http_url: str
     grpc_address: str
-    process: psutil.Popen
+    process: psutil.Process
 
     def memory(self) -> float:
         """Resident memory, MiB; shared pages count once."""
@@ -112,30 +113,7 @@ class Served:
 
 @contextmanager
 def served(*flags: str, program: Sequence[str] = SERVE) -> Iterator[Served]:
-    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts.
-
-    Args:
-        flags: Of `edgegrasp serve`.
-        program: What Python is to run as `edgegrasp`.
-    """
-    ports = ("--http-port", "0", "--grpc-port", "0")
+    """Run `edgegrasp serve` with these flags on free ports of 127.0.0.1 while the context lasts."""
     quiet = ("--log-level", "error")  # every refusal is a line, and they come by the thousand
-    process = psutil.Popen(
-        [sys.executable, *program, "serve", *ports, *quiet, *flags],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        # "EdgeGrasp serves HTTP <url> gRPC <address>", printed when it is ready.
-        words = process.stdout.readline().split()
-        if len(words) != 6:
-            raise RuntimeError("the server did not start; it says why above")
-        yield Served(words[3], words[5], process)
-    finally:
-        if process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(STOP_SECONDS)
-            except psutil.TimeoutExpired:
-                process.kill()
-        process.stdout.close()
+    with local_server(*quiet, *flags, program=(sys.executable, *program)) as own:
+        yield Served(own.http_url, own.grpc_address, psutil.Process(own.pid))

@@ -191,12 +191,8 @@ def draw(
 ) -> None:
     """Write a picture: the camera's image with the grasps, and both support planes.
 
-    Args:
-        path: `.png` file to write.
-        scene: What the camera saw.
-        grasps: Best first, camera frame.
-        plane: Normal (3,) and offset of the plane found, if one was.
-        title: One line above the picture.
+    Grasps are best first and the plane that was found is its normal (3,) and offset, both in the
+    camera's frame.
     """
     from edgegrasp_sim.picture import Picture
 

@@ -144,29 +144,14 @@ def open_client(
     grippers: Sequence[Path] | None = None,
     device: str = "cpu",
 ) -> AbstractContextManager[Any]:
-    """A client of a server, or where there is none an OwnDetector.
-
-    Args:
-        server: Its address.
-        timeout: Seconds to wait for it.
-        connection: Keyword arguments of `connect`.
-        weights: As for OwnDetector.
-        grippers: As for OwnDetector.
-        device: As for OwnDetector.
-    """
+    """A client of a server, or where there is none an OwnDetector."""
     if server:
         return connect(server, timeout, **connection)
     return nullcontext(OwnDetector(weights or (), grippers or (), device))
 
 
 class OwnDetector:
-    """A detector in this process, asked as `GraspClient` asks a server.
-
-    Args:
-        weights: Files or folders besides those that ship.
-        grippers: Gripper files that requests may name by their stem.
-        device: Where the networks run, as of `choose_device`.
-    """
+    """A detector in this process, asked as `GraspClient` asks a server."""
 
     def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
         self._load = weights, grippers, device
@@ -225,13 +210,7 @@ def draw(
     A camera's one image is drawn as that camera saw it, in its colours where they are given; a
     cloud from its viewpoint, or from above at a slant.
 
-    Args:
-        path: `.png` or `.jpg` file to write.
-        detection: The answer.
-        options: Those of the request; its regions are drawn.
-        cloud: As for `decode`, as the rest.
-        depth_images: In place of a cloud.
-        colors: Of the points.
+    The request is given as for `decode`.
     """
     import numpy as np
 

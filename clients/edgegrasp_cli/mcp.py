@@ -63,9 +63,7 @@ def mcp(
 def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
     """The tools, to be run over a transport.
 
-    Args:
-        client: Of the grasp server.
-        folder: Files are named relative to it; no file outside of it is read.
+    Files are named relative to the folder; no file outside of it is read.
     """
     from mcp.server.mcpserver import Image, MCPServer
 

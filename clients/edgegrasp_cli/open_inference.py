@@ -87,10 +87,7 @@ class Answer(NamedTuple):
 class Models:
     """The weights of a grasp server as models of the protocol; raises RefusedError.
 
-    Args:
-        client: Of the server.
-        default: Name of the server's default weights, beside their own.
-        timeout: Seconds for a request that names no deadline.
+    `default` names the server's default weights, beside their own name.
     """
 
     def __init__(self, client: "GraspClient", default: str, timeout: float) -> None:

@@ -155,12 +155,8 @@ def judge(
 ) -> SceneFigures:
     """What an answer is worth.
 
-    Args:
-        scene: What was asked.
-        grasps: Of the client or of the detector, best first, camera frame.
-        plane: Normal (3,) and offset of the support plane that was found, if one was.
-        gripper: The hand.
-        milliseconds: That the answer took.
+    Grasps are best first and the plane that was found is its normal (3,) and offset, both in the
+    camera's frame.
     """
     best = grasps[:BEST]
     on_object = _objects_held(scene, grasps)

@@ -2,10 +2,15 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from edgegrasp_service.settings import Settings
+    from edgegrasp_service.worker.job import Answer, Job
 
 Option = typer.Option
 
@@ -68,7 +73,6 @@ def request(
 
     Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
     """
-    from edgegrasp_service.recording import replay as answer_again
     from edgegrasp_service.settings import load_settings
 
     job, recorded, answer = answer_again(file, load_settings(config))
@@ -77,6 +81,19 @@ def request(
     if now != before:
         sys.exit("edgegrasp replay: the answer differs from the recorded one")
     print("the answer is the same")
+
+
+def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer]":
+    """A recorded request, the answer that is recorded, and the answer now; raises ValueError."""
+    from edgegrasp_service.worker import answer as worker
+    from edgegrasp_service.worker.job import Answer, Job, receive
+
+    with file.open("rb") as stream:
+        job, recorded = receive(stream), receive(stream)
+    if not isinstance(job, Job) or not isinstance(recorded, Answer):
+        raise ValueError(f"{file} is no recorded request")
+    job = replace(job, remaining=settings.max_request_seconds)
+    return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)
 
 
 def _without_times(job: Any, body: bytes) -> Any:

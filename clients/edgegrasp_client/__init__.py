@@ -7,100 +7,49 @@ with GraspClient("127.0.0.1:50051") as client:  # or "http://127.0.0.1:8000"
 best = detection.grasps[0]
 """
 
-from edgegrasp_client.async_client import AsyncGraspClient
-from edgegrasp_client.client import GraspClient
-from edgegrasp_client.clouds import DepthImage, Intrinsics, PointCloud2, PointField
-from edgegrasp_client.connection import Tls
-from edgegrasp_client.errors import (
-    AccessDeniedError,
-    DeadlineError,
-    GraspClientError,
-    InvalidRequestError,
-    OverloadedError,
-    PayloadTooLargeError,
-    ProtocolError,
-    ServerFailedError,
-    ServerUnavailableError,
-    UnknownModelError,
-)
-from edgegrasp_client.options import (
-    ApproachDirection,
-    Box,
-    Collision,
-    Cone,
-    DetectOptions,
-    GripperGeometry,
-    HalfSpace,
-    HandPart,
-    Indices,
-    Linkage,
-    Mask,
-    OrientedBox,
-    RansacPlane,
-    Region,
-    Segments,
-    Sphere,
-    SupportPlane,
-    Suppression,
-    Workspace,
-)
-from edgegrasp_client.requests import StreamRequest
-from edgegrasp_client.results import (
-    DebugInfo,
-    Detection,
-    Evaluation,
-    Grasp,
-    Model,
-    Scoring,
-    StreamAnswer,
-)
-from edgegrasp_client.targets import object_in_scene, on_mask
-
-__all__ = [
-    "AccessDeniedError",
-    "ApproachDirection",
-    "AsyncGraspClient",
-    "Box",
-    "Collision",
-    "Cone",
-    "DeadlineError",
-    "DebugInfo",
-    "DepthImage",
-    "DetectOptions",
-    "Detection",
-    "Evaluation",
-    "Grasp",
-    "GraspClient",
-    "GraspClientError",
-    "GripperGeometry",
-    "HalfSpace",
-    "HandPart",
-    "Indices",
-    "Intrinsics",
-    "InvalidRequestError",
-    "Linkage",
-    "Mask",
-    "Model",
-    "OrientedBox",
-    "OverloadedError",
-    "PayloadTooLargeError",
-    "PointCloud2",
-    "PointField",
-    "ProtocolError",
-    "RansacPlane",
-    "Region",
-    "Scoring",
-    "Segments",
-    "ServerFailedError",
-    "ServerUnavailableError",
-    "Sphere",
-    "StreamAnswer",
-    "StreamRequest",
-    "SupportPlane",
-    "Suppression",
-    "Tls",
-    "UnknownModelError",
-    "Workspace",
-    "object_in_scene",
-    "on_mask",
-]
+from edgegrasp_client.async_client import AsyncGraspClient as AsyncGraspClient
+from edgegrasp_client.client import GraspClient as GraspClient
+from edgegrasp_client.clouds import DepthImage as DepthImage
+from edgegrasp_client.clouds import Intrinsics as Intrinsics
+from edgegrasp_client.clouds import PointCloud2 as PointCloud2
+from edgegrasp_client.clouds import PointField as PointField
+from edgegrasp_client.connection import Tls as Tls
+from edgegrasp_client.errors import AccessDeniedError as AccessDeniedError
+from edgegrasp_client.errors import DeadlineError as DeadlineError
+from edgegrasp_client.errors import GraspClientError as GraspClientError
+from edgegrasp_client.errors import InvalidRequestError as InvalidRequestError
+from edgegrasp_client.errors import OverloadedError as OverloadedError
+from edgegrasp_client.errors import PayloadTooLargeError as PayloadTooLargeError
+from edgegrasp_client.errors import ProtocolError as ProtocolError
+from edgegrasp_client.errors import ServerFailedError as ServerFailedError
+from edgegrasp_client.errors import ServerUnavailableError as ServerUnavailableError
+from edgegrasp_client.errors import UnknownModelError as UnknownModelError
+from edgegrasp_client.options import ApproachDirection as ApproachDirection
+from edgegrasp_client.options import Box as Box
+from edgegrasp_client.options import Collision as Collision
+from edgegrasp_client.options import Cone as Cone
+from edgegrasp_client.options import DetectOptions as DetectOptions
+from edgegrasp_client.options import GripperGeometry as GripperGeometry
+from edgegrasp_client.options import HalfSpace as HalfSpace
+from edgegrasp_client.options import HandPart as HandPart
+from edgegrasp_client.options import Indices as Indices
+from edgegrasp_client.options import Linkage as Linkage
+from edgegrasp_client.options import Mask as Mask
+from edgegrasp_client.options import OrientedBox as OrientedBox
+from edgegrasp_client.options import RansacPlane as RansacPlane
+from edgegrasp_client.options import Region as Region
+from edgegrasp_client.options import Segments as Segments
+from edgegrasp_client.options import Sphere as Sphere
+from edgegrasp_client.options import SupportPlane as SupportPlane
+from edgegrasp_client.options import Suppression as Suppression
+from edgegrasp_client.options import Workspace as Workspace
+from edgegrasp_client.requests import StreamRequest as StreamRequest
+from edgegrasp_client.results import DebugInfo as DebugInfo
+from edgegrasp_client.results import Detection as Detection
+from edgegrasp_client.results import Evaluation as Evaluation
+from edgegrasp_client.results import Grasp as Grasp
+from edgegrasp_client.results import Model as Model
+from edgegrasp_client.results import Scoring as Scoring
+from edgegrasp_client.results import StreamAnswer as StreamAnswer
+from edgegrasp_client.targets import object_in_scene as object_in_scene
+from edgegrasp_client.targets import on_mask as on_mask

@@ -1,8 +1,16 @@
-"""The client for asyncio; `scripts/unasync.py` makes the synchronous one, client.py, from it."""
+"""The client for asyncio; client.py runs it for who does without."""
 
 import asyncio
 import time
-from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Sequence
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Iterable,
+    Sequence,
+)
 from functools import partial
 from typing import Any, TypeVar
 
@@ -64,7 +72,6 @@ class AsyncGraspClient:
         token: For a server that asks for one; over TLS, or everyone on the way can read it.
         tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx knows.
-        channel: gRPC channel to use instead of opening one; its owner closes it.
         http_transport: httpx transport to use instead of the network.
     """
 
@@ -76,7 +83,6 @@ class AsyncGraspClient:
         retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
-        channel: grpc.aio.Channel | None = None,
         http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
@@ -85,7 +91,7 @@ class AsyncGraspClient:
         if is_rest(address):
             self._transport = _RestTransport(address, token, tls, http_transport)
         else:
-            self._transport = _GrpcTransport(address, token, tls, channel)
+            self._transport = _GrpcTransport(address, token, tls)
 
     async def detect(
         self,
@@ -137,17 +143,8 @@ class AsyncGraspClient:
     ) -> Scoring:
         """Score edges or hand poses of one's own: the paper's grasp evaluation function.
 
-        Args:
-            cloud: As for `detect`, like all that is not said here.
-            edges: (M, 2) integers: approach and contact point, rows of the cloud as sent.
-            hand_poses: (M, 4, 4) T_cloud_hand, in the place of edges.
-            depth_images: As for `detect`.
-            normals: As for `detect`.
-            colors: As for `detect`.
-            segment_ids: As for `detect`.
-            view_ids: As for `detect`.
-            timeout: As for `detect`.
-            options: As for `detect`.
+        `edges` are (M, 2) integers, approach and contact point, rows of the cloud as sent; in their
+        place `hand_poses`, (M, 4, 4) T_cloud_hand. All else is as for `detect`.
 
         Returns:
             An evaluation for each edge or pose, in their order.
@@ -164,7 +161,7 @@ class AsyncGraspClient:
         requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
         *,
         timeout: float | None = None,
-    ) -> AsyncIterator[StreamAnswer]:
+    ) -> AsyncGenerator[StreamAnswer, None]:
         """Find grasps in one cloud after the other, over one stream.
 
         The next request is sent while earlier ones are at work; where the server is behind, this
@@ -172,8 +169,8 @@ class AsyncGraspClient:
         connection.
 
         Args:
-            requests: Read as they can be sent, by `GraspClient` over gRPC in a thread of its own;
-                an error in it ends the stream once what went before is answered.
+            requests: Read as they can be sent; an error in it ends the stream once what went
+                before is answered.
             timeout: Seconds for each request that does not say; None: the client's own.
 
         Yields:
@@ -246,11 +243,12 @@ class AsyncGraspClient:
 class _GrpcTransport:
     """Calls over one channel; raises GraspClientErrors."""
 
-    def __init__(
-        self, address: str, token: str | None, tls: Tls | None, channel: grpc.aio.Channel | None
-    ) -> None:
-        self._owned = channel is None
-        self._channel = channel or _open_channel(address, tls)
+    def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
+        if tls is None:
+            self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
+        else:
+            credentials = channel_credentials(tls)
+            self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
         self._metadata = token_metadata(token)
         self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
         self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
@@ -278,7 +276,7 @@ class _GrpcTransport:
 
     async def detect_stream(
         self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
-    ) -> AsyncIterator[StreamAnswer]:
+    ) -> AsyncGenerator[StreamAnswer, None]:
         failed: list[Exception] = []
 
         async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
@@ -306,8 +304,7 @@ class _GrpcTransport:
             return False
 
     async def close(self) -> None:
-        if self._owned:
-            await self._channel.close(None)
+        await self._channel.close(None)
 
 
 class _RestTransport:
@@ -350,7 +347,7 @@ class _RestTransport:
 
     async def detect_stream(
         self, requests: AsyncIterator[tuple[int, StreamRequest]], timeout: float
-    ) -> AsyncIterator[StreamAnswer]:
+    ) -> AsyncGenerator[StreamAnswer, None]:
         async for number, request in requests:
             call = rest_wire.detect_call(request.request)
             seconds = timeout if request.timeout is None else request.timeout
@@ -368,9 +365,3 @@ class _RestTransport:
 
     async def close(self) -> None:
         await self._http.aclose()
-
-
-def _open_channel(address: str, tls: Tls | None) -> grpc.aio.Channel:
-    if tls is None:
-        return grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
-    return grpc.aio.secure_channel(address, channel_credentials(tls), CHANNEL_OPTIONS)

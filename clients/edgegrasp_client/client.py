@@ -1,69 +1,46 @@
-"""The synchronous client, generated from async_client.py: edit that one."""
+"""The synchronous client: the asynchronous one, run in a thread."""
 
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
-from typing import Any, TypeVar
+import asyncio
+import os
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from concurrent.futures import Future
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
-import grpc
 import httpx
-from numpy.typing import NDArray
-from typing_extensions import Self, Unpack
+from typing_extensions import Self
 
-from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
-from edgegrasp_client import grpc_wire, rest_wire
-from edgegrasp_client.clouds import Cloud, DepthImage
-from edgegrasp_client.connection import (
-    CHANNEL_OPTIONS,
-    DEFAULT_ADDRESS,
-    HTTP_OVER_UNIX,
-    Tls,
-    channel_credentials,
-    is_rest,
-    retry_delay,
-    ssl_context,
-    token_metadata,
-)
-from edgegrasp_client.errors import DeadlineError, GraspClientError, ServerUnavailableError
-from edgegrasp_client.options import DetectOptions
-from edgegrasp_client.requests import (
-    Request,
-    ScoreRequest,
-    StreamRequest,
-    plain_options,
-)
-from edgegrasp_client.results import (
-    Detection,
-    Model,
-    Read,
-    Scoring,
-    StreamAnswer,
-    detection_from,
-    models_from,
-    scoring_from,
-)
+from edgegrasp_client.async_client import AsyncGraspClient
+from edgegrasp_client.connection import DEFAULT_ADDRESS, Tls, is_rest
+from edgegrasp_client.errors import invalid
+from edgegrasp_client.requests import StreamRequest
+from edgegrasp_client.results import StreamAnswer
 
-POLL_SECONDS = 0.1
-
+Parameters = ParamSpec("Parameters")
 Answer = TypeVar("Answer")
+
+_LOOPS: dict[int, asyncio.AbstractEventLoop] = {}  # by process
+_STARTING = threading.Lock()
+_ASKED_OVER_GRPC: set[int] = set()  # this process, and those that it was forked from
+
+
+def _waiting(
+    method: Callable[Concatenate[AsyncGraspClient, Parameters], Coroutine[Any, Any, Answer]],
+) -> "Callable[Concatenate[GraspClient, Parameters], Answer]":
+    """A method of the asynchronous client that returns its answer."""
+
+    @wraps(method)
+    def call(self: "GraspClient", /, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Answer:
+        return _run(method(self._client, *args, **kwargs))
+
+    return call
 
 
 class GraspClient:
-    """Asks one server for grasps; use as a context manager, or close it.
+    """Asks one server for grasps; use as a context manager, or close it. Any thread may call it.
 
-    Args:
-        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
-            of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
-            "http+unix:/run/edgegrasp/http.sock" for REST.
-        timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
-            for each of connecting, sending and waiting.
-        retry: Whether to try again, after short random delays, where the server is away or busy
-            or lost the worker of the request. Requests of a stream are sent once.
-        token: For a server that asks for one; over TLS, or everyone on the way can read it.
-        tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
-            authorities that httpx knows.
-        channel: gRPC channel to use instead of opening one; its owner closes it.
-        http_transport: httpx transport to use instead of the network.
+    Arguments and methods are those of `AsyncGraspClient`.
     """
 
     def __init__(
@@ -74,142 +51,50 @@ class GraspClient:
         retry: bool = True,
         token: str | None = None,
         tls: Tls | None = None,
-        channel: grpc.Channel | None = None,
-        http_transport: httpx.BaseTransport | None = None,
+        http_transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self._timeout = timeout
-        self._retry = retry
-        self._transport: _GrpcTransport | _RestTransport
-        if is_rest(address):
-            self._transport = _RestTransport(address, token, tls, http_transport)
-        else:
-            self._transport = _GrpcTransport(address, token, tls, channel)
+        if not is_rest(address):
+            _ASKED_OVER_GRPC.add(os.getpid())
+            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait for ever, for threads of the parent's
+                fix = "Start processes by `spawn`, or ask over REST."
+                raise invalid("address", "gRPC in a fork of a process that has used it", fix)
 
-    def detect(
-        self,
-        cloud: Cloud | None = None,
-        *,
-        depth_images: Sequence[DepthImage] | None = None,
-        normals: NDArray[Any] | None = None,
-        colors: NDArray[Any] | None = None,
-        segment_ids: NDArray[Any] | None = None,
-        view_ids: NDArray[Any] | None = None,
-        timeout: float | None = None,
-        **options: Unpack[DetectOptions],
-    ) -> Detection:
-        """Find grasps in a cloud.
+        async def make() -> AsyncGraspClient:
+            return AsyncGraspClient(
+                address,
+                timeout=timeout,
+                retry=retry,
+                token=token,
+                tls=tls,
+                http_transport=http_transport,
+            )
 
-        Args:
-            cloud: (N, 3) float32 or float64, metres; (H, W, 3) with NaN for holes; the path of a
-                .npy, .npz, .ply, .pcd or .xyz file; or an object with the attributes of
-                sensor_msgs/PointCloud2.
-            depth_images: Views to fuse in place of a cloud; their cameras are the viewpoints, and
-                the rows of the cloud their pixels, one image after the other.
-            normals: (N, 3), one for each row of the cloud, outward, of any length.
-            colors: (N, 3), one for each row.
-            segment_ids: (N,) integers, which `segments` of a region name.
-            view_ids: (N,) integers: which of several positions of `viewpoint` saw each row.
-            timeout: Seconds to wait; None: the client's own.
-            options: As in DetectOptions; what is left out takes the server's default.
+        self._client = _run(make())
 
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
-        """
-        arrays = (normals, colors, segment_ids, view_ids)
-        request = Request(cloud, depth_images, *arrays, options=plain_options(options))
-        return self._retried(partial(self._transport.detect, request), timeout)
-
-    def score(
-        self,
-        cloud: Cloud | None = None,
-        *,
-        edges: NDArray[Any] | None = None,
-        hand_poses: NDArray[Any] | None = None,
-        depth_images: Sequence[DepthImage] | None = None,
-        normals: NDArray[Any] | None = None,
-        colors: NDArray[Any] | None = None,
-        segment_ids: NDArray[Any] | None = None,
-        view_ids: NDArray[Any] | None = None,
-        timeout: float | None = None,
-        **options: Unpack[DetectOptions],
-    ) -> Scoring:
-        """Score edges or hand poses of one's own: the paper's grasp evaluation function.
-
-        Args:
-            cloud: As for `detect`, like all that is not said here.
-            edges: (M, 2) integers: approach and contact point, rows of the cloud as sent.
-            hand_poses: (M, 4, 4) T_cloud_hand, in the place of edges.
-            depth_images: As for `detect`.
-            normals: As for `detect`.
-            colors: As for `detect`.
-            segment_ids: As for `detect`.
-            view_ids: As for `detect`.
-            timeout: As for `detect`.
-            options: As for `detect`.
-
-        Returns:
-            An evaluation for each edge or pose, in their order.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
-        """
-        arrays = (normals, colors, segment_ids, view_ids, plain_options(options))
-        request = ScoreRequest(cloud, depth_images, *arrays, edges, hand_poses)
-        return self._retried(partial(self._transport.score, request), timeout)
+    detect = _waiting(AsyncGraspClient.detect)
+    score = _waiting(AsyncGraspClient.score)
+    models = _waiting(AsyncGraspClient.models)
+    ready = _waiting(AsyncGraspClient.ready)
+    wait_until_ready = _waiting(AsyncGraspClient.wait_until_ready)
+    close = _waiting(AsyncGraspClient.close)
 
     def detect_stream(
-        self,
-        requests: Iterable[StreamRequest],
-        *,
-        timeout: float | None = None,
+        self, requests: Iterable[StreamRequest], *, timeout: float | None = None
     ) -> Iterator[StreamAnswer]:
-        """Find grasps in one cloud after the other, over one stream.
+        """As `AsyncGraspClient.detect_stream`; the requests are read in a thread of their own."""
+        answers = self._client.detect_stream(_from_thread(requests), timeout=timeout)
 
-        The next request is sent while earlier ones are at work; where the server is behind, this
-        does not run ahead of it. Over REST, each request waits for the answer before it, on one
-        connection.
+        async def following() -> StreamAnswer | None:
+            return await anext(answers, None)
 
-        Args:
-            requests: Read as they can be sent, by `GraspClient` over gRPC in a thread of its own;
-                an error in it ends the stream once what went before is answered.
-            timeout: Seconds for each request that does not say; None: the client's own.
+        async def end() -> None:
+            await answers.aclose()
 
-        Yields:
-            An answer to each request, in their order; the error of one does not end the stream.
-
-        Raises:
-            GraspClientError: The stream itself failed, so that no more answers come.
-        """
-        return self._transport.detect_stream(enumerate(requests), self._seconds(timeout))
-
-    def models(self, *, timeout: float | None = None) -> list[Model]:
-        """The weights that `model` can name.
-
-        Raises:
-            GraspClientError: As in edgegrasp_client.errors.
-        """
-        return self._retried(self._transport.models, timeout)
-
-    def ready(self, *, timeout: float | None = None) -> bool:
-        """Whether the server answers requests: False if it is not there or still loading."""
-        return self._transport.ready(self._seconds(timeout))
-
-    def wait_until_ready(self, timeout: float = 60.0) -> None:
-        """Return once the server answers requests.
-
-        Raises:
-            DeadlineError: It did not within `timeout` seconds.
-        """
-        end = time.monotonic() + timeout
-        while not self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
-            if time.monotonic() >= end:
-                raise DeadlineError(f"The server was not ready within {timeout:g} s.")
-            time.sleep(POLL_SECONDS)
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._retry = False  # a call that this cancels has no connection to try again on
-        self._transport.close()
+        try:
+            while (answer := _run(following())) is not None:
+                yield answer
+        finally:  # not waited for: the garbage collector may come here in the loop's own thread
+            asyncio.run_coroutine_threadsafe(end(), _loop())
 
     def __enter__(self) -> Self:
         """Itself."""
@@ -219,154 +104,40 @@ class GraspClient:
         """Close the connection."""
         self.close()
 
-    def _seconds(self, timeout: float | None) -> float:
-        return self._timeout if timeout is None else timeout
 
-    def _retried(self, call: Callable[[float], Answer], timeout: float | None) -> Answer:
-        """The answer of a call, made again while the server is away or busy and time is left."""
-        left = self._seconds(timeout)
-        end = time.monotonic() + left
-        attempt = 0
-        while True:
+def _loop() -> asyncio.AbstractEventLoop:
+    """The event loop of all clients of this process; a forked one has none of its parent's."""
+    with _STARTING:
+        if os.getpid() not in _LOOPS:
+            loop = _LOOPS[os.getpid()] = asyncio.new_event_loop()
+            threading.Thread(target=loop.run_forever, name="edgegrasp-client", daemon=True).start()
+        return _LOOPS[os.getpid()]
+
+
+def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
+    """What the work gives; where its caller is interrupted, it is cancelled."""
+    running = asyncio.run_coroutine_threadsafe(work, _loop())
+    try:
+        return running.result()
+    except BaseException:
+        running.cancel()
+        raise
+
+
+async def _from_thread(requests: Iterable[StreamRequest]) -> AsyncIterator[StreamRequest]:
+    """The requests; to wait for the next one holds up nothing, not even the program's end."""
+    source = iter(requests)
+
+    def read(found: "Future[StreamRequest | None]") -> None:
+        if found.set_running_or_notify_cancel():
             try:
-                return call(left)
-            except ServerUnavailableError as error:
-                delay = retry_delay(error, attempt)
-                if not self._retry or delay is None or time.monotonic() + delay >= end:
-                    raise
-            time.sleep(delay)
-            left = max(end - time.monotonic(), 0.0)
-            attempt += 1
+                found.set_result(next(source, None))
+            except Exception as error:
+                found.set_exception(error)
 
-
-class _GrpcTransport:
-    """Calls over one channel; raises GraspClientErrors."""
-
-    def __init__(
-        self, address: str, token: str | None, tls: Tls | None, channel: grpc.Channel | None
-    ) -> None:
-        self._owned = channel is None
-        self._channel = channel or _open_channel(address, tls)
-        self._metadata = token_metadata(token)
-        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
-        self._check = self._channel.unary_unary(grpc_wire.HEALTH_CHECK, bytes, bytes)
-
-    def detect(self, request: Request, timeout: float) -> Detection:
-        message = grpc_wire.detect_message(request)
-        return self._answer(self._stub.DetectGrasps, message, timeout, detection_from)
-
-    def score(self, request: ScoreRequest, timeout: float) -> Scoring:
-        message = grpc_wire.score_message(request)
-        return self._answer(self._stub.ScoreGrasps, message, timeout, scoring_from)
-
-    def models(self, timeout: float) -> list[Model]:
-        message = grasp_pb2.ListModelsRequest()
-        return self._answer(self._stub.ListModels, message, timeout, models_from)
-
-    def _answer(
-        self, method: Any, message: Any, timeout: float, parse: Callable[[Any, Read], Answer]
-    ) -> Answer:
-        try:
-            answer = method(message, timeout=timeout, metadata=self._metadata)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        return parse(answer, grpc_wire.read_field)
-
-    def detect_stream(
-        self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
-    ) -> Iterator[StreamAnswer]:
-        failed: list[Exception] = []
-
-        def messages() -> Iterator[grasp_pb2.DetectGraspsStreamRequest]:
-            try:
-                for number, request in requests:
-                    yield grpc_wire.stream_message(request, number, timeout)
-            except Exception as error:  # gRPC reads this elsewhere, and would only log it
-                failed.append(error)
-
-        call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
-        try:
-            for answer in call:
-                yield grpc_wire.stream_answer(answer)
-        except grpc.RpcError as error:
-            raise grpc_wire.error_from_call(error) from None
-        finally:
-            call.cancel()
-        if failed:
-            raise failed[0]
-
-    def ready(self, timeout: float) -> bool:
-        try:
-            return bool(self._check(b"", timeout=timeout) == grpc_wire.SERVING)
-        except grpc.RpcError:
-            return False
-
-    def close(self) -> None:
-        if self._owned:
-            self._channel.close()
-
-
-class _RestTransport:
-    """Posts over connections that are kept open; raises GraspClientErrors."""
-
-    def __init__(
-        self,
-        address: str,
-        token: str | None,
-        tls: Tls | None,
-        transport: httpx.BaseTransport | None,
-    ) -> None:
-        if address.startswith(HTTP_OVER_UNIX):
-            transport = httpx.HTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
-            address = "http://localhost"
-        self._http = httpx.Client(
-            base_url=address,
-            headers=dict(token_metadata(token)),
-            verify=ssl_context(tls),
-            transport=transport,
-        )
-
-    def detect(self, request: Request, timeout: float) -> Detection:
-        return self._answer(rest_wire.detect_call(request), timeout, detection_from)
-
-    def score(self, request: ScoreRequest, timeout: float) -> Scoring:
-        return self._answer(rest_wire.score_call(request), timeout, scoring_from)
-
-    def models(self, timeout: float) -> list[Model]:
-        return self._answer(rest_wire.models_call(), timeout, models_from)
-
-    def _answer(
-        self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]
-    ) -> Answer:
-        try:
-            response = self._http.request(**rest_wire.with_deadline(call, timeout))
-        except httpx.HTTPError as error:
-            raise rest_wire.error_from_transport(error) from None
-        return rest_wire.parsed(response, parse)
-
-    def detect_stream(
-        self, requests: Iterator[tuple[int, StreamRequest]], timeout: float
-    ) -> Iterator[StreamAnswer]:
-        for number, request in requests:
-            call = rest_wire.detect_call(request.request)
-            seconds = timeout if request.timeout is None else request.timeout
-            try:
-                detection = self._answer(call, seconds, detection_from)
-                yield StreamAnswer(request.name(number), detection)
-            except GraspClientError as error:
-                yield StreamAnswer(request.name(number), error=error)
-
-    def ready(self, timeout: float) -> bool:
-        try:
-            return (self._http.get(rest_wire.READY, timeout=timeout)).is_success
-        except httpx.HTTPError:
-            return False
-
-    def close(self) -> None:
-        self._http.close()
-
-
-def _open_channel(address: str, tls: Tls | None) -> grpc.Channel:
-    if tls is None:
-        return grpc.insecure_channel(address, CHANNEL_OPTIONS)
-    return grpc.secure_channel(address, channel_credentials(tls), CHANNEL_OPTIONS)
+    while True:
+        found: Future[StreamRequest | None] = Future()
+        threading.Thread(target=read, args=(found,), daemon=True).start()
+        if (request := await asyncio.wrap_future(found)) is None:
+            return
+        yield request

@@ -123,11 +123,7 @@ def is_point_cloud2(cloud: object) -> TypeGuard[PointCloud2]:
 
 
 def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
-    """The fields of edgegrasp.v1.PointCloud2; `data` as bytes.
-
-    Args:
-        cloud: Any object with those attributes, such as a message of rclpy.
-    """
+    """The fields of edgegrasp.v1.PointCloud2; `data` as bytes."""
     data = cloud.data
     if not isinstance(data, bytes):
         data = np.asarray(data, dtype=np.uint8).tobytes()

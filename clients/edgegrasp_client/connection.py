@@ -29,17 +29,11 @@ FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 
 @dataclass(frozen=True)
 class Tls:
-    """How to know the server, and what to show it; files in PEM.
+    """How to know the server, and what to show it; files in PEM."""
 
-    Attributes:
-        ca: Certificates of the authorities to trust; None: those of the machine.
-        certificate: One's own, for servers that ask for it.
-        key: The key of that certificate.
-    """
-
-    ca: str | Path | None = None
-    certificate: str | Path | None = None
-    key: str | Path | None = None
+    ca: str | Path | None = None  # authorities to trust; None: those of the machine
+    certificate: str | Path | None = None  # one's own, for servers that ask for it
+    key: str | Path | None = None  # of that certificate
 
     def __post_init__(self) -> None:
         """Raise InvalidRequestError for a certificate without its key."""

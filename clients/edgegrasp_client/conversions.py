@@ -184,9 +184,7 @@ def pose_from_moveit_grasp(
 ) -> Float64:
     """T_cloud_hand of a `moveit_msgs/Grasp` given as a dictionary of its fields.
 
-    Args:
-        message: The fields; only `grasp_pose` is read.
-        T_hand_link: (4, 4) as for `moveit_grasp`.
+    Only its `grasp_pose` is read; `T_hand_link` (4, 4) is as for `moveit_grasp`.
 
     Returns:
         (4, 4).

@@ -52,16 +52,11 @@ class ServerUnavailableError(GraspClientError):
 
 
 class OverloadedError(ServerUnavailableError):
-    """The server is full.
-
-    Args:
-        message: The whole sentence.
-        retry_after: Seconds until another try is worth it.
-    """
+    """The server is full."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
         super().__init__(message)
-        self.retry_after = retry_after
+        self.retry_after = retry_after  # seconds until another try is worth it
 
 
 class DeadlineError(GraspClientError):

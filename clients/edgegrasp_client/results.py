@@ -140,7 +140,7 @@ _STAGES = (
 )
 
 
-Record = TypeVar("Record", Model, FoundSupport, DetectedObject)
+Record = TypeVar("Record", Model, FoundSupport, DetectedObject, Grasp)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
@@ -149,7 +149,7 @@ def detection_from(answer: Any, read: Read) -> Detection:
     """The answer to a request for grasps."""
     debug, support = read(answer, "debug"), read(answer, "support")
     return Detection(
-        grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
+        grasps=[_record(Grasp, grasp, read) for grasp in read(answer, "grasps")],
         up=_array(read(answer, "up")),
         support=None if support is None else _record(FoundSupport, support, read),
         objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
@@ -172,11 +172,12 @@ def models_from(answer: Any, read: Read) -> list[Model]:
 
 
 def _record(kind: type[Record], answer: Any, read: Read) -> Record:
-    """An object whose fields are read as they are, lists of numbers as arrays."""
+    """An object whose fields are read as they are, lists of numbers as arrays, poses (4, 4)."""
     plain = (str, int, float, type(None))
     values: dict[str, Any] = {one.name: read(answer, one.name) for one in fields(kind)}
     for name, value in values.items():
-        values[name] = value if isinstance(value, plain) else _array(value)
+        if not isinstance(value, plain):
+            values[name] = _array(value).reshape((4, 4) if name.startswith("T_") else -1)
     return kind(**values)
 
 
@@ -200,24 +201,8 @@ def _in_order(stages: Mapping[str, Any]) -> dict[str, Any]:
 
 def _evaluation(answer: Any, read: Read) -> Evaluation:
     grasp = read(answer, "grasp")
-    return Evaluation(None if grasp is None else _grasp(grasp, read), read(answer, "reason"))
-
-
-def _grasp(answer: Any, read: Read) -> Grasp:
-    def floats(name: str, *shape: int) -> Float32:
-        return np.array(read(answer, name), dtype=np.float32).reshape(shape)
-
-    return Grasp(
-        score=read(answer, "score"),
-        T_cloud_hand=floats("T_cloud_hand", 4, 4),
-        T_cloud_tcp=floats("T_cloud_tcp", 4, 4),
-        width=read(answer, "width"),
-        approach_point=floats("approach_point", 3),
-        contact_point=floats("contact_point", 3),
-        approach_direction=floats("approach_direction", 3),
-        collision_free=read(answer, "collision_free"),
-        clearance=read(answer, "clearance"),
-        object=read(answer, "object"),
+    return Evaluation(
+        None if grasp is None else _record(Grasp, grasp, read), read(answer, "reason")
     )
 
 

@@ -26,23 +26,14 @@ STYLES = ("-", "--", ":", "-.")  # of the models
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One benchmark of an experiment.
+    """One benchmark of an experiment."""
 
-    Attributes:
-        group: what varies.
-        value: its value here, a number or a name.
-        scene: kind of the scenes.
-        protocol: the constants, with the one that varies.
-        planner: fields of the planner that vary.
-        objects: folder of the objects; None: the experiment's.
-    """
-
-    group: str
-    value: float | str
+    group: str  # what varies
+    value: float | str  # its value here
     scene: SceneKind
-    protocol: Protocol
-    planner: dict[str, Any] = field(default_factory=dict)
-    objects: Path | None = None
+    protocol: Protocol  # the constants, with the one that varies
+    planner: dict[str, Any] = field(default_factory=dict)  # fields of the planner that vary
+    objects: Path | None = None  # folder; None: the experiment's
 
     @property
     def name(self) -> str:
@@ -66,12 +57,7 @@ def cases_of(
 ) -> list[Case]:
     """The benchmarks of an experiment.
 
-    Args:
-        name: one of `EXPERIMENTS`.
-        protocol: what is varied.
-        scenes: kinds of scenes.
-        models: names or files of weights.
-        folder: of the experiment, for objects that it makes.
+    Objects that it makes go into the folder.
 
     Raises:
         ValueError: no such experiment, or `labels` with a model that is not a file in a folder
@@ -156,11 +142,7 @@ EXPERIMENTS: dict[str, Callable[[Protocol, str, Path], Iterator[Variant]]] = {
 
 
 def experiment_table(results: dict[str, Any]) -> str:
-    """Markdown tables of an experiment, one for each group; per cent with 95 % intervals.
-
-    Args:
-        results: as in `experiment.json`.
-    """
+    """Markdown tables of an experiment, one for each group; per cent with 95 % intervals."""
     parts = []
     for group, cases in _by(_group, results["cases"]).items():
         columns = _by(_line, cases)

@@ -48,22 +48,14 @@ class Drawable(Protocol):
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame.
+    """A pinhole camera: column = fx * x / z + cx, row = fy * y / z + cy in its own frame."""
 
-    Attributes:
-        shape: rows and columns of its image.
-        fx: pixels; negative where the cloud's z points backward.
-        fy: pixels.
-        cx: pixels.
-        cy: pixels.
-        T_cloud_camera: (4, 4); by default the cloud is in the camera's frame.
-    """
-
-    shape: tuple[int, int]
-    fx: float
+    shape: tuple[int, int]  # rows and columns of its image
+    fx: float  # pixels, as the next three; negative where the cloud's z points backward
     fy: float
     cx: float
     cy: float
+    # (4, 4); by default the cloud is in the camera's frame
     T_cloud_camera: NDArray[np.floating] = field(default_factory=lambda: np.eye(4))
 
     @classmethod

@@ -14,10 +14,6 @@ from edgegrasp_sim.trial import Attempt, PlannedGrasp, Round, RoundDriver
 class Replay:
     """The recorded rounds of a result folder, to be repeated.
 
-    Args:
-        folder: a benchmark's.
-        objects: where its object folder is now; by default where it was.
-
     Raises:
         FileNotFoundError: the folder holds no benchmark, or its objects are not there.
         ValueError: the objects are not those of the benchmark.

@@ -29,9 +29,7 @@ MIN_IN_BIN = 5  # attempts; fewer say nothing about a score
 def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     """Write `report.html` into a result folder.
 
-    Args:
-        folder: of a benchmark.
-        objects: where its object folder is now; by default where it was.
+    `objects` is where its object folder is now; None: where it was.
 
     Raises:
         FileNotFoundError: the folder holds no benchmark, or its objects are not there.

@@ -249,10 +249,6 @@ def planner_title(planner: dict[str, Any]) -> str:
 def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
     """Differences of GSR and DR over the scenes that two benchmarks share.
 
-    Args:
-        first: the reference.
-        second: compared with it.
-
     Returns:
         Figures ready for JSON: for `grasp_success_rate` and `declutter_rate` the value and
         interval of each and the difference, second minus first, with its paired 95 % interval.
@@ -346,10 +342,7 @@ def paired_difference(
 
     Scenes are resampled, so that differences between scenes cancel out.
 
-    Args:
-        numerators: (2, S) counts of each run in each scene.
-        denominators: (2, S) likewise.
-        rng: source of the resampling.
+    Counts are (2, S): of each run in each scene.
 
     Returns:
         Second run's ratio minus the first's, and its 95 % interval; None if a run has no counts.

@@ -15,12 +15,7 @@ MIN_POINTS = 10
 def plan_top_down(observation: Observation, seed: int) -> PlannedGrasp | None:
     """Plan one grasp; a `Planner` to compare others with, and to try the simulator with.
 
-    Args:
-        observation: what is seen.
-        seed: not needed, nothing here is random.
-
-    Returns:
-        The grasp, or None if hardly anything is there to grasp.
+    None if hardly anything is there to grasp.
     """
     del seed
     cloud = observation.cloud.astype(np.float64)

@@ -27,12 +27,7 @@ def measure_agreement(
 ) -> list[tuple[int, int]]:
     """Repeat the grasps of `<shared>/reference/grasp_outcomes/<kind>.json`.
 
-    Args:
-        shared: folder with `objects` and `reference`.
-        kind: of the scenes.
-        most: only the first so many grasps of each scene.
-        to_the_end: see `ClutterSimulation.try_grasp`.
-        engine: see `choose_engine`; the reference simulator is PyBullet.
+    `most`: only the first so many of each scene.
 
     Returns:
         For each scene how many grasps succeeded or failed as in the reference, and were tried.

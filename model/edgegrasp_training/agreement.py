@@ -33,9 +33,7 @@ class Pair(NamedTuple):
 def compare_engines(objects: Path | None, options: GenerationOptions) -> Iterator[Pair]:
     """Make packed scenes and piles in either engine in turn, and try grasps in both.
 
-    Args:
-        objects: Folder of train objects as for generated data; None: the built-in ones.
-        options: How many scenes, views and grasps; grasps are chosen as for generated data.
+    Objects and grasps are chosen as for generated data.
 
     Raises:
         RuntimeError: An engine is not installed.

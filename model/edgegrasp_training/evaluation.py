@@ -107,13 +107,7 @@ def write_model_card(
 ) -> None:
     """Write a card in Markdown.
 
-    Args:
-        path: File to write.
-        metadata: Of the trained network.
-        training: Provenance: views, labels, steps, seconds and the like.
-        evaluation: On the validation views, before calibration.
-        log: CSV file of the evaluations during training.
-        command: The one that trained it.
+    The evaluation is that before calibration.
     """
     network = metadata.network
     rows = [

@@ -93,13 +93,7 @@ class Packed(NamedTuple):
 def tried_grasps(
     view: LabelledView, config: NetworkConfig, *, viewpoint_known: bool = True
 ) -> TriedGrasps:
-    """Build the tried candidates of a view, with the inputs of a hand network.
-
-    Args:
-        view: The view.
-        config: The network to prepare for.
-        viewpoint_known: Whether the request gave the camera's position.
-    """
+    """Build the tried candidates of a view, with the inputs of a hand network."""
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
     candidates = _candidates(view, cloud, rows)
@@ -151,11 +145,7 @@ def pack_balls(
 
     The axes are those of the detector's frame; lengths are multiples of LENGTH_UNIT.
 
-    Args:
-        grasps: The labelled candidates of a view.
-        balls: (A,) ascending rows of the cloud to crop around.
-        config: Crop radius and k.
-        soft_labels: Further candidates that a teacher has scored.
+    The balls are ascending rows (A,) of the cloud to crop around.
     """
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, balls))
     tried = grasps.candidates.take(rows)
@@ -199,11 +189,7 @@ def pack_hands(
 ) -> Packed:
     """Pack the hand network's inputs for the candidates of some balls.
 
-    Args:
-        grasps: The labelled candidates of a view, with those inputs.
-        balls: (A,) rows of the cloud.
-        config: Points of each hand.
-        rng: Picks each hand's points at random; without it, they are spread evenly.
+    The balls are rows (A,) of the cloud; without `rng` each hand's points are spread evenly.
     """
     seen = grasps.seen
     assert seen is not None

@@ -38,9 +38,7 @@ class Outcomes:
 def read_outcomes(path: Path, digest: str = "") -> Outcomes:
     """The outcomes in a file that a server wrote, an object of JSON on each line.
 
-    Args:
-        path: The file.
-        digest: Of the weights whose scores count; empty: all.
+    `digest`: of the weights whose scores count; empty: all.
 
     Raises:
         OSError: It cannot be read.
@@ -78,13 +76,7 @@ def fit(outcomes: Outcomes) -> tuple[float, float]:
 def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     """Write weights whose scores are calibrated on the outcomes of the old ones.
 
-    Args:
-        weights: Those that scored the grasps.
-        outcomes_file: As of `read_outcomes`; outcomes of other weights are left out.
-        folder: Gets NAME-robot.safetensors.
-
-    Returns:
-        What was done, in a sentence.
+    Into NAME-robot.safetensors; returns what was done, in a sentence.
 
     Raises:
         InvalidCheckpoint: The weights cannot be read.

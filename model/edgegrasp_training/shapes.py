@@ -40,10 +40,7 @@ Profile = NDArray[np.float64]  # (P, 2) radius and height, metres; closed, count
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
     """Draw objects of a set and computed ones, each stretched at random.
 
-    Args:
-        objects: To draw from.
-        folder: Gets the descriptions and the computed objects; other meshes stay where they are.
-        rng: Draws objects and factors.
+    The folder gets descriptions and computed objects; other meshes stay where they are.
 
     Returns:
         Up to `NUM_VARIED` objects, each under the name it had.
@@ -66,11 +63,6 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
 
 def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:
     """Describe an object anew, with its meshes stretched along x, y and z.
-
-    Args:
-        model: An object whose shapes are meshes.
-        factors: Along the axes of its link frame.
-        folder: Gets the description.
 
     Raises:
         ValueError: The object has a shape that is not a mesh, or one with a frame of its own.
@@ -112,9 +104,7 @@ def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
 def made_object(name: str, folder: Path) -> ObjectModel:
     """Write a computed object into a folder.
 
-    Args:
-        name: One of HOLLOW_NAMES or DRAWN_NAMES.
-        folder: Created if missing.
+    One of HOLLOW_NAMES or DRAWN_NAMES.
     """
     surface = revolved(HOLLOW[name]) if name in HOLLOW else drawn_shape(DRAWN_NAMES.index(name))
     return ObjectModel(name, write_object(name, surface, folder))

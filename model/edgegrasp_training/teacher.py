@@ -47,11 +47,7 @@ class Teacher:
         self.folder = folder / f"{self.metadata.digest[:12]}-{crop_radius * 1000:g}mm"
 
     def soft_labels(self, path: Path) -> SoftLabels:
-        """Its scores of a view's candidates, read from a file if they were computed before.
-
-        Args:
-            path: The view's file; its content decides which candidates are scored.
-        """
+        """Its scores of a view's candidates, read from a file if they were computed before."""
         digest = zlib.crc32(path.read_bytes())
         kept = self.folder / f"{path.stem}-{digest:08x}.npz"
         if not kept.is_file():
@@ -60,12 +56,7 @@ class Teacher:
         return SoftLabels.load(kept)
 
     def score(self, view: LabelledView, rng: np.random.Generator) -> SoftLabels:
-        """Score candidates around some of a view's points.
-
-        Args:
-            view: The view.
-            rng: Chooses balls and candidates.
-        """
+        """Score candidates around some of a view's points."""
         own = np.unique(view.approach_index[view.tried()])
         others = np.setdiff1d(np.arange(len(view.points)), own)
         own = rng.permutation(own)[:OWN_BALLS]

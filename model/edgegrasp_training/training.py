@@ -133,9 +133,7 @@ class Trainer:
     def run(self, progress: Callable[[int, float], None], until: int | None = None) -> None:
         """Train until finished, or up to a step.
 
-        Args:
-            progress: Called after each step with its number and training loss.
-            until: Step to stop at, for a run in parts.
+        `progress` is called after each step with its number and training loss.
         """
         while not self.finished and (until is None or self.step < until):
             start = time.perf_counter()
@@ -166,12 +164,7 @@ class Trainer:
         return evaluate_scores(logit, label_array)
 
     def finish(self, provenance: dict[str, Any], command: str) -> Evaluation:
-        """Calibrate the best network on all validation views; write it and its card.
-
-        Args:
-            provenance: Further facts for the checkpoint and the card.
-            command: That trained it.
-        """
+        """Calibrate the best network on all validation views; write it and its card."""
         path = self.folder / f"{self.metadata.name}.safetensors"
         best, _ = load_checkpoint(path, self.device)
         self.average.load_state_dict(in_units(best).state_dict())

@@ -163,10 +163,7 @@ def split_by_scene(
 
     A scene keeps its side when scenes are added, so that a run may resume with more data.
 
-    Args:
-        paths: View files.
-        validation_share: Share of the scenes to hold out; at least one is.
-        seed: Which ones.
+    At least one scene is held out.
     """
     place = {
         scene: zlib.crc32(f"{seed} {scene}".encode()) / 2**32 for scene in map(scene_of, paths)
@@ -181,11 +178,6 @@ def split_by_scene(
 def part_of(paths: list[Path], share: float, seed: int) -> list[Path]:
     """The views of a share of the scenes; a larger share has those of a smaller one too.
 
-    Args:
-        paths: View files.
-        share: Of the scenes, about; 1: all.
-        seed: Which ones.
-
     Raises:
         ValueError: No view is left.
     """
@@ -196,13 +188,7 @@ def part_of(paths: list[Path], share: float, seed: int) -> list[Path]:
 
 
 def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
-    """Count views, scenes, labels and objects of each kind of scene in `card.md`.
-
-    Args:
-        folder: Where the card goes.
-        paths: View files.
-        command: The one that made them.
-    """
+    """Count views, scenes, labels and objects of each kind of scene in `card.md`."""
     views = {path: load_view(path) for path in paths}
     columns = {}
     for kind in (*sorted({_kind(path) for path in paths}), "all"):

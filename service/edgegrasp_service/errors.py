@@ -12,31 +12,23 @@ class ServiceError(EdgeGraspError):
     """Base of the service's own errors."""
 
 
-class _FieldError(ServiceError):
-    def __init__(self, field: str, value: str, fix: str) -> None:
-        self.field = field
-        self.value = value
-        self.fix = fix
-        super().__init__(f"{field}: got {value}. {fix}")
-
-
-class PayloadTooLarge(_FieldError):  # noqa: N818
+class PayloadTooLarge(InvalidRequest):
     """A body or a cloud is over the server's limits."""
 
 
-class UnsupportedMediaType(_FieldError):  # noqa: N818
+class UnsupportedMediaType(InvalidRequest):
     """A body is in a format the server does not read."""
 
 
-class Unauthenticated(_FieldError):  # noqa: N818
+class Unauthenticated(InvalidRequest):
     """There is no token, or none that the server knows; its value is in no message."""
 
 
-class PermissionDenied(_FieldError):  # noqa: N818
+class PermissionDenied(InvalidRequest):
     """A token is good for less than what is asked for."""
 
 
-class HeadersTooLarge(_FieldError):  # noqa: N818
+class HeadersTooLarge(InvalidRequest):
     """HTTP headers or gRPC metadata are over the server's limits."""
 
 
@@ -49,19 +41,14 @@ class NotReady(ServiceError):  # noqa: N818
 
 
 class Overloaded(ServiceError):  # noqa: N818
-    """As many requests as the server takes are in it already.
-
-    Args:
-        message: The whole sentence.
-        retry_after: Seconds until it is worth another try.
-    """
+    """As many requests as the server takes are in it already."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
         super().__init__(message)
-        self.retry_after = retry_after
+        self.retry_after = retry_after  # seconds
 
 
-class RequestTimeout(_FieldError):  # noqa: N818
+class RequestTimeout(InvalidRequest):
     """A body arrives too slowly."""
 
 
@@ -135,7 +122,7 @@ def report(error: Exception) -> Problem:
     if isinstance(error, UnknownModel):
         field, value = "options.model", brief(error.name)
         fix = f"Use one of: {', '.join(error.known)}."
-    elif isinstance(error, InvalidRequest | _FieldError):
+    elif isinstance(error, InvalidRequest):
         field, value, fix = error.field, error.value, error.fix
     field, value = _sendable(field), _sendable(value)
     detail = f"{field}: got {value}. {fix}" if field else str(error)

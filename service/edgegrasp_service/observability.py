@@ -183,12 +183,7 @@ class LogQueue(logging.handlers.QueueHandler):
 def write_line(stream: TextIO | None, line: str) -> bool:
     """Write a line past the stream's buffer, which would keep it and fail again on closing.
 
-    Args:
-        stream: None: this process was started with it closed.
-        line: Without a line end.
-
-    Returns:
-        Whether it was written.
+    Returns whether it was written; no stream: this process was started with it closed.
     """
     if stream is None:
         return False
@@ -218,11 +213,7 @@ MANY = (0, 10, 100, 300, 1000, 2000, 4000, 8000, 16000)
 
 
 class Metrics:
-    """Counts, gauges and histograms of one server.
-
-    Args:
-        models: Gives facts of the loaded weights.
-    """
+    """Counts, gauges and histograms of one server."""
 
     def __init__(self, models: Callable[[], Sequence[dict[str, Any]]]) -> None:
         self._models = models
@@ -271,8 +262,7 @@ class Metrics:
     def page(self, accept: str) -> tuple[bytes, str]:
         """All metrics as text, and its content type.
 
-        Args:
-            accept: The header of that name; OpenMetrics to whom asks for it.
+        OpenMetrics to whom asks for it.
         """
         self._model_info.clear()
         for facts in self._models():

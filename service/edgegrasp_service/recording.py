@@ -1,13 +1,11 @@
-"""Requests and their answers in a folder, for the day a robot misses: recorded, and replayed."""
+"""Requests and answers in a folder, for the day a robot misses; `edgegrasp replay` reads it."""
 
 import logging
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import Answer, Job, pack, receive
+from edgegrasp_service.worker.job import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
@@ -15,9 +13,7 @@ logger = logging.getLogger(__name__)
 class Recorder:
     """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
-    Args:
-        folder: Made if it is not there.
-        most: Bytes of all files; the oldest are deleted.
+    Beyond `most` bytes of all files the oldest are deleted.
     """
 
     def __init__(self, folder: Path, most: int) -> None:
@@ -47,28 +43,3 @@ class Recorder:
                 sizes.pop(0)
         except OSError as error:
             logger.warning("%s is not recorded: %s", job.request_id, error)
-
-
-def replay(path: Path, settings: Settings) -> tuple[Job, Answer, Answer]:
-    """Answer a recorded request again, in this process.
-
-    Args:
-        path: The file.
-        settings: Weights and limits.
-
-    Returns:
-        The request, the answer that is recorded, and the answer now.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: It is no recording.
-        EdgeGraspError: Weights cannot be used.
-    """
-    from edgegrasp_service.worker import answer as worker
-
-    with path.open("rb") as file:
-        job, recorded = receive(file), receive(file)
-    if not isinstance(job, Job) or not isinstance(recorded, Answer):
-        raise ValueError(f"{path} is no recorded request")
-    job = replace(job, remaining=settings.max_request_seconds)
-    return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)

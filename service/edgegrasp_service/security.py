@@ -25,17 +25,11 @@ _NAMED = re.compile(r"(?:([\w.-]{1,64}):)?(.*)", re.DOTALL)  # a line of a token
 
 @dataclass(frozen=True)
 class Token:
-    """A token that the server knows.
+    """A token that the server knows."""
 
-    Attributes:
-        name: Shown in logs; "NAME:" before a token in its file, or else where it was read.
-        digest: SHA-256; the token itself is not kept.
-        is_admin: Whether it is good for reloading weights too.
-    """
-
-    name: str
-    digest: bytes
-    is_admin: bool = False
+    name: str  # for logs; "NAME:" before a token in its file, or else where it was read
+    digest: bytes  # SHA-256; the token itself is not kept
+    is_admin: bool = False  # good for reloading weights too
 
 
 class Tokens:
@@ -127,15 +121,8 @@ def _digest(token: str) -> bytes:
 class ServerTls:
     """What each transport needs to speak TLS, with client certificates where a CA is set.
 
-    Args:
-        settings: Certificate, key and client CA.
-
     Raises:
         InvalidSettings: A file cannot be read, or certificate and key are no pair.
-
-    Attributes:
-        http: For the HTTP server.
-        grpc: For the gRPC server.
     """
 
     def __init__(self, settings: Settings) -> None:

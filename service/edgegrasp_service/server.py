@@ -38,10 +38,7 @@ REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble wit
 class Server:
     """Both transports of one service. Must be made in the running event loop.
 
-    Args:
-        settings: What an operator set.
-        observers: Told of every call, besides the metrics and the log.
-        nursery: The command that starts the process which workers fork from.
+    `observers` are told of every call, besides the metrics and the log.
 
     Raises:
         InvalidSettings: A certificate or a token cannot be used.

@@ -115,9 +115,7 @@ class Settings(BaseModel):
 def load_settings(config: Path | None = None, **given: object) -> Settings:
     """Settings from defaults, a TOML file, the environment and arguments, the latter winning.
 
-    Args:
-        config: The file; None: the one EDGEGRASP_CONFIG names, if it does.
-        given: Settings by name.
+    Without `config`, the file is the one EDGEGRASP_CONFIG names, if it does.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.
@@ -180,11 +178,7 @@ def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str
     name = str(first["loc"][0])
     origin = next(source for source, fields in sources.items() if name in fields)
     if first["type"] == "extra_forbidden":
-        return f"{one_line(name)}: no such setting. It comes from {origin}."
+        name = "".join(letter if letter.isprintable() else "?" for letter in name)
+        return f"{name}: no such setting. It comes from {origin}."
     path = ".".join(str(part) for part in first["loc"])
     return f"{path}: got {first['input']!r}. {message}. It comes from {origin}."
-
-
-def one_line(text: str) -> str:
-    """A text from outside as it may stand in a message."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)

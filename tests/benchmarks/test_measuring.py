@@ -1,7 +1,11 @@
 """The arithmetic of the measurements."""
 
+from dataclasses import replace
+
 import pytest
 from benchmarks import load, soak
+
+from edgegrasp_client import DeadlineError, Detection, InvalidRequestError
 
 
 def test_load_tells_answers_from_refusals_and_the_server_from_the_detector() -> None:
@@ -19,15 +23,14 @@ def test_a_soak_finds_faults() -> None:
     assert soak.slope(memory, 10_000) == pytest.approx(2.0)
     warm = [(done, 100.0 + min(done, 1500) / 100) for done in range(0, 10_001, 100)]
     assert soak.slope(warm, 10_000) == pytest.approx(0.0, abs=1e-6)
-    good = {"wrong": [], "stuck_clients": 0, "outcomes": {}, "exit_code": 0, "requests": 10_000}
+    good = {"wrong": [], "outcomes": {"": 10_000}, "exit_code": 0, "requests": 10_000}
     good["memory_slope_mb_per_1000"] = 0.1
     assert soak.faults(good) == []
     for change in (
         {"memory_slope_mb_per_1000": 2.0},
         {"exit_code": -9},
         {"wrong": [{}]},
-        {"stuck_clients": 1},
-        {"outcomes": {"rest good: no answer in time": 1}},
+        {"outcomes": {"": 9_999}},
     ):
         assert len(soak.faults(good | change)) == 1
 
@@ -35,7 +38,8 @@ def test_a_soak_finds_faults() -> None:
 def test_an_answer_to_another_cloud_is_noticed() -> None:
     plan = soak.Plan(3, "good", 50, 0.0, seed=0)
     digest = soak.zlib.crc32(plan.points().tobytes())
-    assert soak.outcome(plan, "OK", digest) == soak.ANSWERED
-    assert soak.outcome(plan, "OK", digest ^ 1) == soak.CROSSED
-    assert soak.outcome(plan, "INVALID_ARGUMENT", None) == soak.REFUSED
-    assert soak.outcome(plan, "UNAVAILABLE", None) == "UNAVAILABLE"
+    answer = Detection([], {"crc32": digest}, {}, "", [], None, None, plan.points()[0], [])
+    assert soak.outcome(plan, answer) == soak.ANSWERED
+    assert soak.outcome(plan, replace(answer, counts={"crc32": digest ^ 1})) == soak.CROSSED
+    assert soak.outcome(plan, InvalidRequestError("")) == soak.REFUSED
+    assert soak.outcome(plan, DeadlineError("")) == "DeadlineError"

@@ -1,17 +1,19 @@
 """One API, either transport, synchronous or not: the same values and the same exceptions."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
-import grpc
 import numpy as np
+import pytest
 
 import edgegrasp_client
 from edgegrasp_client import (
     AsyncGraspClient,
     Detection,
     GraspClient,
+    InvalidRequestError,
 )
 
 
@@ -108,18 +110,11 @@ def test_none_is_the_default_but_for_suppression(client, cloud) -> None:
     assert_same(client.detect(cloud, **options), client.detect(cloud))
 
 
-def test_models_and_readiness(either_client) -> None:
-    (model,) = either_client.models()
+def test_models_and_readiness(client) -> None:
+    (model,) = client.models()
     assert (model.name, model.default, model.gripper) == ("dummy", True, "panda")
-    assert either_client.ready()
-    either_client.wait_until_ready(5)
-
-
-def test_injected_channel_stays_open(dummy_server, cloud) -> None:
-    with grpc.insecure_channel(dummy_server.grpc_address) as channel:
-        for _ in range(2):
-            with GraspClient(channel=channel) as client:
-                assert client.detect(cloud).grasps
+    assert client.ready()
+    client.wait_until_ready(5)
 
 
 async def test_async_context_manager(dummy_server, cloud) -> None:
@@ -132,3 +127,20 @@ async def test_async_context_manager(dummy_server, cloud) -> None:
         with GraspClient(address) as sync:
             for seed, detection in enumerate(detections):
                 assert_same(detection, sync.detect(cloud, seed=seed))
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # of several threads
+def test_a_forked_process_asks_over_rest_alone(dummy_server, cloud) -> None:
+    with GraspClient(dummy_server.grpc_address) as client:
+        assert client.detect(cloud).grasps
+        child = os.fork()
+        if child == 0:
+            with GraspClient(dummy_server.http_url) as of_child:
+                found = bool(of_child.detect(cloud).grasps)
+            try:
+                GraspClient(dummy_server.grpc_address)
+            except InvalidRequestError:
+                os._exit(0 if found else 2)
+            os._exit(1)
+        assert os.waitpid(child, 0)[1] == 0
+        assert client.detect(cloud).grasps

@@ -253,7 +253,7 @@ def test_deadline(transport: str, slow_server, make_client, cloud) -> None:
 
 
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
-def test_too_large(size: int, either_client) -> None:
+def test_too_large(size: int, client) -> None:
     with pytest.raises(PayloadTooLargeError):
-        either_client.detect(np.zeros((size, 3), np.float32))
-    assert either_client.ready()
+        client.detect(np.zeros((size, 3), np.float32))
+    assert client.ready()

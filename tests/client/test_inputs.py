@@ -96,9 +96,9 @@ def test_files_of_depths(client, tmp_path) -> None:
         np.testing.assert_allclose(contacts(client.detect(depth_images=[image])), expected)
 
 
-def test_edges_are_scored_in_their_order(either_client, cloud) -> None:
+def test_edges_are_scored_in_their_order(client, cloud) -> None:
     edges = np.array([[0, 1], [7, 7], [499, 3]])
-    scoring = either_client.score(cloud, edges=edges, seed=2, collision={"mode": "ignore"})
+    scoring = client.score(cloud, edges=edges, seed=2, collision={"mode": "ignore"})
     assert [evaluation.reason for evaluation in scoring.evaluations] == [None, "too-short", None]
     first, none, last = (evaluation.grasp for evaluation in scoring.evaluations)
     assert none is None

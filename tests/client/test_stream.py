@@ -14,25 +14,25 @@ from edgegrasp_client import (
 )
 
 
-def test_answers_are_those_of_single_requests(either_client, cloud) -> None:
+def test_answers_are_those_of_single_requests(client, cloud) -> None:
     requests = [StreamRequest(cloud, seed=seed, top_k=3) for seed in range(6)]
-    answers = either_client.detect_stream(requests)
+    answers = client.detect_stream(requests)
     for seed, answer in enumerate(answers):
         assert answer.request_id == str(seed)
-        alone = either_client.detect(cloud, seed=seed, top_k=3)
+        alone = client.detect(cloud, seed=seed, top_k=3)
         found = answer.result()
         assert [grasp.score for grasp in found.grasps] == [grasp.score for grasp in alone.grasps]
         assert found.counts == alone.counts
 
 
-def test_errors_are_answers(either_client, cloud) -> None:
+def test_errors_are_answers(client, cloud) -> None:
     requests = [
         StreamRequest(cloud, request_id="fine"),
         StreamRequest(cloud[:0], request_id="empty"),
         StreamRequest(cloud, request_id="model", model="none of mine"),
         StreamRequest(cloud, request_id="fine again"),
     ]
-    answers = list(either_client.detect_stream(requests))
+    answers = list(client.detect_stream(requests))
     assert [answer.request_id for answer in answers] == ["fine", "empty", "model", "fine again"]
     kinds = [None if answer.error is None else type(answer.error) for answer in answers]
     assert kinds == [None, InvalidRequestError, UnknownModelError, None]
@@ -41,10 +41,10 @@ def test_errors_are_answers(either_client, cloud) -> None:
         answers[2].result()
 
 
-def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(either_client, cloud) -> None:
+def test_what_cannot_be_sent_ends_the_stream_after_what_went_before(client, cloud) -> None:
     requests = [StreamRequest(cloud), StreamRequest("nowhere.ply"), StreamRequest(cloud)]
     with pytest.raises(InvalidRequestError, match="nowhere"):
-        list(either_client.detect_stream(requests))
+        list(client.detect_stream(requests))
     with pytest.raises(InvalidRequestError, match="Give a cloud"):
         StreamRequest()
 

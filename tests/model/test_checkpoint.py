@@ -3,7 +3,7 @@
 import hashlib
 import json
 import pickle
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +106,15 @@ def test_a_missing_a_pickled_and_a_foreign_file_are_refused(tmp_path: Path) -> N
     [
         ({"format": 2}, "format: got 2"),
         ({"format": None}, "format"),
-        ({"network": {"architecture": "gpd"}}, "architecture: got .*gpd"),
-        ({"network": CONFIG.to_dict() | {"dropout": 0.1}}, "dropout"),
+        ({"network": {"architecture": "gpd"}}, "architecture.*gpd"),
+        ({"network": asdict(CONFIG) | {"dropout": 0.1}}, "dropout"),
         ({"network": {"architecture": "hand"}}, r"hand_widths: got \(\)"),
         ({"network": None}, "network"),
         ({"network": [1]}, "metadata"),
-        ({"network": replace(CONFIG, classifier_widths=(24, 20)).to_dict()}, r"classifier\.0"),
+        ({"network": asdict(replace(CONFIG, classifier_widths=(24, 20)))}, r"classifier\.0"),
         ({"voxel_size": None}, "voxel_size"),
-        ({"voxel_size": 4.5}, "voxel_size: got 4.5"),
-        ({"temperature": 0.0}, "temperature: got 0.0"),
+        ({"voxel_size": 4.5}, "voxel_size.*4.5"),
+        ({"temperature": 0.0}, "temperature.*0.0"),
         ({"colour": "red"}, "colour"),
     ],
 )

@@ -95,7 +95,7 @@ def example(kind: str) -> Exception:
         return UnknownModel("wanted", ["a", "b"])
     if found is Overloaded:
         return Overloaded("What happened.", 7.0)
-    if issubclass(found, InvalidRequest | errors._FieldError):
+    if issubclass(found, InvalidRequest):
         return found("cloud", "a value", "Fix it.")
     return found("What happened.")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks.dummy import DummyCatalogue
 
-from edgegrasp_service.recording import replay
+from edgegrasp_cli.replay import answer_again
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
 
@@ -31,14 +31,14 @@ async def test_recorded_requests_are_replayed(
     fine, bad = sorted((tmp_path / "recorded").glob("*.job"))
     settings = Settings()
     monkeypatch.setattr(answer, "load_catalogue", lambda settings: DummyCatalogue())
-    _, recorded, again = replay(fine, settings)
+    _, recorded, again = answer_again(fine, settings)
     assert again.error is None
     assert again.facts.grasps == 10
     assert len(again.body) > 1000
     if client.name == "rest":  # a map of protobuf has no order
         cut = recorded.body.index(b'"seconds"')
         assert again.body[:cut] == recorded.body[:cut]
-    assert replay(bad, settings)[-1].error.kind == "invalid-request"
+    assert answer_again(bad, settings)[-1].error.kind == "invalid-request"
 
 
 async def test_the_oldest_are_deleted(serve, cloud, tmp_path: Path) -> None:

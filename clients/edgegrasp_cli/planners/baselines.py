@@ -127,16 +127,11 @@ class PaperCandidates:
     at the published code's seven points of the hand. Outliers are dropped and normals estimated in
     the dense cloud, approach points sampled farthest from each other in the voxelised one. No
     constraint depends on which way a normal points.
-
-    Attributes:
-        num_approach_points: approach points sampled.
-        num_candidates: candidates kept at most.
-        voxel_size: metres.
     """
 
     num_approach_points: int
-    num_candidates: int
-    voxel_size: float
+    num_candidates: int  # at most
+    voxel_size: float  # metres
 
     def __call__(self, observation: Observation, rng: np.random.Generator) -> Float32:
         """Poses `T_world_hand` of random candidates, in random order: (E, 4, 4)."""
@@ -157,11 +152,7 @@ class PaperCandidates:
 class OwnCandidates:
     """Draws the candidates that our own pipeline would score: collision-free, top-down ones too.
 
-    Attributes:
-        rules: of the protocol.
-        options: of each request, besides the protocol's.
-        weights: files or folders besides those that ship; they decide only how clouds are prepared.
-        model: of them; empty: the default.
+    The weights decide only how clouds are prepared.
     """
 
     rules: PlanningRules
@@ -227,10 +218,6 @@ def paper_grasps(
 
 def clean_cloud(points: Float32, voxel_size: float) -> Cloud | None:
     """Outliers dropped, normals estimated, then voxels; None where too few points are left.
-
-    Args:
-        points: (N, 3) dense cloud above the table, metres.
-        voxel_size: metres.
 
     Returns:
         The mean of the points and normals in each voxel; normals are of either sign.

@@ -25,28 +25,17 @@ SAMPLING = ("num_approach_points", "num_candidates")  # options that planners wi
 
 @dataclass(frozen=True)
 class PlannerChoice:
-    """A planner as the command line names it.
+    """A planner as the command line names it."""
 
-    Attributes:
-        name: `server`, `in-process`, `edge-sample`, `oracle`, `oracle-own`, an installed one, or
-            `module:callable`.
-        model: weights by name, or a `.safetensors` file; empty: the default.
-        weights: files or folders besides those that ship.
-        server: `host:port` or `http://host:port`; None: one is started.
-        connection: keyword arguments of `connect`.
-        options: of each request, in place of the protocol's.
-        voxel_size: metres, in place of the weights' own; `in-process` only.
-        flipped_normals: share of the normals turned around at random; `in-process` only.
-    """
-
-    name: str
-    model: str = ""
-    weights: tuple[Path, ...] = ()
-    server: str | None = None
-    connection: dict[str, Any] = field(default_factory=dict)
+    name: str  # one of SHIPPED, an installed one, or `module:callable`
+    model: str = ""  # weights by name, or a `.safetensors` file; empty: the default
+    weights: tuple[Path, ...] = ()  # files or folders besides those that ship
+    server: str | None = None  # `host:port` or `http://host:port`; None: one is started
+    connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
+    # Of each request, in place of the protocol's.
     options: dict[str, Any] = field(default_factory=dict)
-    voxel_size: float | None = None
-    flipped_normals: float = 0.0
+    voxel_size: float | None = None  # metres, in place of the weights' own; `in-process` only
+    flipped_normals: float = 0.0  # share turned around at random; `in-process` only
 
     def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
         """The weights to load, and the name to ask for.
@@ -64,15 +53,10 @@ class PlannerChoice:
 
 @dataclass(frozen=True)
 class ChosenPlanner:
-    """How to make a planner, and what it is.
+    """How to make a planner, and what it is."""
 
-    Attributes:
-        make: makes the planner in the process that uses it; can be sent to another.
-        facts: for the manifest.
-    """
-
-    make: Callable[[], Planner]
-    facts: dict[str, Any]
+    make: Callable[[], Planner]  # in the process that uses it; can be sent to another
+    facts: dict[str, Any]  # for the manifest
 
     @property
     def title(self) -> str:

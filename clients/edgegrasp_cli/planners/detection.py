@@ -1,7 +1,7 @@
 """Planners that ask a detector, on a server or in this process, and which grasp they take."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,34 +35,20 @@ NEARBY_WORTH, SAME_GRIP_WORTH = 0.8, 0.6  # factors on the score
 MAX_DEPTH_ERROR = 0.12  # of views that show the table; more than any protocol's noise
 
 
+@dataclass
 class ServerPlanner:
     """Asks a server for the best grasp of each observation.
 
     A server that went away may come back at the same address: the connection is made anew, and
     its weights must be the same as before.
-
-    Args:
-        address: host:port (gRPC) or http://host:port.
-        rules: of the protocol.
-        options: of each request, besides the protocol's.
-        digest: of the weights that the server has to answer with.
-        connection: keyword arguments of `connect`.
     """
 
-    def __init__(
-        self,
-        address: str,
-        rules: PlanningRules,
-        options: Mapping[str, Any],
-        digest: str,
-        connection: Mapping[str, Any],
-    ) -> None:
-        self._address = address
-        self._rules = rules
-        self._options = options
-        self._digest = digest
-        self._connection = connection
-        self._client: GraspClient | None = None
+    address: str  # host:port (gRPC) or http://host:port
+    rules: PlanningRules  # of the protocol
+    options: Mapping[str, Any]  # of each request, besides the protocol's
+    digest: str  # of the weights that the server has to answer with
+    connection: Mapping[str, Any]  # keyword arguments of `connect`
+    _client: GraspClient | None = field(default=None, init=False)
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The server's best grasp; None where it finds none.
@@ -71,7 +57,7 @@ class ServerPlanner:
             PlannerUnavailableError: no answer; asking again may help.
             GraspClientError: the server refuses the request, or has other weights than before.
         """
-        options = request_options(observation, seed, self._rules, self._options)
+        options = request_options(observation, seed, self.rules, self.options)
         try:
             client = self._connected()
             detection: Detection = client.detect(
@@ -79,8 +65,8 @@ class ServerPlanner:
             )
         except (ServerUnavailableError, DeadlineError) as error:
             self.close()
-            raise PlannerUnavailableError(f"{self._address}: {error}") from None
-        return _planned(detection.grasps, self._rules, observation)
+            raise PlannerUnavailableError(f"{self.address}: {error}") from None
+        return _planned(detection.grasps, self.rules, observation)
 
     def close(self) -> None:
         """Close the connection; the next request opens it anew."""
@@ -91,12 +77,12 @@ class ServerPlanner:
     def _connected(self) -> GraspClient:
         if self._client is None:
             # The benchmark asks again itself, for longer, and counts it.
-            self._client = connect(self._address, REQUEST_SECONDS, False, **self._connection)
-            used = model_used(self._client, self._options.get("model", ""))
-            if used.digest != self._digest:
+            self._client = connect(self.address, REQUEST_SECONDS, False, **self.connection)
+            used = model_used(self._client, self.options.get("model", ""))
+            if used.digest != self.digest:
                 raise GraspClientError(
-                    f"{self._address} now has other weights for {used.name} (digest "
-                    f"{used.digest[:12]}, not {self._digest[:12]}); restart it with those "
+                    f"{self.address} now has other weights for {used.name} (digest "
+                    f"{used.digest[:12]}, not {self.digest[:12]}); restart it with those "
                     "the benchmark began with"
                 )
         return self._client
@@ -105,13 +91,8 @@ class ServerPlanner:
 class InProcessPlanner:
     """Takes the best grasp of a detector in this process.
 
-    Args:
-        weights: files or folders besides those that ship.
-        model: weights to use; empty: the default.
-        rules: of the protocol.
-        options: of each request, besides the protocol's.
-        voxel_size: metres, in place of what the weights were trained on.
-        flipped_normals: share of the processed cloud's normals to turn around at random.
+    A voxel size, metres, takes the place of what the weights were trained on; a share of the
+    normals is turned around at random.
 
     Raises:
         EdgeGraspError: the weights cannot be loaded.

@@ -1,8 +1,8 @@
 """The batch that the ball networks score: the neighbourhoods of the approach points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -24,12 +24,6 @@ def nearest_in_ball(
 
     The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
     row fills the rest, which changes no maximum over neighbours.
-
-    Args:
-        points: The cloud (N, 3), metres.
-        approach_index: Rows (A,) of `points`, as given to `crop_balls`.
-        crop: P ball points.
-        k: Neighbours per point, itself included.
 
     Returns:
         (P, k) rows of `crop.ball_rows`, nearest (the point itself) first.
@@ -72,15 +66,7 @@ class BallBatch:
     ) -> Self:
         """Packs a cloud and its balls.
 
-        Args:
-            points: The cloud (N, 3), metres.
-            normals: Its normals (N, 3).
-            approach_index: Rows (A,) of `points`, as given to `crop_balls`.
-            crop: The balls.
-            contact: Rows (E,) of `crop.ball_rows`, not of the cloud: a contact has a ball.
-            approach: Outward approach directions (E, 3), unit length.
-            depth: Depths (E,), metres.
-            k: Neighbours per point, itself included.
+        Contacts are rows of the crop, not of the cloud: a contact has a ball.
         """
         centre = points[approach_index][crop.ball_of_point]
         return cls(
@@ -146,16 +132,9 @@ class BallBatch:
 
     def to(self, device: torch.device | str) -> "BallBatch":
         """Moves every tensor to a device."""
-        return BallBatch(
-            points=self.points.to(device),
-            normals=self.normals.to(device),
-            neighbors=self.neighbors.to(device),
-            ball_of_point=self.ball_of_point.to(device),
-            num_balls=self.num_balls,
-            contact=self.contact.to(device),
-            approach=self.approach.to(device),
-            depth=self.depth.to(device),
-        )
+        parts = vars(self).items()
+        tensors: dict[str, Any] = {name: part for name, part in parts if isinstance(part, Tensor)}
+        return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
 
 def _float_tensor(array: NDArray[np.floating]) -> Tensor:

@@ -45,7 +45,6 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
     tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
     values = asdict(metadata) | {
         "format": _FORMAT,
-        "network": metadata.network.to_dict(),
         "tensors_digest": _digest(tensors),
         "reference_logits": [round(logit, 4) for logit in reference_logits(network)],
     }
@@ -149,7 +148,6 @@ def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
         written = values.pop("format")
         if written != _FORMAT:
             raise ValueError(f"format: got {written!r}. This version reads {_FORMAT}.")
-        values["network"] = NetworkConfig.from_dict(values["network"])
         return CheckpointMetadata(**values)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InvalidCheckpoint(
@@ -161,9 +159,7 @@ def _read_metadata(path: Path, text: str | None) -> CheckpointMetadata:
 def build_network(config: NetworkConfig, generator: torch.Generator | None = None) -> nn.Module:
     """Builds a network with random weights.
 
-    Args:
-        config: Its architecture and widths.
-        generator: Source of the weights; without one, those of seed 0.
+    From the generator, or without one from seed 0.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # The layers first initialise themselves from the global stream: leave it as it was.

@@ -56,25 +56,16 @@ class HandBatch:
         cloud: Cloud,
         candidates: Candidates,
         gripper: Gripper,
-        up: Float32,
+        up: Float32,  # (3,) away from gravity
         support: SupportPlane | None,
-        viewpoint: Float32 | None,
-        at_side: NDArray[np.bool_] | None,
+        viewpoint: Float32 | None,  # (3,) the camera, where there is one and it is known
+        at_side: NDArray[np.bool_] | None,  # (N,) cut off by a side of the workspace
         num_points: int,
         view: HandView | None = None,
     ) -> Self:
         """Look at a cloud from the hands of some candidates.
 
-        Args:
-            cloud: N points with normals.
-            candidates: E of them.
-            gripper: The hand, open to its maximum.
-            up: (3,) away from gravity.
-            support: Plane that heights are measured from, where it is known.
-            viewpoint: (3,) the camera, where there is one and it is known.
-            at_side: (N,) points where a side of the workspace cuts things off.
-            num_points: P.
-            view: `hand_views` of the same candidates, where the caller has it already.
+        The gripper is open to its maximum; heights are measured from the support.
         """
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
@@ -89,11 +80,8 @@ class HandBatch:
     @staticmethod
     def concatenate(batches: Sequence["HandBatch"]) -> "HandBatch":
         """Join batches into one, as training does; scores come out in the same order."""
-        return HandBatch(
-            torch.cat([batch.description for batch in batches]),
-            torch.cat([batch.points for batch in batches]),
-            torch.cat([batch.point_count for batch in batches]),
-        )
+        parts = zip(*(vars(batch).values() for batch in batches), strict=True)
+        return HandBatch(*map(torch.cat, parts))
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
@@ -110,11 +98,7 @@ class HandBatch:
 
     def to(self, device: torch.device | str) -> "HandBatch":
         """Moves every tensor to a device."""
-        return HandBatch(
-            self.description.to(device),
-            self.points.to(device),
-            self.point_count.to(device),
-        )
+        return HandBatch(*(tensor.to(device) for tensor in vars(self).values()))
 
 
 def hand_batch(

@@ -71,11 +71,8 @@ def import_checkpoint(
 ) -> tuple[nn.Module, CheckpointMetadata]:
     """Reads a checkpoint in the authors' layout; a VN network where there is a `std` file.
 
-    Args:
-        directory: Holds the files of one checkpoint number N.
-        voxel_size: Of the clouds to give it, metres; by default that of the authors' evaluation.
-        crop_radius: Ball radius, metres; likewise.
-        gripper: Name of the gripper it was trained for.
+    The folder holds the files of one checkpoint number N. Voxel size and crop radius, metres, are
+    by default those of the authors' evaluation.
 
     Returns:
         The network in evaluation mode and its metadata, ready for `save_checkpoint`.

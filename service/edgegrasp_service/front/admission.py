@@ -14,11 +14,7 @@ MARGIN = 1.5  # the wait is told from a median; half of the requests take longer
 
 
 class Ticket:
-    """The right of one request to be in the server.
-
-    Args:
-        client: Who asks; see `Admission.admit`.
-    """
+    """The right of one request to be in the server."""
 
     def __init__(self, client: str) -> None:
         self.client = client

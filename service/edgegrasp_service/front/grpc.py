@@ -77,11 +77,6 @@ class GrpcServer:
 
     Must be made in the running event loop.
 
-    Args:
-        service: What answers.
-        reloader: What reloads.
-        credentials: For TLS; None: without.
-
     Raises:
         AddressInUse: The port cannot be bound.
     """
@@ -348,13 +343,7 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
     A request is read only when fewer than `max_stream_requests` are unanswered; what the client
     sends beyond that stays with it. Where this is closed early, what is under way is cancelled.
 
-    Args:
-        service: What answers.
-        stream: The call of the stream itself.
-        context: Of gRPC; read from.
-
-    Yields:
-        Serialized DetectGraspsStreamResponses.
+    Gives serialized DetectGraspsStreamResponses.
 
     Raises:
         NotReady: The server is stopping; what was read is answered before.

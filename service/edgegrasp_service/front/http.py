@@ -113,13 +113,7 @@ class HttpMiddleware:
 
 
 def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> FastAPI:
-    """The application, without its middleware.
-
-    Args:
-        service: What answers.
-        metrics: What /metrics shows.
-        reloader: What reloads.
-    """
+    """The application, without its middleware."""
     settings = service.settings
     app: FastAPI = FastAPIOffline(
         title="EdgeGrasp", redoc_url=None, static_url=ASSETS, redirect_slashes=False

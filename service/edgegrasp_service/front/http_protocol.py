@@ -16,12 +16,7 @@ MANY_PIECES, SMALL_PIECE = 1024, 16  # so many chunks of so few bytes are no bod
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Ends connections whose headers do not arrive, and bodies in crumbs; closes gently.
-
-    Args:
-        settings: `max_connections`, `max_header_bytes` and `read_seconds` are used.
-        arguments: Of uvicorn's protocol.
-    """
+    """Ends connections whose headers do not arrive, and bodies in crumbs; closes gently."""
 
     def __init__(self, settings: Settings, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -133,10 +128,6 @@ class _GentleTransport:
     """A transport whose `close` lets the client read its answer, but not hold the connection.
 
     A socket that is closed while bytes arrive is reset, and an answer on its way may be lost.
-
-    Args:
-        transport: What it stands for.
-        receiving: Whether the client is still sending its request.
     """
 
     def __init__(self, transport: asyncio.Transport, receiving: Callable[[], bool]) -> None:

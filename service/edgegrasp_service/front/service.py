@@ -41,13 +41,6 @@ Recorder = Callable[[Job, Answer], None]
 class GraspService:
     """The front without a transport.
 
-    Args:
-        settings: Its bounds.
-        pool: The workers.
-        tokens: Who may ask.
-        observers: Told of every call when it has ended.
-        record: Told of every job and its answer.
-
     Attributes:
         tokens: Replaced when they are read anew.
         stopping: Set: new requests are refused.
@@ -226,13 +219,7 @@ class GraspService:
 
 
 class Reloader:
-    """Reloads weights, tokens and certificates of one server; the old ones serve meanwhile.
-
-    Args:
-        service: Whose weights and tokens are replaced.
-        tls: Whose certificates are read anew; None: there are none.
-        reloaded: Told of each reload whether it succeeded.
-    """
+    """Reloads weights, tokens and certificates of one server; the old ones serve meanwhile."""
 
     def __init__(
         self, service: GraspService, tls: ServerTls | None, reloaded: Callable[[bool], None]
@@ -258,11 +245,7 @@ class Reloader:
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
         """Load anew.
 
-        Args:
-            call: Of who asks; None: the process itself.
-
-        Returns:
-            What is loaded now.
+        Returns what is loaded now.
 
         Raises:
             PermissionDenied: Who asks has no admin token.

@@ -48,11 +48,6 @@ FILE_FORMATS = tuple(FIXES)
 def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
     """Read a point cloud file.
 
-    Args:
-        file_format: One of FILE_FORMATS.
-        data: The file's bytes.
-        max_points: Most points accepted.
-
     Returns:
         The arrays in the file, of whatever shape and dtype, in native byte order; points (N, 3)
         for ply and xyz, (N, 3) or (H, W, 3) for pcd.
@@ -94,10 +89,7 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
 def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
     """Read an .npy file.
 
-    Args:
-        data: The file's bytes.
-        max_points: Most points accepted, where a row, or a pixel, is one point.
-        field: What the file is in the request.
+    A row, or a pixel, counts as one point; `field` is what the file is in the request.
 
     Returns:
         The array in it, of whatever shape and dtype, in native byte order.
@@ -160,11 +152,6 @@ def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) 
 
 def read_png(data: bytes, max_points: int, field: str) -> Array:
     """Read an image.
-
-    Args:
-        data: The file's bytes.
-        max_points: Most pixels accepted.
-        field: What the file is in the request.
 
     Returns:
         (H, W) bool, uint8 or uint16, or (H, W, C) uint8 of C channels.

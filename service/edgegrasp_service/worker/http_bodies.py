@@ -105,10 +105,6 @@ def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) ->
 def read_json(field: str, text: bytes) -> Any:
     """What a text says, within the memory that a request of its size is worth.
 
-    Args:
-        field: What it is in the request.
-        text: UTF-8.
-
     Raises:
         InvalidRequest: It is no JSON, has a key twice, or would take far more memory than points
             of its size do.

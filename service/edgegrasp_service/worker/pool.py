@@ -33,11 +33,6 @@ logger = logging.getLogger(__name__)
 class WorkerPool:
     """Runs each job in a worker process of its own.
 
-    Args:
-        settings: How many workers, and what they load.
-        nursery: The command of the process which they fork from; the settings are added to it.
-        replaced: Called for each worker that dies and is replaced.
-
     Attributes:
         models: Facts of the loaded weights; empty before `start`.
     """

@@ -30,9 +30,7 @@ LOST = "The worker of this request died or ran out of memory. Try again, or send
 def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
     """Load, then fork a worker for each socket that comes on standard input, until its end.
 
-    Args:
-        told: The settings, as JSON.
-        load: Makes the catalogue; None: `load_catalogue`.
+    `told` is the settings, as JSON; `load` makes the catalogue, in the place of `load_catalogue`.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end

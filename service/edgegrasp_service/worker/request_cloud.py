@@ -69,10 +69,7 @@ def decode_cloud(
 ) -> tuple[CloudInput, DetectOptions]:
     """Decode the cloud of a request and the arrays beside it.
 
-    Args:
-        fields: Those of the request; one of SOURCES, any of PER_POINT.
-        options: Those of the request.
-        max_points: Most points accepted.
+    `fields` has one of SOURCES, and any of PER_POINT.
 
     Returns:
         The cloud; and the options, in which the cameras of depth images are the viewpoints.
@@ -272,10 +269,6 @@ POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
     """Read x, y, z of a cloud, and normals and colours where there are any.
 
-    Args:
-        fields: As PointCloud2; `data` as bytes or base64.
-        max_points: Most points accepted.
-
     Returns:
         Points (N, 3), or (H, W, 3) where the height is 2 or more.
 
@@ -332,9 +325,7 @@ DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
 def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
     """Read views, and fuse them; as `edgegrasp_model.scene.depth` says.
 
-    Args:
-        images: A list of DepthImage, as plain values; their `depth` may also be a File.
-        max_points: Most pixels accepted, of all images together.
+    `images` is a list of DepthImage, as plain values; their `depth` may also be a File.
 
     Raises:
         InvalidRequest: A field is missing, unknown or wrong.
