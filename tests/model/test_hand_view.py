@@ -168,7 +168,7 @@ def test_an_older_network_reads_the_numbers_that_it_knows() -> None:
     batch, older = look(*scene(2)), replace(HAND, description_size=61)
     fewer = replace(batch, description=batch.description[:, :61].contiguous())
     assert torch.equal(scores(batch, older), scores(fewer, older))
-    with pytest.raises(ValueError, match="description_size: got 500"):
+    with pytest.raises(ValueError, match="description_size"):
         replace(HAND, description_size=500)
 
 
