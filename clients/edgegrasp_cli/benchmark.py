@@ -35,6 +35,10 @@ Objects = Annotated[
 Engine = Annotated[
     str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
 ]
+Hand = Annotated[
+    str | None,
+    Option("--gripper", help="Hand to grasp with: a gripper's name or .toml file; else the Panda."),
+]
 Split = Annotated[str, Option(help="Which of its objects: test or train.")]
 Workers = Annotated[int | None, Option(help="Processes; else one for each core. Same results.")]
 Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
@@ -63,6 +67,7 @@ def benchmark(
     objects: Objects = None,
     split: Split = "test",
     engine: Engine = None,
+    gripper: Hand = None,
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
@@ -93,6 +98,7 @@ def benchmark(
     Options of the detection are the protocol's, with collision penalise, unless a flag is given.
     """
     from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
@@ -103,13 +109,16 @@ def benchmark(
         rules = load_protocol(protocol)
         chosen = choose_engine(engine, rules.engine)
         print(chosen)
+        # The Panda's hand has shapes of its own.
+        hand = gripper_fields(gripper) if gripper not in (None, "panda") else None
+        asked = parse_option_flags(options)
         choice = PlannerChoice(
             planner,
             model,
             tuple(path.resolve() for path in weights or ()),
             server,
             connection,
-            parse_option_flags(options),
+            asked if hand is None else asked | {"gripper": hand},
         )
         config = BenchmarkConfig(
             SceneKind(scene),
@@ -120,6 +129,7 @@ def benchmark(
             split,
             patience,
             chosen.name,
+            hand,
         )
         own_server = planner == "server" and server is None
         if ray not in (None, "local") and own_server:
@@ -256,7 +266,7 @@ def _progress(
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from rich.console import Console
 
-    from edgegrasp_sim.results import over_seeds, percent
+    from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
     gsr, dr = (
@@ -269,6 +279,13 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
+    wide = summary["too_wide"]
+    if wide["objects"]:
+        gsr, dr = (percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
+        console.print(
+            f"{wide['objects']} objects are wider than the hand opens; of the others: "
+            f"GSR {gsr} %, DR {dr} %"
+        )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")
     if summary["planner_retries"]:

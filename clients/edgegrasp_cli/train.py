@@ -32,6 +32,10 @@ def generate_data(
         Option(help="Network that chooses half of the grasps: its best, and its least certain."),
     ] = None,
     engine: Engine = None,
+    gripper: Annotated[
+        str,
+        Option(help="Hand that tries them: a gripper's name or .toml file; random: one a scene."),
+    ] = "panda",
     workers: Workers = None,
     ray: Ray = None,
 ) -> None:
@@ -52,7 +56,7 @@ def generate_data(
     # Paths as other machines have them.
     weights, objects = weights and weights.resolve(), objects and objects.resolve()
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name
+        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name, gripper
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0

@@ -48,6 +48,7 @@ class BenchmarkConfig:
         split: of that folder.
         patience: seconds to keep asking a planner that is unavailable.
         engine: to simulate with; by default see `choose_engine`, with the protocol's.
+        gripper: the fields of a gripper file; by default the Panda's hand.
     """
 
     scene: SceneKind
@@ -58,6 +59,7 @@ class BenchmarkConfig:
     split: str = "test"
     patience: float = PATIENCE
     engine: str = ""
+    gripper: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -135,6 +137,8 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         planner: how grasps are planned: its name, the weights' name and digest, options.
     """
     drawn = config.object_set()
+    # Named where it is not the Panda's, so that earlier results can be resumed.
+    hand = {} if config.gripper is None else {"gripper": config.gripper}
     return {
         "run": {
             "scene": config.scene.value,
@@ -143,6 +147,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
             "planner": planner,
             "engine": config.engine,
             "constants": constants(config.engine),
+            **hand,
         },
         "rounds": config.rounds,
         "seeds": list(config.seeds),
@@ -182,7 +187,9 @@ class RoundRunner:
         objects.check_same(digest)
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: objects}, engine=config.engine)
+        self.simulation = ClutterSimulation(
+            {config.scene: objects}, engine=config.engine, gripper=config.gripper
+        )
 
     def __call__(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
