@@ -42,11 +42,15 @@ RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["
     && /tools/bin/pip install --no-deps open3d-cpu \
     && find /venv -name draw_plotly.py -exec sh -c \
         'echo "get_plotly_fig = draw_plotly = draw_plotly_server = None" > "$0"' {} \; \
-    && find /venv -type d \( -name tests -o -path '*/torch/include' -o -path '*/torch/test' \
-        -o -path '*/torch/_inductor' -o -path '*/open3d/_ml3d' -o -path '*/open3d/examples' \
-        -o -path '*/open3d/resources' \) -prune -exec rm -r {} + \
-    && find /venv \( -path '*/torch/bin/*[tT]est*' -o -path '*/torch/bin/protoc*' \
-        -o -name 'open3d_t*_ops.so' \) -delete \
+    && find /venv -regextype posix-extended -type d -regex ".*/(tests|numba/cuda|numpy/distutils|torchgen/packaged\
+|open3d/(_ml3d|agent_skills|examples|labextension|nbextension|resources)\
+|scipy/(cluster|datasets|differentiate|fft|fftpack|integrate|interpolate|io|odr|optimize|signal|stats)\
+|torch/(_dynamo|_inductor|include|onnx|share|test|testing/_internal/[a-z]+))" -prune -exec rm -r {} + \
+    && find /venv -regextype posix-extended -type f -regex ".*(\.(a|c|cmake|cpp|h|hpp|pxd|pyi|pyx)\
+|/torch/bin/.*([tT]est|protoc).*|/torch/lib/.*(test|custom_ops|with_compiler)\.so\
+|/torch/testing/_internal/common_[^d]*\.py\
+|/open3d_t.*_ops\.so|/(_avif|libavif).*\.so.*)" -delete \
+    && find /venv -path '*/pygments/lexers/[!_]*' -not -name python.py -delete \
     && find /venv -name '*.so' -not -path '*.libs/*' -exec strip --strip-unneeded {} +
 
 COPY LICENSE README.md ./

@@ -39,6 +39,7 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
+	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose*.yaml
 	mkdir -p build
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done

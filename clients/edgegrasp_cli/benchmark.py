@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from edgegrasp_sim.trial import Round
 
 Option = typer.Option
-MAX_RAY_WORKERS = 1024  # as many as the cluster has processors, but for this
 
-# Flags that `experiment` has too.
+# Flags that other commands have too.
 Seeds = Annotated[
     list[int] | None, Option("--seed", help="Seed of scenes, views and noise; may be repeated.")
 ]
@@ -36,10 +35,12 @@ Objects = Annotated[
 Engine = Annotated[
     str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
 ]
-Split = Annotated[str, Option(help="Which of its objects: test or train.")]
-Workers = Annotated[
-    int | None, Option(help="Processes that simulate; else one for each core. Same results.")
+Hand = Annotated[
+    str | None,
+    Option("--gripper", help="Hand to grasp with: a gripper's name or .toml file; else the Panda."),
 ]
+Split = Annotated[str, Option(help="Which of its objects: test or train.")]
+Workers = Annotated[int | None, Option(help="Processes; else one for each core. Same results.")]
 Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
 # Options of a detection that the simulation, the protocol or another flag decides.
 DECIDED = (
@@ -66,6 +67,7 @@ def benchmark(
     objects: Objects = None,
     split: Split = "test",
     engine: Engine = None,
+    gripper: Hand = None,
     server: Annotated[
         str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
     ] = None,
@@ -96,6 +98,7 @@ def benchmark(
     Options of the detection are the protocol's, with collision penalise, unless a flag is given.
     """
     from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
@@ -106,13 +109,16 @@ def benchmark(
         rules = load_protocol(protocol)
         chosen = choose_engine(engine, rules.engine)
         print(chosen)
+        # The Panda's hand has shapes of its own.
+        hand = gripper_fields(gripper) if gripper not in (None, "panda") else None
+        asked = parse_option_flags(options)
         choice = PlannerChoice(
             planner,
             model,
             tuple(path.resolve() for path in weights or ()),
             server,
             connection,
-            parse_option_flags(options),
+            asked if hand is None else asked | {"gripper": hand},
         )
         config = BenchmarkConfig(
             SceneKind(scene),
@@ -123,11 +129,16 @@ def benchmark(
             split,
             patience,
             chosen.name,
+            hand,
         )
         own_server = planner == "server" and server is None
-        processes = _processes(workers, ray=ray, own_server=own_server)
+        if ray not in (None, "local") and own_server:
+            raise ValueError(
+                f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
+                "--server, or --planner in-process"
+            )
         folder = ResultFolder(output) if output is not None else None
-        done, title = run_rounds(config, choice, folder, workers=processes, ray=ray)
+        done, title = run_rounds(config, choice, folder, workers=workers, ray=ray)
     summary = {
         "scene": scene,
         "engine": chosen.name,
@@ -195,8 +206,8 @@ def run_rounds(
     choice: "PlannerChoice",
     folder: "ResultFolder | None",
     *,
-    workers: int,
-    ray: str | None = None,
+    workers: int | None,
+    ray: str | None,
 ) -> "tuple[list[Round], str]":
     """Run what is left of a benchmark behind a progress bar.
 
@@ -252,28 +263,10 @@ def _progress(
         yield on_round
 
 
-def _processes(workers: int | None, *, ray: str | None, own_server: bool) -> int:
-    """How many worker processes to use.
-
-    Raises:
-        ValueError: flags that do not go together.
-    """
-    from edgegrasp_sim.benchmark import available_cores
-
-    if ray not in (None, "local") and own_server:
-        raise ValueError(
-            f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
-            "--server, or --planner in-process"
-        )
-    if workers is None:
-        return MAX_RAY_WORKERS if ray is not None else available_cores()
-    return workers
-
-
 def _print_summary(summary: dict[str, Any], planner: str) -> None:
     from rich.console import Console
 
-    from edgegrasp_sim.results import over_seeds, percent
+    from edgegrasp_sim.results import RATE_LABELS, over_seeds, percent
 
     console = Console(highlight=False, markup=False, soft_wrap=True)
     gsr, dr = (
@@ -286,6 +279,13 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         f"DR {dr} "
         f"({summary['successes']} of {summary['objects']} objects)"
     )
+    wide = summary["too_wide"]
+    if wide["objects"]:
+        gsr, dr = (percent(wide[f"{name}_of_others"]) for name in RATE_LABELS)
+        console.print(
+            f"{wide['objects']} objects are wider than the hand opens; of the others: "
+            f"GSR {gsr} %, DR {dr} %"
+        )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")
     if summary["planner_retries"]:

@@ -62,7 +62,7 @@ def experiment(
     Writes experiment.json, table.md, picture.png, and each benchmark's own folder. Where they are
     not varied there are 32 approach points and 2,000 candidates, unless flags say otherwise.
     """
-    from edgegrasp_sim.benchmark import BenchmarkConfig, available_cores
+    from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.experiments import cases_of
     from edgegrasp_sim.objects import CLUTTER, SceneKind
@@ -90,7 +90,7 @@ def experiment(
             )
             folder = ResultFolder(output / "cases" / case.name)
             finished, _ = run_rounds(
-                config, _planner(case, asked), folder, workers=workers or available_cores(), ray=ray
+                config, _planner(case, asked), folder, workers=workers, ray=ray
             )
             folder.finish(finished)
             done.append({"group": case.group, "value": case.value, **record_of(folder)})

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from edgegrasp_cli.benchmark import Engine
+from edgegrasp_cli.benchmark import Engine, Ray, Workers, interruptible
 
 Option = typer.Option
 
@@ -32,7 +32,12 @@ def generate_data(
         Option(help="Network that chooses half of the grasps: its best, and its least certain."),
     ] = None,
     engine: Engine = None,
-    workers: Annotated[int, Option(min=1, help="Processes; the data stay the same.")] = 1,
+    gripper: Annotated[
+        str,
+        Option(help="Hand that tries them: a gripper's name or .toml file; random: one a scene."),
+    ] = "panda",
+    workers: Workers = None,
+    ray: Ray = None,
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
 
@@ -48,15 +53,17 @@ def generate_data(
     kind = None if scene is None else SceneKind(scene)
     chosen = choose_engine(engine)
     print(chosen)
+    # Paths as other machines have them.
+    weights, objects = weights and weights.resolve(), objects and objects.resolve()
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name
+        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name, gripper
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0
-    for _, grasps, successes in track(
-        generate(output, objects, options, workers), "scenes", total=missing
-    ):
-        tried, held = tried + grasps, held + successes
+    with interruptible("generate-data", resumes=True):
+        made = generate(output, objects, options, workers, ray)
+        for _, grasps, successes in track(made, "scenes", total=missing):
+            tried, held = tried + grasps, held + successes
     write_data_card(output, find_views([output]), _command())
     share = f", {100 * held / tried:.1f} % held" if tried else ""
     print(f"{missing} scenes made, {scenes - missing} kept; {tried} grasps tried{share}.")

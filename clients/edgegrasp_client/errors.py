@@ -6,7 +6,7 @@ GraspClientError
       + PayloadTooLargeError    the request exceeds the server's limits
   + AccessDeniedError           no token, an unknown one, or one without the right to this
   + ServerUnavailableError      no connection, weights still loading, the server is stopping, or
-                                its worker was lost
+                                its worker or a proxy lost the request
       + OverloadedError         the server is full: retry_after
   + DeadlineError               no answer within the timeout
   + ServerFailedError           the server failed on a good request

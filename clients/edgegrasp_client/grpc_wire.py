@@ -46,7 +46,7 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.PERMISSION_DENIED: AccessDeniedError,
     grpc.StatusCode.UNAVAILABLE: ServerUnavailableError,
     grpc.StatusCode.CANCELLED: ServerUnavailableError,
-    grpc.StatusCode.INTERNAL: ServerFailedError,
+    grpc.StatusCode.INTERNAL: ServerUnavailableError,  # of a proxy: our servers say more
     grpc.StatusCode.UNKNOWN: ServerFailedError,
 }
 

@@ -158,6 +158,6 @@ def _foreign(response: httpx.Response) -> GraspClientError:
     retry_after = response.headers.get("retry-after", "")  # may also be a date, which is not read
     if status == httpx.codes.TOO_MANY_REQUESTS or (status == 503 and retry_after.isdecimal()):
         return OverloadedError(f"{what}.", float(retry_after) if retry_after.isdecimal() else 1.0)
-    if status in (502, 503, 504):
+    if status in (500, 502, 503, 504):
         return ServerUnavailableError(f"{what}.")
     return ProtocolError(f"{what}, which is not the answer of a grasp service.")

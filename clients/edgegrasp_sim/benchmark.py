@@ -1,16 +1,10 @@
-"""Many rounds of clutter removal, resumable: in this process, in several, or on a Ray cluster."""
+"""Many rounds of clutter removal, resumable."""
 
-import ctypes
-import importlib
-import multiprocessing
 import os
 import platform
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
@@ -23,12 +17,11 @@ from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.trial import PATIENCE, Planner, Round, run_round
+from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
-MAX_CRASHES = 3  # in a row, without a finished round between them
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3d-cpu")
 CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module, for the manifest
     (surroundings, ("table_friction",)),
@@ -40,8 +33,6 @@ CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module,
     (hand, ("min_opening",)),
     (trial, ("min_points",)),
 )
-PR_SET_PDEATHSIG = 1  # of Linux's prctl
-LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +48,7 @@ class BenchmarkConfig:
         split: of that folder.
         patience: seconds to keep asking a planner that is unavailable.
         engine: to simulate with; by default see `choose_engine`, with the protocol's.
+        gripper: the fields of a gripper file; by default the Panda's hand.
     """
 
     scene: SceneKind
@@ -67,6 +59,7 @@ class BenchmarkConfig:
     split: str = "test"
     patience: float = PATIENCE
     engine: str = ""
+    gripper: dict[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -97,7 +90,7 @@ def run_benchmark(
     config: BenchmarkConfig,
     make_planner: PlannerFactory,
     *,
-    workers: int = 1,
+    workers: int | None = 1,
     ray: str | None = None,
     folder: ResultFolder | None = None,
     on_round: Callable[[Round], None] | None = None,
@@ -107,9 +100,8 @@ def run_benchmark(
     Args:
         config: what to run.
         make_planner: called once in every process.
-        workers: processes; with 1 all runs in this one. If a worker dies, another runs its
-            rounds again.
-        ray: address of a Ray cluster to run the workers on; see `_run_on_ray`.
+        workers: how many rounds at a time, and
+        ray: address of a Ray cluster to run them on: see `run_tasks`.
         folder: keeps each round as it finishes; opened by the caller.
         on_round: called with every round as it finishes, in any order.
 
@@ -122,22 +114,14 @@ def run_benchmark(
         PlannerUnavailableError: the planner stayed away for longer than the patience.
         RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """
-    if workers < 1:
-        raise ValueError(f"workers is {workers}; use at least 1")
-    config.object_set()  # fail here on a wrong folder, not in every worker
+    digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
     tasks = config.tasks()
     kept = folder.rounds() if folder is not None else []
     rounds = {(r.seed, r.index): r for r in kept if (r.seed, r.index) in set(tasks)}
     missing = [task for task in tasks if task not in rounds]
-    workers = max(1, min(workers, len(missing)))
-    if ray is not None:
-        run = _run_on_ray(ray, config, make_planner, missing, workers)
-    elif workers == 1:
-        run = _run_here(config, make_planner, missing)
-    else:
-        run = _run_in_processes(config, make_planner, missing, workers)
-    for done in run:
-        rounds[done.seed, done.index] = done
+    make_runner = partial(RoundRunner, config, make_planner, digest)
+    for task, done in run_tasks(make_runner, missing, workers=workers, ray=ray):
+        rounds[task] = done
         if folder is not None:
             folder.add(done)
         if on_round is not None:
@@ -153,6 +137,8 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
         planner: how grasps are planned: its name, the weights' name and digest, options.
     """
     drawn = config.object_set()
+    # Named where it is not the Panda's, so that earlier results can be resumed.
+    hand = {} if config.gripper is None else {"gripper": config.gripper}
     return {
         "run": {
             "scene": config.scene.value,
@@ -161,6 +147,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
             "planner": planner,
             "engine": config.engine,
             "constants": constants(config.engine),
+            **hand,
         },
         "rounds": config.rounds,
         "seeds": list(config.seeds),
@@ -183,43 +170,28 @@ def constants(engine: str) -> dict[str, float]:
     }
 
 
-def available_cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 class RoundRunner:
     """A simulation with a planner, for one process.
 
     Args:
         config: what to run.
         make_planner: called once.
-        digest: that the objects must have, if they are read on another machine.
+        digest: that the objects must have; they may be read on another machine.
 
     Raises:
         ValueError: the objects have another digest.
     """
 
-    def __init__(
-        self,
-        config: BenchmarkConfig,
-        make_planner: PlannerFactory,
-        *,
-        digest: str | None = None,
-    ) -> None:
+    def __init__(self, config: BenchmarkConfig, make_planner: PlannerFactory, digest: str) -> None:
         objects = config.object_set()
-        if digest not in (None, objects.digest):
-            raise ValueError(
-                f"the objects in {config.objects} differ between the machines of the cluster; put "
-                "the same folder at the same path on each"
-            )
+        objects.check_same(digest)
         self.config = config
         self.planner: Planner = make_planner()
-        self.simulation = ClutterSimulation({config.scene: objects}, engine=config.engine)
+        self.simulation = ClutterSimulation(
+            {config.scene: objects}, engine=config.engine, gripper=config.gripper
+        )
 
-    def run(self, task: Task) -> Round:
+    def __call__(self, task: Task) -> Round:
         """Run the round of a seed and an index."""
         seed, index = task
         config = self.config
@@ -238,137 +210,6 @@ class RoundRunner:
         self.simulation.close()
         if close := getattr(self.planner, "close", None):
             close()
-
-
-def _run_here(
-    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task]
-) -> Iterator[Round]:
-    if not tasks:
-        return
-    runner = RoundRunner(config, make_planner)
-    try:
-        yield from map(runner.run, tasks)
-    finally:
-        runner.close()
-
-
-def _run_in_processes(
-    config: BenchmarkConfig, make_planner: PlannerFactory, tasks: Sequence[Task], workers: int
-) -> Iterator[Round]:
-    """Run rounds in processes; if one dies, the pool breaks and a new one takes its place."""
-    missing, crashes = list(tasks), 0
-    while missing:
-        # Forked children would share the parent's physics servers.
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(
-            workers, context, initializer=_start_worker, initargs=(config, make_planner)
-        )
-        try:
-            with _one_thread_each():
-                futures = [pool.submit(_run_in_worker, task) for task in missing]
-            for future in as_completed(futures):
-                done = future.result()
-                crashes = 0
-                missing.remove((done.seed, done.index))
-                yield done
-        except BrokenProcessPool:
-            crashes += 1
-            if crashes >= MAX_CRASHES:
-                raise RuntimeError(
-                    f"worker processes died {crashes} times in a row with {len(missing)} rounds "
-                    "left; run with one worker to see why"
-                ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def end_with_parent() -> None:
-    """Have this process ended when its parent ends, however that comes about."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
-_worker: RoundRunner | None = None  # of a worker process, made by its initialiser
-
-
-def _start_worker(config: BenchmarkConfig, make_planner: PlannerFactory) -> None:
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
-    end_with_parent()
-    _worker = RoundRunner(config, make_planner)
-
-
-def _run_in_worker(task: Task) -> Round:
-    assert _worker is not None
-    return _worker.run(task)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Make processes started meanwhile use one thread each: all cores are busy anyway."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update({name: value or "1" for name, value in before.items()})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-
-
-def _run_on_ray(
-    address: str,
-    config: BenchmarkConfig,
-    make_planner: PlannerFactory,
-    tasks: Sequence[Task],
-    workers: int,
-) -> Iterator[Round]:
-    """Run rounds in the actors of a Ray cluster.
-
-    Each of its machines needs this package, the same objects at the same path, and what the
-    planner needs. An actor that dies is restarted, and so is its round.
-
-    Args:
-        address: of the cluster, as `ray.init` takes it; `local` starts one on this machine.
-        config: what to run.
-        make_planner: called once in every actor.
-        tasks: the rounds.
-        workers: actors at most; no more are started than the cluster has processors.
-
-    Yields:
-        The rounds, in the order in which they finish.
-
-    Raises:
-        RuntimeError: Ray is not installed, there is no such cluster, or actors keep dying.
-    """
-    try:
-        ray: Any = importlib.import_module("ray")
-    except ModuleNotFoundError:
-        raise RuntimeError("ray is not installed: pip install 'edgegrasp[ray]'") from None
-    if not tasks:
-        return
-    own: dict[str, Any] = {}
-    if address == LOCAL_RAY:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
-        own = {"num_cpus": workers, "include_dashboard": False}
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
-        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
-    try:
-        workers = max(1, min(workers, int(ray.cluster_resources().get("CPU", 1))))
-        actor: Any = ray.remote(
-            num_cpus=1, max_restarts=MAX_CRASHES * len(tasks), max_task_retries=MAX_CRASHES
-        )(RoundRunner)
-        digest = config.object_set().digest
-        runners = [actor.remote(config, make_planner, digest=digest) for _ in range(workers)]
-        pool = ray.util.ActorPool(runners)
-        yield from pool.map_unordered(lambda runner, task: runner.run.remote(task), tasks)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from None
-    except ray.exceptions.RayActorError as error:
-        raise RuntimeError(f"a Ray actor died again and again: {error}") from error
-    finally:
-        ray.shutdown()
 
 
 def _version(distribution: str) -> str | None:

@@ -1,31 +1,32 @@
-"""A floating Panda hand, and a grasp with it: approach, close, retreat, and the outcome."""
+"""A floating hand, and a grasp with it: approach, close, retreat, and the outcome."""
 
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from edgegrasp_sim.engine import TIME_STEP, Body, HandModel, World
+from edgegrasp_sim.engine import TIME_STEP, Body, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
 
 SHAPES = Path(__file__).parent / "panda_hand.obj"
-MAX_OPENING = 0.08  # metres between the fingers
-FINGERTIP = 0.1122  # metres ahead of the link
-# The centre of mass lies 0.04 m ahead of the panda_hand link; the engine moves bodies by it.
-T_HAND_HANDCOM = translation(0.0, 0.0, 0.04)
-T_HANDCOM_HAND = translation(0.0, 0.0, -0.04)
+MAX_OPENING = 0.08  # metres between the Panda's fingers
+FINGERTIP = 0.1122  # metres ahead of the panda_hand link
+FINGER_BASE = 0.0584
+CENTRE = 0.04  # of mass
+T_HANDCOM_HAND = translation(0.0, 0.0, -CENTRE)
 
+# Of every hand: a gripper file says nothing of them.
 HAND_MASS = 0.5  # kg
 HAND_FRICTION = 1.0
 FINGER_MASS = 0.1  # kg
 FINGER_FRICTION = 0.75
 FINGER_FORCE = 20.0  # N
-FINGER_BASE = 0.0584  # metres ahead of the link
 TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
 
@@ -47,8 +48,8 @@ HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves
 SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
 LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
 SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
-# Metres along the hand's z at which to look for the object between the fingers, best first.
-_TARGET_DEPTHS = (FINGERTIP - 0.007, FINGERTIP - 0.002, FINGERTIP - 0.015, FINGERTIP - 0.025)
+# Metres behind the fingertips at which to look for the object between the fingers, best first.
+_TARGET_DEPTHS = (0.007, 0.002, 0.015, 0.025)
 
 
 class GraspOutcome(StrEnum):
@@ -170,15 +171,13 @@ def retreat_pose(T_world_hand: Matrix) -> Matrix:
 
 
 class Gripper:
-    """The simulated hand; its link frame is `panda_hand` (z out of the palm, y closes).
+    """The simulated hand, in the hand frame of its file: z out of the palm, y closes."""
 
-    The shapes are the convex hulls of the Panda's meshes: palm at z = 0.0658, fingertips at
-    z = 0.1122, hand within x ± 0.0316 and y ± 0.104, in metres.
-    """
-
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, model: HandModel | None = None) -> None:
         self.world = world
-        self.body = world.add_hand(panda(), _PARKED[:3, 3])
+        self.model = model or panda()
+        self._T_hand_com = translation(*self.model.centre)  # the engine moves bodies by it
+        self.body = world.add_hand(self.model, _PARKED[:3, 3])
         self.park()
 
     @property
@@ -192,7 +191,7 @@ class Gripper:
 
     def place(self, T_world_hand: Matrix) -> None:
         """Put the open hand there at once, at rest."""
-        T_world_com = T_world_hand @ T_HAND_HANDCOM
+        T_world_com = T_world_hand @ self._T_hand_com
         self.body.set_pose(T_world_com[:3, 3], quaternion_xyzw(T_world_com))
 
     def steps_to(self, T_world_hand: Matrix, *, step_length: float) -> Iterator[None]:
@@ -201,7 +200,7 @@ class Gripper:
         Yields:
             After every time step; a caller that stops iterating leaves the hand where it is.
         """
-        T_world_com = T_world_hand @ T_HAND_HANDCOM
+        T_world_com = T_world_hand @ self._T_hand_com
         quaternion = quaternion_xyzw(T_world_com)
         position = self.body.position
         way = T_world_com[:3, 3] - position
@@ -225,22 +224,78 @@ class Gripper:
 
 @cache
 def panda() -> HandModel:
-    """The Panda's hand, of the convex hulls of its meshes."""
+    """The Panda's hand, of the convex hulls of its meshes.
+
+    Palm at z = 0.0658, fingertips at z = 0.1122, hand within x ± 0.0316 and y ± 0.104, in metres.
+    """
     shapes = dict(read_obj(SHAPES))
-    x, y, z = T_HAND_HANDCOM[:3, 3].tolist()
+    finger = shapes["finger"].points
     return HandModel(
-        palm=shapes["palm"].points,
-        finger=shapes["finger"].points,
+        palm=(shapes["palm"].points,),
+        fingers=((finger,), (finger * (-1.0, -1.0, 1.0),)),
         finger_base=FINGER_BASE,
-        centre=(x, y, z),
-        mass=HAND_MASS,
-        friction=HAND_FRICTION,
-        finger_mass=FINGER_MASS,
-        finger_friction=FINGER_FRICTION,
-        finger_force=FINGER_FORCE,
+        finger_centre=(0.0, 0.01, 0.02),
+        tip=FINGERTIP,
+        centre=(0.0, 0.0, CENTRE),
         max_opening=MAX_OPENING,
-        tool_force=TOOL_FORCE,
+        meshes=("hand.obj", "finger.obj"),
+        **_OF_EVERY_HAND,
     )
+
+
+def hand_of(gripper: Mapping[str, Any]) -> HandModel:
+    """The hand that a gripper file describes, of its boxes.
+
+    Args:
+        gripper: the fields of the file, which are right; see docs/frames.md.
+    """
+    palm, finger = (np.array(gripper[part]["boxes"], float) for part in ("hand", "finger"))
+    opening, root = float(gripper["max_opening"]), float(finger[:, 0, 2].min())
+    finger[..., 2] -= root
+    centre, finger_centre = (
+        ((boxes.min(axis=(0, 1)) + boxes.max(axis=(0, 1))) / 2).tolist() for boxes in (palm, finger)
+    )
+    advance = swing_of(gripper)
+    held = 0.0 if advance is None else float(np.polynomial.Polynomial(advance)(opening / 4))
+    return HandModel(
+        palm=_corners(palm),
+        fingers=(_corners(finger), _corners(finger * (1.0, -1.0, 1.0))),
+        finger_base=root,
+        finger_centre=finger_centre,
+        tip=float(gripper["tip_z"]) + held,
+        centre=centre,
+        max_opening=opening,
+        advance=advance,
+        **_OF_EVERY_HAND,
+    )
+
+
+def swing_of(gripper: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """`HandModel.advance` of a gripper file: its linkage's circle, to a hundredth of its reach."""
+    swing = gripper.get("swing")
+    if swing is None:
+        return None
+    radius, reach, shut = swing["radius"], swing["reach"], gripper["max_opening"] / 2
+    half = np.linspace(0.0, shut, 50)
+    ahead = np.sqrt(radius**2 - (reach - shut + half) ** 2) - np.sqrt(radius**2 - reach**2)
+    fit = np.polynomial.Polynomial.fit(half, ahead, 4).convert()
+    return tuple(fit.coef.tolist())
+
+
+_OF_EVERY_HAND: dict[str, Any] = {
+    "mass": HAND_MASS,
+    "friction": HAND_FRICTION,
+    "finger_mass": FINGER_MASS,
+    "finger_friction": FINGER_FRICTION,
+    "finger_force": FINGER_FORCE,
+    "tool_force": TOOL_FORCE,
+}
+
+
+def _corners(boxes: Matrix) -> Parts:
+    """The eight corners (8, 3) of each of some boxes (B, 2, 3)."""
+    pick = np.indices((2, 2, 2)).reshape(3, 8).T  # lower or upper, of x, y and z
+    return tuple(box[pick, np.arange(3)] for box in boxes)
 
 
 def _close(gripper: Gripper, objects: Mapping[int, SceneObject], *, to_the_end: bool) -> None:
@@ -339,9 +394,9 @@ def _object_between_fingers(
     gripper: Gripper, T_world_hand: Matrix, objects: Mapping[int, SceneObject]
 ) -> SceneObject | None:
     """The object between the fingers of a hand at the grasp: the first that rays across hit."""
-    half = 0.5 * MAX_OPENING
-    ends = np.array([[0.0, side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
-    across = np.array([[0.0, -side * half, z, 1.0] for z in _TARGET_DEPTHS for side in (1, -1)])
+    half, depths = 0.5 * gripper.model.max_opening, [gripper.model.tip - d for d in _TARGET_DEPTHS]
+    ends = np.array([[0.0, side * half, z, 1.0] for z in depths for side in (1, -1)])
+    across = np.array([[0.0, -side * half, z, 1.0] for z in depths for side in (1, -1)])
     hits = gripper.world.first_hits(
         (ends @ T_world_hand.T)[:, :3], (across @ T_world_hand.T)[:, :3]
     )

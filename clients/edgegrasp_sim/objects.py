@@ -119,6 +119,14 @@ class ObjectSet:
                 digest.update(file.read_bytes())
         return digest.hexdigest()
 
+    def check_same(self, digest: str) -> None:
+        """Raise ValueError where a set of that digest was read on another machine."""
+        if self.digest != digest:
+            raise ValueError(
+                f"the objects {self.name} differ between the machines of the cluster; put the same "
+                "folder at the same path on each"
+            )
+
     def sample(self, rng: np.random.Generator) -> ObjectModel:
         """Draw one object, uniformly."""
         return self.models[int(rng.integers(len(self.models)))]

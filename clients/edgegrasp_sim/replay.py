@@ -37,7 +37,9 @@ class Replay:
                 "pass the folder it was run with"
             )
         self.rounds = {(done.seed, done.index): done for done in folder.rounds()}
-        self.simulation = ClutterSimulation({self.scene: models}, engine=run["engine"])
+        self.simulation = ClutterSimulation(
+            {self.scene: models}, engine=run["engine"], gripper=run.get("gripper")
+        )
 
     def __enter__(self) -> Self:
         return self

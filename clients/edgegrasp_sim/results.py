@@ -6,7 +6,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import fmean, median, stdev
 from typing import Any
@@ -133,11 +133,19 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
     planning = sorted(attempt.planning_seconds for attempt in attempts)
     seeds = np.array([item.seed for item in rounds])
     counts = dict(zip(COUNTS, count(rounds), strict=True))
+    fitting = dict(zip(COUNTS, count(map(without_too_wide, rounds)), strict=True))
     return {
         "rounds": len(rounds),
         **{name: int(numbers.sum()) for name, numbers in counts.items()},
         "grasp_success_rate": _rate(counts["successes"], counts["attempts"], seeds),
         "declutter_rate": _rate(counts["successes"], counts["objects"], seeds),
+        "too_wide": {
+            "objects": sum(len(item.too_wide) for item in rounds),
+            **{
+                f"{name}_of_others": _share(fitting["successes"], fitting[trials])
+                for name, trials in zip(RATE_LABELS, ("attempts", "objects"), strict=True)
+            },
+        },
         "failures": {
             **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
             "no candidate": sum(item.no_grasp for item in rounds),
@@ -165,6 +173,13 @@ def count(rounds: Iterable[Round]) -> NDArray[np.int64]:
     return np.array(rows, np.int64).reshape(-1, len(COUNTS)).T
 
 
+def without_too_wide(item: Round) -> Round:
+    """A round but for the objects that are too wide for the hand, and the grasps of them."""
+    left = Counter(item.objects) - Counter(item.too_wide)
+    attempts = tuple(a for a in item.attempts if not {a.object, a.target} & {*item.too_wide})
+    return replace(item, objects=tuple(left.elements()), attempts=attempts)
+
+
 def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
     """For each object: how often it was present, removed, aimed at, and held when aimed at."""
     attempts = [attempt for item in rounds for attempt in item.attempts]
@@ -184,10 +199,10 @@ def by_object(rounds: Sequence[Round]) -> dict[str, dict[str, int]]:
 
 
 def attempts_digest(rounds: Sequence[Round]) -> str:
-    """SHA-256 of everything but wall-clock times; equal for equal attempts."""
+    """SHA-256 of all but wall-clock times and the objects' widths; equal for equal attempts."""
     tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
     for table in tables:
-        del table["retries"], table["waited_seconds"]
+        del table["retries"], table["waited_seconds"], table["too_wide"]
         for attempt in table["attempts"]:
             del attempt["planning_seconds"]
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
@@ -201,8 +216,9 @@ def round_from_json(table: dict[str, Any]) -> Round:
         attempts.append(
             Attempt(**item | {"outcome": GraspOutcome(item["outcome"]), "cause": cause})
         )
-    end, objects = RoundEnd(table["end"]), tuple(table["objects"])
-    return Round(**table | {"objects": objects, "attempts": tuple(attempts), "end": end})
+    names = {key: tuple(table.get(key, ())) for key in ("objects", "too_wide")}
+    end = RoundEnd(table["end"])
+    return Round(**table | names | {"attempts": tuple(attempts), "end": end})
 
 
 def record_of(folder: ResultFolder) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self, TypedDict, Unpack
+from typing import Any, Self, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,8 @@ from edgegrasp_sim.camera import (
     seen_box,
 )
 from edgegrasp_sim.engine import make_world
-from edgegrasp_sim.hand import GraspResult, Gripper, run_grasp
+from edgegrasp_sim.engine.urdf import least_width, read_urdf
+from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.picture import lit
 from edgegrasp_sim.poses import Matrix, require_pose
@@ -111,6 +112,7 @@ class ClutterSimulation:
             has looked for any, so that it never fails a grasp for this and lets the engine push
             hand and objects apart; off by default, to agree with it.
         engine: see `choose_engine`.
+        gripper: the fields of a gripper file; by default the Panda's hand, of its own shapes.
     """
 
     def __init__(
@@ -119,7 +121,9 @@ class ClutterSimulation:
         *,
         start_contact_fails: bool = False,
         engine: str | None = None,
+        gripper: Mapping[str, Any] | None = None,
     ) -> None:
+        self.gripper = gripper
         self.object_sets = (
             dict(objects)
             if objects is not None
@@ -156,6 +160,16 @@ class ClutterSimulation:
     def object_models(self) -> list[ObjectModel]:
         """Models of the objects that are left."""
         return [item.model for item in self._objects]
+
+    @property
+    def too_wide(self) -> list[ObjectModel]:
+        """Models of the objects that are wider at their narrowest than the hand opens."""
+        return [
+            model
+            for model, scale in ((item.model, item.scale) for item in self._objects)
+            if least_width(read_urdf(model.urdf, scale * model.scale))
+            > self._hand.model.max_opening
+        ]
 
     @property
     def object_bounds(self) -> Matrix:
@@ -219,7 +233,7 @@ class ClutterSimulation:
                 given = scales or PACKED_SCALE
                 made = make_table(self.world, around, objects, rng, num_objects, given)
         self._objects = made
-        self._gripper = Gripper(self.world)
+        self._gripper = self._add_gripper()
         return self.num_objects
 
     def reset_from_poses(
@@ -241,7 +255,7 @@ class ClutterSimulation:
             )
             item.body.set_pose(placement.position, placement.quaternion_xyzw)
             self._objects.append(item)
-        self._gripper = Gripper(self.world)
+        self._gripper = self._add_gripper()
 
     def observe(
         self,
@@ -373,7 +387,9 @@ class ClutterSimulation:
             ValueError: `T_world_hand` is no rigid transform.
         """
         if self._copy is None:
-            self._copy = ClutterSimulation(self.object_sets, engine=self.world.name)
+            self._copy = ClutterSimulation(
+                self.object_sets, engine=self.world.name, gripper=self.gripper
+            )
         placements = self.placements
         if self._copied != placements:
             self._copy.reset_from_poses(placements, self.surroundings)
@@ -400,6 +416,9 @@ class ClutterSimulation:
             self._objects.remove(result.held)
         self._objects = settle(self.world, self._objects, self.surroundings)
         return result
+
+    def _add_gripper(self) -> Gripper:
+        return Gripper(self.world, None if self.gripper is None else hand_of(self.gripper))
 
     @property
     def _hand(self) -> Gripper:

@@ -116,6 +116,7 @@ class Round:
         end: why the round ended.
         retries: how often the planner had to be asked again because it was unavailable.
         waited_seconds: spent on that.
+        too_wide: names of the objects that no grasp can hold: the hand does not open that far.
     """
 
     seed: int
@@ -126,6 +127,7 @@ class Round:
     end: RoundEnd
     retries: int = 0
     waited_seconds: float = 0.0
+    too_wide: tuple[str, ...] = ()
 
     @property
     def successes(self) -> int:
@@ -206,7 +208,8 @@ class RoundDriver:
         self._failures = 0
         self._planning_seconds = 0.0
         names = tuple(model.name for model in simulation.object_models)
-        self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED)
+        wide = tuple(model.name for model in simulation.too_wide)
+        self._round = Round(seed, index, names, (), 0, RoundEnd.CLEARED, too_wide=wide)
         self._update_end()
 
     def look(self) -> Observation:

@@ -161,6 +161,15 @@ def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
     Raises:
         InvalidGripper: There is no such file, or it is no gripper's.
     """
+    return gripper_from_fields(gripper_fields(name_or_path))
+
+
+def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
+    """What such a file says, ready for JSON and for a request's option `gripper`.
+
+    Raises:
+        InvalidGripper: There is no such file, or it is no gripper's.
+    """
     path = Path(name_or_path)
     if path.suffix != ".toml":
         path = GRIPPER_FOLDER / f"{name_or_path}.toml"
@@ -169,7 +178,9 @@ def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
             f"gripper: got {str(name_or_path)!r}. Use one of {gripper_names()} or a .toml file."
         )
     try:
-        return gripper_from_fields(tomllib.loads(path.read_text()))
+        fields = tomllib.loads(path.read_text())
+        gripper_from_fields(fields)
+        return fields
     except (InvalidGripper, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InvalidGripper(f"{path.name}: {error}") from error
 

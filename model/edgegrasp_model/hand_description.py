@@ -2,7 +2,8 @@
 
 Invariant under rotations, translations and reflections of the whole scene by construction: how
 many points the hand would hit, what lies between its fingers, from where it was seen, how the hand
-stands to gravity and support, and how much of the space around it the camera did not see.
+stands to gravity and support, how much of the space around it the camera did not see, and which
+hand it is.
 """
 
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from edgegrasp_model.hand_view import (
     hand_views,
     mirror_sides,
     reach_of,
+    seen_part,
 )
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
@@ -33,7 +35,7 @@ SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
 GAP = 0.007  # metres without a point in which what is between the fingers ends
-HAND_DESCRIPTION_SIZE = 71
+HAND_DESCRIPTION_SIZE = 76
 HEIGHTS = slice(58, 61)  # of them: heights over the support plane
 
 
@@ -71,11 +73,12 @@ def describe_hands(
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
     mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    seen = _look(view, cloud.normals, mirrored, side, at_side, gripper)
+    ends = seen_part(gripper)
+    seen = _look(view, cloud.normals, mirrored, side, at_side, ends)
     depth = None
     if viewpoint is not None and len(cloud.points):
         depth = DepthMap.of_cloud(cloud.points, viewpoint, up)
-    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, gripper)
+    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, ends)
     columns = [
         *seen.hits.T,
         *seen.between.T,
@@ -89,6 +92,7 @@ def describe_hands(
         *unseen.beyond,
         unseen.free,
         *seen.runs.T,
+        *np.tile(_measures(gripper), (len(candidates), 1)).T,
     ]
     return np.stack(columns, axis=1).astype(np.float32)
 
@@ -98,6 +102,13 @@ def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
     unknown = description.copy()
     unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
     return unknown
+
+
+def _measures(gripper: Gripper) -> list[float]:
+    """Opening, length, half width and thickness of a finger, and how far it swings; metres."""
+    length, swing = gripper.tip_z - gripper.palm_z, gripper.max_tip_z - gripper.tip_z
+    thick = max(high[1] for _, high in gripper.finger_boxes)
+    return [gripper.max_opening, length, gripper.pad_half_width, thick, swing]
 
 
 class _Seen(NamedTuple):

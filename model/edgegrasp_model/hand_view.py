@@ -1,6 +1,6 @@
 """The cloud as it is seen from some hands."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -113,6 +113,17 @@ def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Reach) -> HandView:
     return HandView(hand, row, position, len(T_cloud_hand), reach)
 
 
+SEEN_LENGTH = 0.0465  # metres of the fingers, from their tips: the Panda's are no longer
+
+
+def seen_part(gripper: Gripper) -> Gripper:
+    """The same hand with its palm at most so far behind its fingertips.
+
+    What holds a thing is the ends of the fingers: there, hands of any length look alike.
+    """
+    return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
+
+
 ABOVE = 0.001  # metres over the camera
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
 BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
@@ -154,7 +165,8 @@ def points_around_fingers(
         zeros behind the last; and their number (E,).
     """
     x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
-    low, high = (-x, -y, gripper.palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND)
+    palm_z = seen_part(gripper).palm_z
+    low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND)
     points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
     count = np.zeros(view.num_candidates, dtype=np.int64)
     _around_fingers(

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
-from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import without_support
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
@@ -92,17 +91,17 @@ class Packed(NamedTuple):
 
 
 def tried_grasps(
-    view: LabelledView, config: NetworkConfig, gripper: Gripper, *, viewpoint_known: bool = True
+    view: LabelledView, config: NetworkConfig, *, viewpoint_known: bool = True
 ) -> TriedGrasps:
     """Build the tried candidates of a view, with the inputs of a hand network."""
     rows = view.tried()
     cloud = Cloud(view.points, view.normals)
-    candidates = _candidates(view, cloud, rows, gripper)
+    candidates = _candidates(view, cloud, rows)
     label = _labels(view)[rows[candidates.pair]]
     seen = None
     if config.architecture == "hand":
         viewpoint = view.camera_position if viewpoint_known else None
-        batch = hand_batch(view, candidates, gripper, viewpoint, SPARE_POINTS * config.hand_points)
+        batch = hand_batch(view, candidates, viewpoint, SPARE_POINTS * config.hand_points)
         description, points = batch.description.numpy(), batch.points.numpy()
         seen = HandInputs(
             description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
@@ -113,7 +112,6 @@ def tried_grasps(
 def hand_batch(
     view: LabelledView,
     candidates: Candidates,
-    gripper: Gripper,
     viewpoint: NDArray[np.float32] | None,
     max_points: int,
 ) -> HandBatch:
@@ -122,14 +120,13 @@ def hand_batch(
     Args:
         view: What is seen of the scene.
         candidates: E hands to try.
-        gripper: To try them with.
         viewpoint: (3,) camera position, metres; None: not known.
         max_points: Points of each hand at most.
     """
     return HandBatch.from_cloud(
         Cloud(view.points, view.normals),
         candidates,
-        gripper,
+        view.hand,
         view.up,
         view.support_plane,
         viewpoint,
@@ -257,13 +254,11 @@ def _turn_of(view: LabelledView) -> NDArray[np.float32]:
     return frame.directions(np.eye(3)).T.astype(np.float32)
 
 
-def _candidates(
-    view: LabelledView, cloud: Cloud, rows: NDArray[np.int64], gripper: Gripper
-) -> Candidates:
+def _candidates(view: LabelledView, cloud: Cloud, rows: NDArray[np.int64]) -> Candidates:
     """The tried candidates; `pair` counts in `rows`."""
     approach_index, contact_index = view.approach_index[rows], view.contact_index[rows]
     if view.T_world_hand is None:
-        return edge_grasps(cloud, approach_index, contact_index, gripper)
+        return edge_grasps(cloud, approach_index, contact_index, view.hand)
     pose = view.T_world_hand[rows]
     edge = view.points[contact_index] - view.points[approach_index]  # (E, 3)
     depth = np.maximum(np.einsum("ed,ed->e", edge, pose[:, :3, 2]), 0.0)

@@ -1,28 +1,27 @@
 """Generate labelled views: observe random clutter, try edge grasps in it, keep the outcomes."""
 
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import json
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from multiprocessing import get_context
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.detector import GraspDetector
-from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import (
     AutoPlane,
     Box,
     Collision,
     DetectOptions,
+    GripperGeometry,
     OrientedBox,
     Region,
     SupportPlane,
@@ -30,19 +29,20 @@ from edgegrasp_model.options import (
 )
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_model.scene.scene import Scene, SelectedPoints, build_scene, select_points
-from edgegrasp_sim.benchmark import end_with_parent
 from edgegrasp_sim.camera import Observation, ViewRange
 from edgegrasp_sim.engine import choose_engine
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
+from edgegrasp_sim.workers import run_tasks
+from edgegrasp_training.hands import PANDA, hand_of_scene
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import varied_objects
 from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 
-SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM = 0, 1, 2, 3, 4
+SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
 # Four in ten scenes are those of the benchmark of the paper.
@@ -66,7 +66,8 @@ VIEWS = {
     SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
     SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
 }
-KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried
+KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
+BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
 TOLD_SHARE = {  # of the views that are not cut off, where support and workspace are told
     SceneKind.PACKED: 0.0,
@@ -108,6 +109,7 @@ class GenerationOptions:
     weights: Path | None = None  # of the network that guides the choice
     kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
     engine: str | None = None  # see `choose_engine`
+    gripper: str = PANDA  # see `hand_of_scene`
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
@@ -131,21 +133,27 @@ class Chosen(NamedTuple):
 
 
 def generate(
-    folder: Path, objects: Path | None, options: GenerationOptions, workers: int = 1
+    folder: Path,
+    objects: Path | None,
+    options: GenerationOptions,
+    workers: int | None = 1,
+    ray: str | None = None,
 ) -> Iterator[tuple[int, int, int]]:
-    """Generate the scenes that are missing, in any order; the number of workers changes nothing.
+    """Generate the scenes that are missing, in any order; who makes them changes nothing.
 
     Args:
         folder: Where the views go, one file each.
         objects: Object sets in the layout `packed/train`, `pile/train`; None: the built-in ones.
         options: What to generate.
-        workers: Processes.
+        workers: How many scenes at a time, and
+        ray: Address of a Ray cluster to make them on: see `run_tasks`. Views come back to `folder`.
 
     Yields:
         For each finished scene its index, the grasps tried in it and those that held.
 
     Raises:
         ValueError: The folder holds views of another engine.
+        RuntimeError: Workers keep dying, or there is no such Ray cluster.
     """
     folder.mkdir(parents=True, exist_ok=True)
     options = replace(options, engine=choose_engine(options.engine).name)
@@ -156,23 +164,16 @@ def generate(
             "choose another folder"
         )
     missing = missing_scenes(folder, options)
-    if workers == 1:
-        for index in missing:
-            yield index, *generate_scene(folder, objects, options, index)
-        return
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_start_worker
-    ) as pool:
-        futures = {
-            pool.submit(generate_scene, folder, objects, options, index): index for index in missing
-        }
-        for future in as_completed(futures):
-            yield futures[future], *future.result()
-
-
-def _start_worker() -> None:
-    end_with_parent()
-    torch.set_num_threads(1)
+    sets = {}
+    if objects is not None:
+        sets = {kind: ObjectSet.from_folder(objects, kind, "train") for kind in CLUTTER}
+    digests = [drawn.digest for drawn in sets.values()]
+    make_runner = partial(_scene_maker, sets, digests, options)
+    for index, views in run_tasks(make_runner, missing, workers=workers, ray=ray):
+        for number, view in enumerate(views):
+            view.save(view_path(folder, index, number, options))
+        tried = sum(len(view.tried()) for view in views)
+        yield index, tried, sum(int((view.success == 1).sum()) for view in views)
 
 
 def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
@@ -193,25 +194,33 @@ def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -
     return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
 
 
+def _scene_maker(
+    sets: dict[SceneKind, ObjectSet], digests: list[str], options: GenerationOptions
+) -> Callable[[int], list[LabelledView]]:
+    for drawn, digest in zip(sets.values(), digests, strict=True):
+        drawn.check_same(digest)
+    return partial(generate_scene, sets, options)
+
+
 def generate_scene(
-    folder: Path, objects: Path | None, options: GenerationOptions, index: int
-) -> tuple[int, int]:
-    """Generate all views of one scene; returns how many grasps were tried and how many held."""
-    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(5)]
+    sets: dict[SceneKind, ObjectSet], options: GenerationOptions, index: int
+) -> list[LabelledView]:
+    """Generate all views of one scene, of the built-in objects where there are no sets."""
+    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(6)]
     kind = options.kind_of(index)
     # Some scenes are made of the other kind's objects.
     source = kind.objects
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
         source = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
-    tried = held = 0
+    views = []
     with TemporaryDirectory() as shapes:
-        drawn = None
-        if objects is not None:
-            drawn = ObjectSet.from_folder(objects, source, "train")
-            if streams[SHAPE_STREAM].random() < VARIED_SHARE:
-                drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
-        sets = None if drawn is None else {kind: drawn}
-        with ClutterSimulation(sets, engine=options.engine) as simulation:
+        drawn = sets.get(source)
+        if drawn is not None and streams[SHAPE_STREAM].random() < VARIED_SHARE:
+            drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
+        made_of = None if drawn is None else {kind: drawn}
+        gripper = hand_of_scene(options.gripper, streams[HAND_STREAM])
+        hand = "" if gripper is None else json.dumps(gripper)
+        with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
             hard = _make_scene(simulation, kind, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
@@ -220,11 +229,9 @@ def generate_scene(
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 engine = simulation.world.name
-                view = replace(view, engine=engine, objects=names, object_digests=digests)
-                view.save(view_path(folder, index, number, options))
-                tried += len(view.tried())
-                held += int((view.success == 1).sum())
-    return tried, held
+                view = replace(view, engine=engine, gripper=hand)
+                views.append(replace(view, objects=names, object_digests=digests))
+    return views
 
 
 def _make_scene(
@@ -294,6 +301,9 @@ def ask(
         support, workspace = AutoPlane(), None
     aimed = not open_table and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
+    gripper = None
+    if simulation.gripper is not None:
+        gripper = GripperGeometry.model_validate(simulation.gripper)
     request = DetectOptions(
         num_approach_points=BIN_APPROACH_POINTS if kind is SceneKind.BIN else APPROACH_POINTS,
         seed=int(choice.integers(2**32)),
@@ -303,6 +313,7 @@ def ask(
         approach_region=objects,
         contact_region=objects,
         collision=Collision(mode="penalise"),
+        gripper=gripper,
     )
     return Query(observation, request)
 
@@ -364,7 +375,9 @@ def label(
     selected, scene, candidates, T_world_hand = found
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # What is far from every grasp says nothing about any.
-    far = cKDTree(T_world_hand[:, :3, 3]).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
+    behind = choose_gripper(query.request, load_gripper(), {}).tip_z - BEHIND_TIPS
+    places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
+    far = cKDTree(places).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
     kept = np.flatnonzero(~far)
     return LabelledView(
         points=scene.points_in_cloud[kept],
@@ -401,7 +414,9 @@ def choose_grasps(
         selected = select_points(check_cloud(observation.cloud), request, {}, [])
         scene = build_scene(selected, request, VOXEL_SIZE, {})
         if scene is not None and scene.approach_allowed.any():
-            sample = sample_candidates(scene, request, load_gripper(), CROP_RADIUS, {})
+            gripper = choose_gripper(request, load_gripper(), {})
+            radius = max(CROP_RADIUS, gripper.max_opening / 2)
+            sample = sample_candidates(scene, request, gripper, radius, {})
     else:
         prepared = guide.prepare(observation.cloud, request)
         selected, scene, sample = prepared.selected, prepared.scene, prepared.sample

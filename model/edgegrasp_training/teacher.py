@@ -14,7 +14,6 @@ from edgegrasp_model.candidates.edge_grasps import (
     retract,
 )
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.scene.cloud import Cloud
 from edgegrasp_training.examples import SoftLabels, hand_batch
@@ -44,7 +43,6 @@ class Teacher:
         if self.metadata.network.architecture != "hand":
             found = self.metadata.network.architecture
             raise ValueError(f"teacher: got a network of architecture {found!r}. Use a `hand` one.")
-        self.gripper = load_gripper(self.metadata.gripper)
         self.crop_radius = crop_radius
         self.folder = folder / f"{self.metadata.digest[:12]}-{crop_radius * 1000:g}mm"
 
@@ -68,7 +66,7 @@ class Teacher:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
             return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
-        hands = hand_batch(view, candidates, self.gripper, view.camera_position, max_points)
+        hands = hand_batch(view, candidates, view.camera_position, max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
         return SoftLabels(
@@ -88,12 +86,12 @@ class Teacher:
         pairs = balls[crop.ball_of_point], crop.ball_rows
         every = np.arange(len(crop.ball_rows))
         across = [
-            outline_grasps(cloud.points, crop, balls, every, seen, support, self.gripper)
+            outline_grasps(cloud.points, crop, balls, every, seen, support, view.hand)
             for seen in outlines(cloud.points, view.camera_position, np.unique(crop.ball_rows))
         ]
-        both = Candidates.concatenate([edge_grasps(cloud, *pairs, self.gripper), *across])
+        both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand), *across])
         if support is not None:
-            both, clear = retract(both, support, self.gripper)
+            both, clear = retract(both, support, view.hand)
             both = both.take(np.flatnonzero(clear))
         both = both.take(rng.permutation(len(both)))
         both = both.take(np.argsort(both.approach_index, kind="stable"))

@@ -16,7 +16,6 @@ import torch.nn.functional as F  # noqa: N812
 from numpy.typing import NDArray
 from torch import nn
 
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -102,7 +101,6 @@ class Trainer:
         self.teacher = teacher
         self.metadata, self.folder, self.options, self.device = metadata, folder, options, device
         self.train_paths, self.validation_paths = train_paths, validation_paths
-        self.gripper = load_gripper(metadata.gripper)
         self._tried = lru_cache(maxsize=VIEWS_IN_MEMORY)(self._read)
         if teacher is not None:
             self._soft_labels = lru_cache(maxsize=VIEWS_IN_MEMORY)(teacher.soft_labels)
@@ -282,9 +280,8 @@ class Trainer:
         return pack_balls(grasps, balls, network, soft_labels)
 
     def _read(self, path: Path, viewpoint_known: bool) -> TriedGrasps:
-        view = load_view(path)
         network = self.metadata.network
-        return tried_grasps(view, network, self.gripper, viewpoint_known=viewpoint_known)
+        return tried_grasps(load_view(path), network, viewpoint_known=viewpoint_known)
 
     def _standardise(self, known: int) -> None:
         """Fit mean and spread of the hand descriptions to the training views, but the first few."""

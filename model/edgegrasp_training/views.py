@@ -1,15 +1,18 @@
 """Labelled views, which a data generator writes and a trainer reads, and their data card."""
 
+import json
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_model.gripper import Gripper, gripper_from_fields, load_gripper
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_model.scene.support import Support
@@ -40,6 +43,7 @@ class LabelledView:
     at_side: NDArray[np.bool_] | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
     engine: str = "pybullet"  # that simulated the labels
+    gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
     objects: tuple[str, ...] = ()  # names of the objects in the scene, where they are known
     object_digests: tuple[str, ...] = ()  # SHA-256 of their files, in the same order
 
@@ -53,6 +57,7 @@ class LabelledView:
             "contact_index": self.contact_index.astype(np.uint16),
             "success": self.success,
             "engine": np.array(self.engine),
+            "gripper": np.array(self.gripper),
         }
         for name in OPTIONAL:
             if (array := getattr(self, name)) is not None:
@@ -64,6 +69,11 @@ class LabelledView:
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         partial.replace(path)
+
+    @property
+    def hand(self) -> Gripper:
+        """The hand that tried them."""
+        return _hand(self.gripper)
 
     @property
     def support_plane(self) -> SupportPlane | None:
@@ -92,6 +102,11 @@ class LabelledView:
         return np.flatnonzero(self.success != UNTRIED)
 
 
+@lru_cache(maxsize=64)
+def _hand(fields: str) -> Gripper:
+    return gripper_from_fields(json.loads(fields)) if fields else load_gripper()
+
+
 def support_as_array(support: Support | None) -> Float32:
     """A support plane as `LabelledView.support` has it."""
     if support is None:
@@ -111,6 +126,7 @@ def load_view(path: Path) -> LabelledView:
             success=arrays["success"].astype(np.int8),
             **{name: arrays.get(name) for name in OPTIONAL},
             engine=str(arrays.get("engine", LabelledView.engine)),
+            gripper=str(arrays.get("gripper", "")),
             objects=tuple(map(str, arrays.get("objects", ()))),
             object_digests=tuple(map(str, arrays.get("object_digests", ()))),
         )
@@ -213,6 +229,7 @@ def _facts(views: dict[Path, LabelledView]) -> dict[str, str]:
         "scenes": str(len({scene_of(path) for path in views})),
         "views": str(len(views)),
         "engine": ", ".join(sorted({view.engine for view in views.values()})),
+        "hands": str(len({view.gripper for view in views.values()})),
         "grasps tried": str(tried),
         "held after the lift": _share(held, tried),
         "of those, held after shaking too": _share(firm, shaken_held),

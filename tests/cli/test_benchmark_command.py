@@ -62,6 +62,17 @@ def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tm
     }
 
 
+def test_another_hand_is_planned_for_and_simulated(benchmark, run, refused, tmp_path) -> None:
+    few = ("--num-approach-points", 16, "--num-candidates", 400, "--gripper", "robotiq-2f-85")
+    assert benchmark(tmp_path, "in-process", *few, rounds=1)["successes"] > 0
+    manifest = json.loads((tmp_path / "manifest.json").read_text())["run"]
+    assert manifest["gripper"]["max_opening"] == 0.085
+    assert manifest["planner"]["options"]["gripper"] == manifest["gripper"]
+    assert "the result is the same" in run("replay", "attempt", tmp_path, "--round", 0)
+    assert "nothere" in refused("benchmark", "--gripper", "nothere")
+    assert "Panda alone" in refused("benchmark", "--planner", "oracle", "--gripper", "wsg-50")
+
+
 def test_a_result_below_the_gate_fails(edge_sample: Path, oracle: Path, refused, tmp_path) -> None:
     gate = figures(oracle)
     for name in ("grasp_success_rate", "declutter_rate"):

@@ -138,19 +138,21 @@ NOT_DESCRIBED = {
         (Code.RESOURCE_EXHAUSTED, PayloadTooLargeError),
         (Code.UNAVAILABLE, ServerUnavailableError),
         (Code.DEADLINE_EXCEEDED, DeadlineError),
-        (Code.INTERNAL, ServerFailedError),
+        (Code.INTERNAL, ServerUnavailableError),
+        (Code.UNKNOWN, ServerFailedError),
     ],
     "rest": [
         (200, ProtocolError),
         (404, ProtocolError),
         (413, PayloadTooLargeError),
         (429, OverloadedError),
+        (500, ServerUnavailableError),
         (502, ServerUnavailableError),
     ],
 }
 
 
-@pytest.mark.parametrize("row", range(5))
+@pytest.mark.parametrize("row", range(6))
 def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, cloud) -> None:
     code, expected = NOT_DESCRIBED[transport][row]
     client, _ = failing(itertools.repeat(Problem("", code, code)), retry=False)

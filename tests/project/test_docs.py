@@ -32,9 +32,9 @@ DOCS = ROOT / "docs"
 PAGES = {page.name: page.read_text() for page in (*DOCS.glob("*.md"), *ROOT.glob("*.md"))}
 ALL_DOCS = "\n".join(PAGES[page.name] for page in DOCS.glob("*.md"))
 
-# Python that is compiled only: cameras that no machine has, a server with TLS (tests/service has
-# one), and a page whose blocks stand on each other (test_integrations.py).
-ABSENT = {"pyrealsense2", "pyk4a", "pyorbbecsdk", "zivid", "harvesters"}
+# Python that is compiled only: cameras that no machine has, a cluster and a server with TLS (tests
+# elsewhere have them), and a page whose blocks stand on each other (test_integrations.py).
+ABSENT = {"pyrealsense2", "pyk4a", "pyorbbecsdk", "zivid", "harvesters", "ray"}
 COMPILED = ("Tls(", *(f"import {name}" for name in ABSENT), *(f"from {name}" for name in ABSENT))
 ELSEWHERE = {"integrations.md"}
 # Commands of other programs, which change the machine or need what it has not.

@@ -71,7 +71,7 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
 def test_both_engines_have_one_hand() -> None:
     data = pytest.importorskip("pybullet_data", reason="pybullet is not installed")
     meshes = Path(data.getDataPath()) / "franka_panda" / "meshes" / "collision"
-    for name, points in (("hand", panda().palm), ("finger", panda().finger)):
+    for name, (points,) in (("hand", panda().palm), ("finger", panda().fingers[0])):
         mesh = np.concatenate([part.points for _, part in read_obj(meshes / f"{name}.obj")])
         np.testing.assert_allclose(mesh.min(axis=0), points.min(axis=0), atol=1e-4)
         np.testing.assert_allclose(mesh.max(axis=0), points.max(axis=0), atol=1e-4)

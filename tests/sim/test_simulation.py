@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_model.gripper import gripper_fields, gripper_names, load_gripper
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import FINGERTIP, GraspOutcome, retreat_pose
@@ -66,6 +67,40 @@ def test_antipodal_grasp_on_a_cube_holds(simulation: ClutterSimulation) -> None:
     assert not result.start_contact
     assert result.held is not None
     assert result.held.model.name == "cube"
+
+
+@pytest.mark.parametrize("name", gripper_names())
+def test_every_gripper_lifts_a_cube_between_its_pads(engine: str, name: str) -> None:
+    gripper = load_gripper(name)
+    T_world_hand = top_down(0.15, 0.15, 0.075 - FINGERTIP + gripper.contact_z_at(0.05))
+    with ClutterSimulation(engine=engine, gripper=gripper_fields(name)) as simulation:
+        simulation.reset_from_poses([cube_at(0.15, 0.15)])
+        result = simulation.try_grasp(T_world_hand, shake=True)
+    assert (result.success, result.held_after_shaking) == (True, True)
+    assert result.target is result.held
+    assert result.opening == pytest.approx(0.05, abs=1e-3)
+
+
+def test_fingers_that_swing_reach_what_others_miss(engine: str) -> None:
+    fields = gripper_fields("robotiq-2f-85")
+    above = top_down(0.15, 0.15, 0.105 - FINGERTIP + fields["tip_z"])  # 5 mm over the cube
+    held = []
+    for swing in (fields["swing"], None):
+        with ClutterSimulation(engine=engine, gripper=fields | {"swing": swing}) as simulation:
+            simulation.reset_from_poses([cube_at(0.15, 0.15)])
+            held.append(simulation.try_grasp(above).success)
+    assert held == [True, False]
+
+
+def test_what_is_wider_than_the_hand_opens_is_counted_and_not_held(engine: str) -> None:
+    fields = gripper_fields("wsg-50")
+    T_world_hand = top_down(0.15, 0.15, 0.075 - FINGERTIP + fields["contact_z"])
+    for opening, wide in ((0.06, 0), (0.045, 1)):
+        narrow = fields | {"max_opening": opening}
+        with ClutterSimulation(engine=engine, gripper=narrow) as simulation:
+            simulation.reset_from_poses([cube_at(0.15, 0.15)])
+            assert len(simulation.too_wide) == wide
+            assert simulation.try_grasp(T_world_hand).success is not bool(wide)
 
 
 def test_an_object_pressed_into_the_table_comes_out_on_top(world: World) -> None:

@@ -33,7 +33,7 @@ def hands(networks: Networks) -> NetworkConfig:
 
 
 def grasps_of(view: LabelledView, config: NetworkConfig, *, camera: bool = True) -> TriedGrasps:
-    return tried_grasps(view, config, load_gripper(), viewpoint_known=camera)
+    return tried_grasps(view, config, viewpoint_known=camera)
 
 
 def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, balls) -> None:

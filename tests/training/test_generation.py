@@ -4,8 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed
 from edgegrasp_sim.objects import SceneKind, blob
+from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
 from edgegrasp_training.shapes import made_object
 from edgegrasp_training.views import find_views, load_view
@@ -54,6 +56,29 @@ def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
         if installed(other):
             with pytest.raises(ValueError, match=f"holds labels of {engine}, not of {other}"):
                 list(generate(data, None, replace(SMALL, scenes=5, engine=other)))
+
+
+def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp_path) -> None:
+    options = replace(SMALL, scenes=3, views_per_scene=2, kind=SceneKind.PACKED, gripper="random")
+    list(generate(tmp_path, None, options))
+    paths = find_views([tmp_path])
+    views = [load_view(path) for path in paths]
+    openings = [view.hand.max_opening for view in views]
+    assert openings[::2] == openings[1::2]  # of the two views of each scene
+    assert len(set(openings)) == 3
+    assert all(0.04 <= opening <= 0.14 for opening in openings)
+    assert any(view.success.any() for view in views)
+    for view in views:
+        if len(view.tried()):
+            hand, seen = view.hand, tried_grasps(view, HAND).seen
+            told = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
+            assert seen.description[:, 71:74] == pytest.approx(
+                np.tile(told, (len(seen.points), 1)), rel=1e-3
+            )
+    before = paths[2].read_bytes()
+    paths[2].unlink()
+    list(generate(tmp_path, None, options))
+    assert paths[2].read_bytes() == before
 
 
 def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
@@ -53,7 +52,7 @@ def test_the_new_weights_answer_the_fitted_probability(
     assert recalibrated.training["recalibrated_from_digest"] == metadata.digest
     scale, shift = fit(read_outcomes(file, metadata.digest))
     assert shift < -0.5
-    grasps = tried_grasps(made_up_view(1), config, load_gripper())
+    grasps = tried_grasps(made_up_view(1), config)
     pack = pack_hands if name == "hands" else pack_balls
     batch = pack(grasps, grasps.balls(), config).batch
     with torch.inference_mode():

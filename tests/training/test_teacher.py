@@ -51,8 +51,8 @@ def test_a_teacher_scores_candidates_above_the_table(made_up_view, networks, vie
     assert chance[toward > 0.6].mean() > 1.5 * chance[toward < 0.2].mean()
 
     # Hands of the view's own labels get the scores of the network itself.
-    tried = tried_grasps(view, networks["hands"], gripper).candidates
-    hands = hand_batch(view, tried, gripper, view.camera_position, networks["hands"].hand_points)
+    tried = tried_grasps(view, networks["hands"]).candidates
+    hands = hand_batch(view, tried, view.camera_position, networks["hands"].hand_points)
     with torch.inference_mode():
         own = torch.sigmoid(teacher.network(hands) / teacher.metadata.temperature).numpy()
     pairs = list(zip(labels.approach_index.tolist(), labels.contact_index.tolist(), strict=True))
@@ -106,7 +106,7 @@ def test_soft_labels_are_packed_beside_the_labels_which_weigh_more(
     made_up_view: MakeView, networks: Networks, views: list[Path], teacher: Teacher
 ) -> None:
     labels = teacher.soft_labels(views[0])
-    grasps = tried_grasps(made_up_view(0), networks["balls"], load_gripper())
+    grasps = tried_grasps(made_up_view(0), networks["balls"])
     balls = np.unique(labels.approach_index).astype(np.int64)
     batch, label, weight = pack_balls(grasps, balls, networks["balls"], labels)
     tried = weight == TRIED_WEIGHT

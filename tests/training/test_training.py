@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
@@ -121,7 +120,7 @@ def test_a_run_may_start_from_weights_that_were_told_less(
         CheckpointMetadata("less", told_less, 0.0045, "panda"),
     )
     run = make_trainer(tmp_path / "run", start=tmp_path / "less.safetensors", steps=4)
-    grasps = tried_grasps(load_view(views[0]), told_less, load_gripper())
+    grasps = tried_grasps(load_view(views[0]), told_less)
     batch = pack_hands(grasps, grasps.balls(), told_less).batch
     with torch.no_grad():
         torch.testing.assert_close(run.average(batch), network(batch), rtol=0, atol=1e-5)
@@ -163,7 +162,7 @@ def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
 @pytest.mark.parametrize("name", ["balls", "vn"])
 def test_a_network_trained_in_other_units_scores_the_same_in_metres(made_up_view, networks, name):
     config = networks[name]
-    grasps = tried_grasps(made_up_view(1), config, load_gripper())
+    grasps = tried_grasps(made_up_view(1), config)
     batch = pack_balls(grasps, grasps.balls(), config).batch
     network = build_network(config, torch.Generator().manual_seed(1))
     prepare_to_train(network)
@@ -189,7 +188,7 @@ def test_scores_of_an_untrained_network_of_full_depth_differ(made_up_view, archi
     config = NetworkConfig(
         architecture, (32, 32, 32), (32, 32, 32), (64, 64), (64, 32, 16), crop_radius=0.04
     )
-    grasps = tried_grasps(made_up_view(1), config, load_gripper())
+    grasps = tried_grasps(made_up_view(1), config)
     batch = pack_balls(grasps, grasps.balls(), config).batch
     network = build_network(config)
     with torch.no_grad():

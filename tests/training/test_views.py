@@ -1,9 +1,12 @@
 import csv
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edgegrasp_model.gripper import gripper_fields, load_gripper
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_training.views import (
     LabelledView,
@@ -47,6 +50,14 @@ def test_a_view_comes_back_from_its_file(tmp_path: Path, hands: np.ndarray | Non
         assert read.T_world_hand is None
     else:
         np.testing.assert_array_equal(read.T_world_hand, hands)
+
+
+def test_a_view_knows_the_hand_that_tried_its_grasps(tmp_path: Path) -> None:
+    file = tmp_path / "pile_1-000001_0.npz"
+    some_view().save(file)
+    assert load_view(file).hand == load_gripper("panda")
+    replace(some_view(), gripper=json.dumps(gripper_fields("robotiq-2f-140"))).save(file)
+    assert load_view(file).hand == load_gripper("robotiq-2f-140")
 
 
 def test_scenes_never_fall_on_both_sides_and_keep_theirs_as_data_grows() -> None:

@@ -156,7 +156,10 @@ def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlann
 
     facts: dict[str, Any] = {"name": choice.name}
     sampling = {name: choice.options[name] for name in SAMPLING if name in choice.options}
+    hand = {name: choice.options[name] for name in ("gripper",) if name in choice.options}
     if choice.name in ("edge-sample", "oracle"):
+        if hand:
+            raise ValueError(f"planner is {choice.name!r}; its candidates are for the Panda alone")
         numbers = {name: getattr(rules, name) for name in SAMPLING} | sampling
         sampler = PaperCandidates(**numbers, voxel_size=rules.voxel_size)
         facts |= {"candidates": "paper", **sampling}
@@ -166,7 +169,7 @@ def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlann
     weights, model = choice.weights_and_model()
     used = ModelCatalogue.load(weights).get(model).metadata
     if choice.name == "oracle-own":
-        options = {"collision": "avoid", **sampling}
+        options = {"collision": "avoid", **sampling, **hand}
         own = OwnCandidates(rules, options, weights, model)
         facts |= {"candidates": "own", "voxel_size": used.voxel_size, "max_tries": MAX_TRIES}
         return ChosenPlanner(partial(OraclePlanner, own), facts | {"options": options})

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,14 +117,19 @@ class Contact(NamedTuple):
     distance: float
 
 
+Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3) metres
+
+
 @dataclass(frozen=True, slots=True)
 class HandModel:
     """A floating hand with two coupled fingers that slide apart along y.
 
     Attributes:
-        palm: points whose convex hull it is, hand frame, (P, 3) metres.
-        finger: the same of the finger at y > 0, in its own frame; the other is it turned about z.
+        palm: in the hand's frame.
+        fingers: that at y > 0 and the other, shut, each in its own frame.
         finger_base: metres along the hand's z to the fingers' frames.
+        finger_centre: centre of mass of the finger at y > 0, in its frame, metres.
+        tip: fingertips as they hold something, metres along z.
         centre: the palm's centre of mass, hand frame, metres.
         mass: of the palm, kg.
         friction: of the palm.
@@ -133,11 +138,16 @@ class HandModel:
         finger_force: with which each finger closes and opens, N.
         max_opening: metres between the fingers.
         tool_force: with which the hand is moved at most, N.
+        advance: how far the fingers are ahead of where they are in the open hand, metres: the
+            coefficients of 1, q, ..., q^4, where q is half the opening; None: they never are.
+        meshes: PyBullet's own files with palm and finger; None: its parts are boxes.
     """
 
-    palm: Matrix
-    finger: Matrix
+    palm: Parts
+    fingers: tuple[Parts, Parts]
     finger_base: float
+    finger_centre: tuple[float, float, float]
+    tip: float
     centre: tuple[float, float, float]
     mass: float
     friction: float
@@ -146,6 +156,8 @@ class HandModel:
     finger_force: float
     max_opening: float
     tool_force: float
+    advance: tuple[float, ...] | None = None
+    meshes: tuple[str, str] | None = None
 
 
 class World(ABC):

@@ -112,6 +112,13 @@ def _triangles(lines: list[str], known: int) -> NDArray[np.int64]:
     return np.where(triangles > 0, triangles - 1, known + triangles)
 
 
+def least_width(shape: Shape) -> float:
+    """The least distance of two planes that an object fits between, one along a face; metres."""
+    hull = ConvexHull(np.concatenate([part.points for part in shape.hulls]))
+    heights = hull.points[hull.vertices] @ hull.equations[:, :3].T
+    return float(np.ptp(heights, axis=0).min())
+
+
 def convex_hull(points: Matrix) -> Surface | None:
     """The convex hull of points (P, 3), faces outwards; None if it has no volume."""
     try:

@@ -39,6 +39,7 @@ FINGER_SPINNING_FRICTION = 0.005
 FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
+SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 CONSTANTS = {
     "time_step": TIME_STEP,
     "substeps": SUBSTEPS,
@@ -203,16 +204,18 @@ class MujocoWorld(World):
         joint = body.add_freejoint()
         joint.armature = ARM_INERTIA
         body.gravcomp = 1.0
-        palm = model.palm - model.centre
-        _weigh(body, model.mass, palm)
-        self._add_hull(
-            body, f"{body.name} palm", palm, friction=(model.friction, 0, 0), contype=_HAND
-        )
-        for side in (1.0, -1.0):
-            turned = model.finger * (side, side, 1.0)
+        palm = [part - model.centre for part in model.palm]
+        _weigh(body, model.mass, np.concatenate(palm))
+        friction = (model.friction, 0, 0)
+        for number, part in enumerate(palm):
+            name = f"{body.name} palm {number}"
+            self._add_hull(body, name, part, friction=friction, contype=_HAND)
+        carrier = body if model.advance is None else self._add_slide(body)
+        for side, parts in zip((1.0, -1.0), model.fingers, strict=True):
             base = np.array([0.0, 0.0, model.finger_base]) - model.centre
-            finger = body.add_body(name=f"{body.name} finger {side:+.0f}", pos=base, gravcomp=1.0)
-            _weigh(finger, model.finger_mass, turned)
+            name = f"{body.name} finger {side:+.0f}"
+            finger = carrier.add_body(name=name, pos=base, gravcomp=1.0)
+            _weigh(finger, model.finger_mass, np.concatenate(parts))
             finger.add_joint(
                 name=finger.name,
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
@@ -223,15 +226,16 @@ class MujocoWorld(World):
                 solref_limit=(CONTACT_SECONDS, 1.0),
                 solimp_limit=IMPEDANCE,
             )
-            self._add_hull(
-                finger,
-                finger.name,
-                turned,
-                friction=(model.finger_friction, FINGER_SPINNING_FRICTION, 0),
-                condim=4,
-                priority=2,
-                contype=_HAND,
-            )
+            for number, part in enumerate(parts):
+                self._add_hull(
+                    finger,
+                    f"{finger.name} {number}",
+                    part,
+                    friction=(model.finger_friction, FINGER_SPINNING_FRICTION, 0),
+                    condim=4,
+                    priority=2,
+                    contype=_HAND,
+                )
             self.spec.add_actuator(
                 name=finger.name,
                 trntype=mujoco.mjtTrn.mjTRN_JOINT,
@@ -243,16 +247,11 @@ class MujocoWorld(World):
                 forcerange=(-model.finger_force, model.finger_force),
             )
         self._drag(body, model.tool_force)
-        one, other = (joint.name for joint in body.find_all("joint")[1:])
-        self.spec.add_equality(
-            type=mujoco.mjtEq.mjEQ_JOINT,
-            name1=one,
-            name2=other,
-            data=[0.0, 1.0] + 10 * [0.0],
-            solref=(CONTACT_SECONDS, 1.0),
-            solimp=IMPEDANCE,
-        )
-        self._hand = MujocoHand(self, body, palm, model)
+        *slide, one, other = (joint.name for joint in body.find_all("joint")[1:])
+        self._couple(one, other, (0.0, 1.0))
+        if model.advance is not None:
+            self._couple(slide[0], one, model.advance)
+        self._hand = MujocoHand(self, body, np.concatenate(palm), model)
         self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
         return self._hand
 
@@ -282,6 +281,26 @@ class MujocoWorld(World):
         self.spec.add_mesh(name=name, uservert=points.ravel())
         kind = mujoco.mjtGeom.mjGEOM_MESH
         body.add_geom(type=kind, meshname=name, group=_SOLID, **contact)
+
+    def _add_slide(self, body: Any) -> Any:
+        """Add what carries fingers that swing, which slides along z."""
+        slide = body.add_body(name=f"{body.name} slide", gravcomp=1.0)
+        slide.explicitinertial = True
+        slide.mass, slide.inertia = SLIDE_MASS, [1e-5] * 3
+        kind = mujoco.mjtJoint.mjJNT_SLIDE
+        slide.add_joint(name=slide.name, type=kind, axis=(0.0, 0.0, 1.0), armature=FINGER_INERTIA)
+        return slide
+
+    def _couple(self, joint: str, other: str, polynomial: Sequence[float]) -> None:
+        """Keep a joint where a polynomial of another's place has it."""
+        self.spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            name1=joint,
+            name2=other,
+            data=[*polynomial, *(12 - len(polynomial)) * [0.0]],
+            solref=(CONTACT_SECONDS, 1.0),
+            solimp=IMPEDANCE,
+        )
 
     def _drag(self, body: Any, force: float) -> None:
         """Pull a body to the pose of a target, by springs of limited force along all six axes."""
@@ -378,7 +397,7 @@ class MujocoHand(MujocoBody, Hand):
 
     @property
     def opening(self) -> float:
-        one, other = self.world.places(self.uid)[0][7:].tolist()
+        one, other = self.world.places(self.uid)[0][-2:].tolist()
         return float(one + other)
 
     def set_pose(
@@ -386,7 +405,8 @@ class MujocoHand(MujocoBody, Hand):
     ) -> None:
         super().set_pose(position, quaternion_xyzw)
         data = self.world.data
-        self.world.places(self.uid)[0][7:] = 0.5 * self.hand.max_opening
+        joints = self.world.places(self.uid)[0][7:]
+        joints[:-2], joints[-2:] = 0.0, 0.5 * self.hand.max_opening
         data.ctrl[:2] = FINGER_SPEED
         data.mocap_pos[0] = position
         self.move(position, quaternion_xyzw)

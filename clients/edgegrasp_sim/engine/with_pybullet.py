@@ -16,6 +16,7 @@ from edgegrasp_sim.engine import (
     Hand,
     HandModel,
     Intrinsics,
+    Parts,
     World,
 )
 from edgegrasp_sim.poses import Matrix
@@ -28,6 +29,7 @@ FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
 GEAR_FORCE = 30.0  # N, which keeps the fingers at one opening
 GEAR_ERP = 0.1
+SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 CONSTANTS = {
     "time_step": TIME_STEP,
     "solver_iterations": SOLVER_ITERATIONS,
@@ -73,9 +75,12 @@ class PybulletWorld(World):
             physicsClientId=self.client,
         )
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self.client)
+        self._hand: PybulletHand | None = None
 
     def step(self, steps: int = 1) -> None:
         for _ in range(steps):
+            if self._hand is not None:
+                self._hand.swing()
             pybullet.stepSimulation(physicsClientId=self.client)
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
@@ -143,7 +148,8 @@ class PybulletWorld(World):
         return body
 
     def add_hand(self, model: HandModel, position: Matrix) -> "PybulletHand":
-        return PybulletHand(self.client, model, position)
+        self._hand = PybulletHand(self.client, model, position)
+        return self._hand
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         view = np.linalg.inv(T_world_camera)
@@ -209,31 +215,42 @@ class PybulletBody(Body):
 
 
 class PybulletHand(PybulletBody, Hand):
-    """A hand whose fingers are its links 0 and 1; a fixed constraint drags its palm."""
+    """A hand whose last two links are its fingers; a fixed constraint drags its palm.
+
+    Fingers that swing slide along y on a link that slides along z.
+    """
 
     def __init__(self, client: int, model: HandModel, position: Matrix) -> None:
         self.model = model
-        fingers = [_hull(client, "finger.obj", each) for each in (_STRAIGHT, _HALF_TURN)]
+        if model.meshes is None:
+            palm, *fingers = (_boxes(client, each) for each in (model.palm, *model.fingers))
+        else:
+            palm = _hull(client, model.meshes[0], _STRAIGHT)
+            fingers = [_hull(client, model.meshes[1], each) for each in (_STRAIGHT, _HALF_TURN)]
+        x, y, z = model.finger_centre
+        ahead = 0 if model.advance is None else 1  # links before the fingers
+        links = ahead + 2
         uid = pybullet.createMultiBody(
             baseMass=model.mass,
-            baseCollisionShapeIndex=_hull(client, "hand.obj", _STRAIGHT),
+            baseCollisionShapeIndex=palm,
             basePosition=position,
             baseInertialFramePosition=model.centre,
-            linkMasses=[model.finger_mass] * 2,
-            linkCollisionShapeIndices=fingers,
-            linkVisualShapeIndices=[-1] * 2,
-            linkPositions=[[0.0, 0.0, model.finger_base]] * 2,
-            linkOrientations=[_STRAIGHT] * 2,
-            linkInertialFramePositions=[[0.0, 0.01, 0.02], [0.0, -0.01, 0.02]],
-            linkInertialFrameOrientations=[_STRAIGHT] * 2,
-            linkParentIndices=[0] * 2,
-            linkJointTypes=[pybullet.JOINT_PRISMATIC] * 2,
-            linkJointAxis=[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]],
+            linkMasses=[SLIDE_MASS] * ahead + [model.finger_mass] * 2,
+            linkCollisionShapeIndices=[-1] * ahead + fingers,
+            linkVisualShapeIndices=[-1] * links,
+            linkPositions=[[0.0, 0.0, 0.0]] * ahead + [[0.0, 0.0, model.finger_base]] * 2,
+            linkOrientations=[_STRAIGHT] * links,
+            linkInertialFramePositions=[[0.0, 0.0, 0.0]] * ahead + [[x, y, z], [x, -y, z]],
+            linkInertialFrameOrientations=[_STRAIGHT] * links,
+            linkParentIndices=[0] * ahead + [ahead] * 2,
+            linkJointTypes=[pybullet.JOINT_PRISMATIC] * links,
+            linkJointAxis=[[0.0, 0.0, 1.0]] * ahead + [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]],
             physicsClientId=client,
         )
         super().__init__(client, int(uid))
+        self._fingers = ahead, ahead + 1
         self.change(-1, lateralFriction=model.friction, mass=model.mass)
-        for finger in (0, 1):
+        for finger in self._fingers:
             self.change(
                 finger,
                 lateralFriction=model.finger_friction,
@@ -250,7 +267,15 @@ class PybulletHand(PybulletBody, Hand):
         )
         along = [1.0, 0.0, 0.0]
         gear = pybullet.createConstraint(
-            self.uid, 0, self.uid, 1, pybullet.JOINT_GEAR, along, none, none, physicsClientId=client
+            self.uid,
+            self._fingers[0],
+            self.uid,
+            self._fingers[1],
+            pybullet.JOINT_GEAR,
+            along,
+            none,
+            none,
+            physicsClientId=client,
         )
         pybullet.changeConstraint(
             gear, gearRatio=-1.0, erp=GEAR_ERP, maxForce=GEAR_FORCE, physicsClientId=client
@@ -258,7 +283,7 @@ class PybulletHand(PybulletBody, Hand):
 
     @property
     def opening(self) -> float:
-        states = pybullet.getJointStates(self.uid, (0, 1), physicsClientId=self.client)
+        states = pybullet.getJointStates(self.uid, self._fingers, physicsClientId=self.client)
         return float(states[0][0]) + float(states[1][0])
 
     def set_pose(
@@ -267,7 +292,9 @@ class PybulletHand(PybulletBody, Hand):
         super().set_pose(position, quaternion_xyzw)
         self.move(position, quaternion_xyzw)
         half = 0.5 * self.model.max_opening
-        for finger in (0, 1):
+        if self.model.advance is not None:
+            pybullet.resetJointState(self.uid, 0, 0.0, physicsClientId=self.client)
+        for finger in self._fingers:
             pybullet.resetJointState(self.uid, finger, half, physicsClientId=self.client)
             self._drive(finger, half)
 
@@ -281,8 +308,24 @@ class PybulletHand(PybulletBody, Hand):
         )
 
     def close_fingers(self) -> None:
-        for finger in (0, 1):
+        for finger in self._fingers:
             self._drive(finger, 0.0)
+
+    def swing(self) -> None:
+        """Have the fingers come forward in the next step as far as they will have closed."""
+        if self.model.advance is None:
+            return
+        finger = pybullet.getJointState(self.uid, self._fingers[0], physicsClientId=self.client)
+        half = finger[0] + TIME_STEP * finger[1]
+        pybullet.setJointMotorControl2(
+            self.uid,
+            0,
+            pybullet.POSITION_CONTROL,
+            targetPosition=float(np.polynomial.polynomial.polyval(half, self.model.advance)),
+            force=self.model.tool_force,
+            positionGain=1.0,
+            physicsClientId=self.client,
+        )
 
     def _drive(self, finger: int, position: float) -> None:
         """Let a finger's motor pull toward a place, metres from the middle."""
@@ -302,6 +345,19 @@ def _hull(client: int, mesh: str, quaternion_xyzw: Sequence[float]) -> int:
         pybullet.GEOM_MESH,
         fileName=str(_MESHES / mesh),
         collisionFrameOrientation=quaternion_xyzw,
+        physicsClientId=client,
+    )
+    return int(shape)
+
+
+def _boxes(client: int, parts: Parts) -> int:
+    """A collision shape: the boxes around some parts."""
+    shape = pybullet.createCollisionShapeArray(
+        shapeTypes=[pybullet.GEOM_BOX] * len(parts),
+        halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
+        collisionFramePositions=[
+            ((part.min(axis=0) + part.max(axis=0)) / 2).tolist() for part in parts
+        ],
         physicsClientId=client,
     )
     return int(shape)

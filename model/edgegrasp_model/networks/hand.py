@@ -38,6 +38,7 @@ Float32 = NDArray[np.float32]
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
+CONSTANT = 1e-6  # spread below which a number of the description counts as always the same
 CHUNK = 32  # hands at a time, so that the work stays in cache
 
 
@@ -136,7 +137,8 @@ class HandNet(nn.Module):
         """Stores mean (F,) and standard deviation (F,) of the training data's descriptions."""
         size = self.config.description_size
         self.mean.copy_(mean[:size])
-        self.std.copy_(std[:size].clamp_min(1e-3))
+        # What never varied, such as the only hand's opening, must say little where it does.
+        self.std.copy_(torch.where(std < CONSTANT, 1.0, std.clamp_min(1e-3))[:size])
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
         """Scores the edge grasps of a batch: logits (E,) of success.

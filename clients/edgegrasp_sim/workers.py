@@ -1,0 +1,180 @@
+"""Tasks that do not depend on each other: in this process, in several, or on a Ray cluster."""
+
+import ctypes
+import importlib
+import multiprocessing
+import os
+import pickle
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, nullcontext
+from functools import lru_cache
+from itertools import islice
+from typing import Any, TypeAlias, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+# Makes, in the process that uses it, what does a task; must be picklable unless that is this one.
+MakeRunner: TypeAlias = Callable[[], Callable[[Task], Result]]
+
+MAX_CRASHES = 3  # of processes in a row without a result between them; of one task on a cluster
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
+LOCAL_RAY = "local"  # address of a cluster that is started on this machine for the run
+
+
+def run_tasks(
+    make_runner: MakeRunner[Task, Result],
+    tasks: Sequence[Task],
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+) -> Iterator[tuple[Task, Result]]:
+    """Do tasks whose results depend on nothing but the task.
+
+    Args:
+        make_runner: called once in every process; what it makes is closed if it is made in this
+            one and can be.
+        tasks: what to do.
+        workers: how many at a time; with 1 all in this process. By default as many as there are
+            cores here, or processors in the cluster. If a worker dies, another does its task
+            again.
+        ray: address of a Ray cluster, as `ray.init` takes it; `local` starts one on this machine.
+            Each of its machines needs this package and the files that runners read, at the same
+            paths.
+
+    Yields:
+        Tasks and their results, as they finish.
+
+    Raises:
+        ValueError: `workers` below 1.
+        RuntimeError: workers keep dying, or there is no such Ray cluster.
+    """
+    if workers is not None and workers < 1:
+        raise ValueError(f"workers is {workers}; use at least 1")
+    if ray is not None:
+        return _on_ray(ray, make_runner, tasks, workers)
+    processes = min(workers or available_cores(), len(tasks))
+    if processes > 1:
+        return _in_processes(make_runner, tasks, processes)
+    return _here(make_runner, tasks)
+
+
+def available_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _here(
+    make_runner: MakeRunner[Task, Result], tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result]]:
+    if not tasks:
+        return
+    run: Any = make_runner()
+    with closing(run) if hasattr(run, "close") else nullcontext():
+        for task in tasks:
+            yield task, run(task)
+
+
+def _in_processes(
+    make_runner: MakeRunner[Task, Result], tasks: Sequence[Task], workers: int
+) -> Iterator[tuple[Task, Result]]:
+    """If a process dies, the pool breaks and a new one takes its place."""
+    missing, crashes = list(tasks), 0
+    made = pickle.dumps(make_runner)
+    while missing:
+        # Forked children would share the parent's physics servers.
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers, context, initializer=_start_process)
+        try:
+            with _one_thread_each():
+                futures = {pool.submit(_run, made, task): task for task in missing}
+            for future in as_completed(futures):
+                result, task = future.result(), futures[future]
+                crashes = 0
+                missing.remove(task)
+                yield task, result
+        except BrokenProcessPool:
+            crashes += 1
+            if crashes >= MAX_CRASHES:
+                raise RuntimeError(
+                    f"worker processes died {crashes} times in a row with {len(missing)} tasks "
+                    "left; run with one worker to see why"
+                ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _start_process() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)  # however the parent ends
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Make processes started meanwhile use one thread each: all cores are busy anyway."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update({name: value or "1" for name, value in before.items()})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+
+
+def _run(made: bytes, task: Any) -> Any:
+    """Do a task in a worker."""
+    return _runner(made)(task)
+
+
+@lru_cache(maxsize=1)
+def _runner(made: bytes) -> Callable[[Any], Any]:
+    """What a pickled factory makes, kept for the tasks that follow."""
+    runner: Callable[[Any], Any] = pickle.loads(made)()
+    return runner
+
+
+def _on_ray(
+    address: str,
+    make_runner: MakeRunner[Task, Result],
+    tasks: Sequence[Task],
+    workers: int | None,
+) -> Iterator[tuple[Task, Result]]:
+    """Tasks of Ray, not actors: one of a lost machine runs again wherever there is room."""
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ModuleNotFoundError:
+        raise RuntimeError("ray is not installed: pip install 'edgegrasp[ray]'") from None
+    if not tasks:
+        return
+    own: dict[str, Any] = {}
+    if address == LOCAL_RAY:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # only read from there
+        own = {"num_cpus": workers or available_cores(), "include_dashboard": False}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR", **own)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        raise RuntimeError(f"no Ray cluster at {address!r}: {error}") from error
+    try:
+        most = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
+        made = ray.put(ray.cloudpickle.dumps(make_runner))
+        run = ray.remote(num_cpus=1, max_retries=MAX_CRASHES)(_run)
+        waiting, running = iter(tasks), dict[Any, Task]()
+        while True:
+            for task in islice(waiting, most - len(running)):
+                running[run.remote(made, task)] = task
+            if not running:
+                break
+            (done, *_), _ = ray.wait(list(running))
+            yield running.pop(done), ray.get(done)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    except ray.exceptions.RayError as error:
+        raise RuntimeError(f"a Ray worker died again and again: {error}") from error
+    finally:
+        ray.shutdown()
