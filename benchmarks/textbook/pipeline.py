@@ -151,7 +151,7 @@ def detect(
     found = candidates(points, normals, rows, table_height)
     if len(found.contact) > most:
         some = np.sort(rng.choice(len(found.contact), most, replace=False))
-        found = Candidates(*(getattr(found, name)[some] for name in found.__annotations__))
+        found = Candidates(*(getattr(found, name)[some] for name in Candidates.__annotations__))
     batch = balls(points, normals, rows, found)
     with torch.inference_mode():
         score = torch.sigmoid(logits(batch)).numpy()
