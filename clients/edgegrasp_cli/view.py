@@ -2,9 +2,10 @@
 
 import json
 import shutil
+import signal
 import tempfile
-import time
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -32,6 +33,8 @@ def view(
 
     from edgegrasp_client.local_server import local_server
 
+    # A terminal that is closed or a supervisor ends it as Ctrl-C does: its server goes with it.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     given = {"intrinsics": intrinsics, "depth_scale": depth_scale, "viewpoint": viewpoint}
     with tempfile.TemporaryDirectory() as folder:
         flags = []
@@ -49,8 +52,5 @@ def view(
             print(f"{own.http_url}/playground/ (Ctrl-C ends it)", flush=True)
             if browser:
                 webbrowser.open(f"{own.http_url}/playground/")
-            try:
-                while True:
-                    time.sleep(3600.0)
-            except KeyboardInterrupt:
-                pass
+            with suppress(KeyboardInterrupt):
+                signal.pause()

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import pytest
 
 
-def test_a_scene_is_served_until_ctrl_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_a_scene_is_served_until_it_is_told_to_end(end: signal.Signals, tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", np.full((4, 6), 500, np.uint16))
     program = "from edgegrasp_cli.main import main; main()"
     flags = ("--depth", tmp_path / "depth.npy", "--intrinsics", "30,30,3,2", "--no-browser")
@@ -24,8 +26,10 @@ def test_a_scene_is_served_until_ctrl_c(tmp_path: Path) -> None:
             assert file == (tmp_path / "depth.npy").read_bytes()
             assert httpx.get(address).status_code == 200
         finally:
-            viewer.send_signal(signal.SIGINT)
+            viewer.send_signal(end)
         assert viewer.wait(timeout=30) == 0
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(address)
 
 
 def test_a_file_that_is_not_there_is_named(refused) -> None:
