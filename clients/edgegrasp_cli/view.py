@@ -33,8 +33,9 @@ def view(
 
     from edgegrasp_client.local_server import local_server
 
-    # A terminal that is closed or a supervisor ends it as Ctrl-C does: its server goes with it.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A supervisor ends it as Ctrl-C does, also in the background: its server goes with it.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     given = {"intrinsics": intrinsics, "depth_scale": depth_scale, "viewpoint": viewpoint}
     with tempfile.TemporaryDirectory() as folder:
         flags = []
