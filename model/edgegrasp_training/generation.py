@@ -166,7 +166,9 @@ def generate(
     missing = missing_scenes(folder, options)
     sets = {}
     if objects is not None:
-        sets = {kind: ObjectSet.from_folder(objects, kind, "train") for kind in CLUTTER}
+        wanted = {options.kind_of(index).objects for index in missing}
+        there = [kind for kind in CLUTTER if kind in wanted or (objects / kind).is_dir()]
+        sets = {kind: ObjectSet.from_folder(objects, kind, "train") for kind in there}
     digests = [drawn.digest for drawn in sets.values()]
     make_runner = partial(_scene_maker, sets, digests, options)
     for index, views in run_tasks(make_runner, missing, workers=workers, ray=ray):
@@ -208,10 +210,11 @@ def generate_scene(
     """Generate all views of one scene, of the built-in objects where there are no sets."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(6)]
     kind = options.kind_of(index)
-    # Some scenes are made of the other kind's objects.
+    # Some scenes are made of the other kind's objects, where there are any.
     source = kind.objects
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:
-        source = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
+        other = SceneKind.PILE if source is SceneKind.PACKED else SceneKind.PACKED
+        source = other if other in sets else source
     views = []
     with TemporaryDirectory() as shapes:
         drawn = sets.get(source)

@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from typer.testing import CliRunner
@@ -91,8 +90,6 @@ def test_a_recorded_request_is_answered_again(transport, run, refused, tmp_path,
         job, facts = Job("DetectGrasps", transport, b"", 60.0), Facts(grasps=7)
         return job, Answer(body("plus", 1.0), facts), Answer(body(path.stem, 2.0), facts)
 
-    recording = ModuleType("edgegrasp_service.recording")
-    recording.replay = replay  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "edgegrasp_service.recording", recording)
+    monkeypatch.setattr("edgegrasp_cli.replay.answer_again", replay)
     assert "7 grasps\nthe answer is the same" in run("replay", "request", "plus.job")
     assert "differs" in refused("replay", "request", "small.job")
