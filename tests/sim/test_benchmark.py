@@ -116,17 +116,6 @@ def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
 
 
 # Starting a Ray cluster leaves sockets and processes to the garbage collector.
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::FutureWarning"
-)
-def test_a_ray_cluster_changes_nothing(alone: tuple[BenchmarkConfig, str]) -> None:
-    pytest.importorskip("ray", reason="the extra `ray` is not installed")
-    config, digest = alone
-    rounds = run_benchmark(config, make_planner, workers=2, ray="local")
-    assert attempts_digest(rounds) == digest
-
-
 @pytest.mark.parametrize(
     ("error", "expected", "message"),
     [("RayTaskError", PlannerUnavailableError, "gone"), ("NodeDiedError", RuntimeError, "again")],
