@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 Points = NDArray[np.float64]
 
@@ -311,10 +312,7 @@ def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
             low, high = np.asarray(shape["min"]), np.asarray(shape["max"])
             corners = (low + high) / 2 + corners * (high - low) / 2
         else:
-            x, y, z, w = shape.get("quaternion", (0.0, 0.0, 0.0, 1.0))
-            vector = np.array([x, y, z])
-            corners = corners * shape["half_extents"]
-            twice = 2 * np.cross(vector, corners)
-            corners = shape["center"] + corners + w * twice + np.cross(vector, twice)
+            turn = Rotation.from_quat(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
+            corners = shape["center"] + turn.apply(corners * shape["half_extents"])
         for first, second in EDGES:
             yield corners[[first, second]]

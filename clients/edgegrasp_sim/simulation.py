@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self, TypedDict, Unpack
 
@@ -167,8 +168,7 @@ class ClutterSimulation:
         return [
             model
             for model, scale in ((item.model, item.scale) for item in self._objects)
-            if least_width(read_urdf(model.urdf, scale * model.scale))
-            > self._hand.model.max_opening
+            if _least_width(model.urdf) * scale * model.scale > self._hand.model.max_opening
         ]
 
     @property
@@ -474,3 +474,8 @@ def _inside(points: Matrix, low: Matrix, high: Matrix) -> NDArray[np.bool_]:
     """Which points (N, 3) lie in a box or within 3 mm of it."""
     inside = (points > low - 0.003) & (points < high + 0.003)
     return np.asarray(inside.all(axis=1))
+
+
+@cache
+def _least_width(urdf: Path) -> float:
+    return least_width(read_urdf(urdf, 1.0))

@@ -148,18 +148,18 @@ def _inserted(
     Those for which that is before the contact is TIP_MARGIN inside the fingertips are left out.
     """
     least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
+    room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support
     if support is not None:
         fall = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
-        room = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
-        room = np.where(fall > LEVEL, room / np.maximum(fall, LEVEL), np.inf)
-        enough = np.flatnonzero(room >= least)
-        candidates, room = candidates.take(enough), room[enough]
+        height = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
+        room = np.where(fall > LEVEL, height / np.maximum(fall, LEVEL), room)
+    enough = np.flatnonzero(room >= least)
+    candidates = candidates.take(enough)
     boxes = gripper.boxes(gripper.max_opening)
     boxes[:, 0] -= margin
     boxes[:, 1] += margin
     way = free_way(points, candidates.T_cloud_hand, boxes, APPROACH_LENGTH) - CLEARANCE
-    if support is not None:
-        way = np.minimum(way, room)
+    way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)
     hands = candidates.take(row)
     hands.T_cloud_hand[:, :3, 3] -= np.minimum(way[row], MAX_INSERTION)[:, None] * hands.approach

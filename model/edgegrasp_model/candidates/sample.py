@@ -188,9 +188,11 @@ def _constrained(
         centred = centred_grasps(scene.cloud.points, crop, candidates, gripper)
         candidates = Candidates.concatenate([candidates, centred])
     points, margin = scene.cloud.points, options.collision.margin
+    is_contact = np.zeros(len(points), dtype=bool)
+    is_contact[pairs[1]] = True
     across = [
         outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-        for each in outlines(points, scene.viewpoint, np.unique(pairs[1]))
+        for each in outlines(points, scene.viewpoint, np.flatnonzero(is_contact))
     ]
     candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))
