@@ -208,6 +208,25 @@ def test_no_hand_closes_on_a_wall_beside_a_thing() -> None:
         assert abs(closing[0]) < 0.5
 
 
+@pytest.mark.parametrize("height", [0.02, 0.05, 0.075])  # below a rim at 0.06, and above
+def test_a_thing_that_leans_on_a_wall_is_a_thing_up_to_it(height: float) -> None:
+    walls = bin_walls(0.4, 0.3, 0.06, wall=0.012)
+    leaning = box((-0.168, 0.0, height / 2), (0.025, 0.06, height / 2))
+    T_world_camera = camera(0.1, -1.5, 0.7)
+    found = detect(render([table(), *walls, leaning], T_world_camera))
+    assert len(found.objects) == 1
+    size = 2 * np.sort(found.objects[0].half_extents[:2])
+    assert size == pytest.approx([0.05, 0.12], abs=0.015)
+
+
+def test_one_large_thing_in_the_corner_of_a_shallow_bin_is_found() -> None:
+    walls = bin_walls(0.5, 0.35, 0.05, wall=0.01)  # its floor is near enough to be the support
+    jar = box((0.19, 0.115, 0.045), (0.03, 0.04, 0.035))
+    found = detect(render([table(), *walls, jar], camera(0.1, -1.5, 0.8)))
+    assert len(found.objects) == 1
+    assert found.grasps
+
+
 def test_the_walls_of_a_bin_whose_inside_is_the_workspace_are_not_grasped() -> None:
     rng = np.random.default_rng(4)
     contents = [

@@ -26,7 +26,7 @@ INSIDE = 0.8  # share of a thing that lies over the support
 OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
-STANDS_OUT = 2.0  # margins over the plane that a thing rises at least
+STANDS_OUT = 1.5  # margins over the plane that a thing rises at least
 # In place of a thing's number: furniture; what may belong to one; the floor of an open box.
 FIXED, UNKNOWN, BOX_FLOOR = -1, -2, -3
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
@@ -46,7 +46,8 @@ FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
 WALL = 0.02  # metres inside the outline that belong to a wall whose rim is not seen
-BESIDE = 0.008  # metres further in that noise takes a wall's points
+BESIDE = 0.006  # metres further in that noise takes a wall's points
+FREE = 0.010  # metres further in still, where what is seen is no part of a wall
 HOLLOW = 0.02  # metres that the inside is seen below the rim
 SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
 FLOOR, MIN_FLOOR = 0.012, 0.2  # metres over a box's floor; share of the box where it is seen
@@ -106,7 +107,7 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
             continue
         contents = _around_workspace(mine, view)
         if contents is None and length > MIN_BOX:
-            contents = box_contents(view.plan[mine], view.height[mine])
+            contents = box_contents(view.plan[mine], view.height[mine], view.on)
         if contents is not None:
             number[mine[contents.walls]] = FIXED
             number[mine[contents.floor]] = BOX_FLOOR
@@ -209,31 +210,36 @@ class Contents(NamedTuple):
     floor: Bools  # (M,)
 
 
-def box_contents(plan: Float64, height: NDArray[np.floating]) -> Contents | None:
+def box_contents(plan: Float64, height: NDArray[np.floating], on: Float64) -> Contents | None:
     """What lies in an open box of points (M, 2), (M,); None where it is none.
 
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
-    is lower inside.
+    is lower inside, or the support (K, 2) is seen there.
     """
-    from_side, levels = _rims(plan, height, plan)
+    around, levels = _rims(plan, height, plan)
     if len(levels) < 3:
         return None
     # Stray points beside the walls lie lower than the rim: again, around the rim alone.
     level = np.median(levels)
-    rim = (np.abs(height - level) < LEVEL) & (from_side.min(axis=0) < 2 * STRIP)
-    from_side, levels = _rims(plan, height, plan[rim])
+    rim = (np.abs(height - level) < LEVEL) & (around.from_sides(plan).min(axis=0) < 2 * STRIP)
+    around, levels = _rims(plan, height, plan[rim])
+    from_side, along = around.from_sides(plan), around.along_sides(plan)
     rim = np.abs(height - level) < LEVEL / 2
-    from_wall = np.min([distance - _wall(distance[rim]) for distance in from_side], axis=0)
-    inside: Bools = from_wall > 0
-    walls, deep = ~inside, from_wall > WALL
-    if len(levels) < 3 or inside.sum() < MIN_POINTS:
+    wall = np.array([_wall(*side) for side in zip(along[:, rim], from_side[:, rim], strict=True)])
+    from_wall = (from_side - wall[:, None]).min(axis=0)
+    between: Bools = from_wall > 0
+    if len(levels) < 3 or between.sum() < MIN_POINTS:
         return None
-    if np.percentile(height[inside], 5) > level - HOLLOW:
+    bare = (around.from_sides(on) > wall[:, None]).all(axis=0)
+    floor_seen = occupied_cells(on[bare]) * CELL**2 > MIN_FLOOR * around.size.prod()
+    if np.percentile(height[between], 5) > level - HOLLOW and not floor_seen:
         return None
-    lowest = np.percentile(height[inside], 3)
-    floor = inside & (height < lowest + FLOOR)
-    size = from_side[::2, 0] + from_side[1::2, 0]
-    if occupied_cells(plan[floor]) * CELL**2 < MIN_FLOOR * size.prod():
+    on_rim = (height > level + LEVEL) & (from_side.min(axis=0) > 0)
+    inside = between | on_rim
+    walls, deep = ~inside, from_wall > FREE
+    lowest = np.percentile(height[between], 3)
+    floor = between & (height < lowest + FLOOR)
+    if floor_seen or occupied_cells(plan[floor]) * CELL**2 < MIN_FLOOR * around.size.prod():
         floor[:] = False
     return Contents(inside & ~floor, walls, deep, floor)
 
@@ -266,8 +272,25 @@ def _cells(plan: Float64, size: float = CELL) -> Int64:
     return np.asarray(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1])
 
 
-def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
-    """The smallest rectangle around points (M, 2): its axes (2, 2), low corner on them, size."""
+class Rectangle(NamedTuple):
+    """A rectangle in a plane; metres."""
+
+    axes: Float64  # (2, 2) unit, along its sides
+    low: Float64  # (2,) its lowest corner, on them
+    size: Float64  # (2,)
+
+    def from_sides(self, plan: Float64) -> Float64:
+        """Distances (4, M) of points (M, 2) from its sides, positive inside."""
+        x, y = (plan @ self.axes.T - self.low).T
+        return np.stack([x, self.size[0] - x, y, self.size[1] - y])
+
+    def along_sides(self, plan: Float64) -> Float64:
+        """Places (4, M) of points (M, 2) along the same sides."""
+        return np.repeat((plan @ self.axes.T - self.low).T[::-1], 2, axis=0)
+
+
+def smallest_rectangle(plan: Float64) -> Rectangle:
+    """The smallest rectangle around points (M, 2)."""
     try:
         corners = plan[ConvexHull(plan).vertices]
     except (QhullError, ValueError):  # too few points, or all in a line
@@ -280,31 +303,38 @@ def smallest_rectangle(plan: Float64) -> tuple[Float64, Float64, Float64]:
     turned = np.einsum("kad,cd->kca", axes, corners)
     size = np.ptp(turned, axis=1)
     best = int(size.prod(axis=1).argmin())
-    return axes[best], turned[best].min(axis=0), size[best]
+    return Rectangle(axes[best], turned[best].min(axis=0), size[best])
 
 
 def _rims(
     plan: Float64, height: NDArray[np.floating], around: Float64
-) -> tuple[Float64, list[float]]:
-    """Distance (4, M) of points (M, 2) from the sides of the smallest rectangle around some.
+) -> tuple[Rectangle, list[float]]:
+    """The smallest rectangle around some points, and heights of the level rims along its sides.
 
-    And the heights of the level rims along those sides; none of a small rectangle.
+    Of a small rectangle there are none.
     """
-    axes, low, size = smallest_rectangle(around[_dense(around)])
-    place = plan @ axes.T - low
-    from_side = np.stack([place[:, 0], size[0] - place[:, 0], place[:, 1], size[1] - place[:, 1]])
-    levels = []
-    for side, distance in enumerate(from_side if size.min() > MIN_WIDTH else from_side[:0]):
+    rectangle = smallest_rectangle(around[_dense(around)])
+    size, levels = rectangle.size, []
+    for length, along, distance in zip(
+        np.repeat(size[::-1], 2),
+        rectangle.along_sides(plan),
+        rectangle.from_sides(plan),
+        strict=True,
+    ):
         at = distance < STRIP
-        along = 1 - side // 2
-        levels.append(_rim(place[at, along], height[at], float(size[along])))
-    return from_side, [level for level in levels if level is not None]
+        levels.append(_rim(along[at], height[at], length) if size.min() > MIN_WIDTH else None)
+    return rectangle, [level for level in levels if level is not None]
 
 
-def _wall(distance: Float64) -> float:
-    """How far in a wall goes whose rim's points have a distance (M,) from its outside; metres."""
-    near = distance[distance < 2 * STRIP]
-    return float(np.percentile(near, 90)) + BESIDE if len(near) else WALL
+def _wall(along: Float64, distance: Float64) -> float:
+    """How far in a wall goes whose rim's points are at places (M,) and distances (M,); metres.
+
+    The median along it: what leans on it here or there does not count.
+    """
+    near = distance < 2 * STRIP
+    step, distance = (along[near] / STEP).astype(np.int64), distance[near]
+    ends = [np.percentile(distance[step == one], 90) for one in np.unique(step)]
+    return float(np.median(ends)) + BESIDE if ends else WALL
 
 
 def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
@@ -324,11 +354,10 @@ def _is_heap(plan: Float64, height: NDArray[np.floating], most: float) -> bool:
 
     Of a box, most points are on the sides of a rectangle, and on a level top.
     """
-    axes, low, size = smallest_rectangle(plan)
-    place = plan @ axes.T - low
-    side = np.minimum(place, size - place).min(axis=1) < STRIP
+    rectangle = smallest_rectangle(plan)
+    side = rectangle.from_sides(plan).min(axis=0) < STRIP
     level = np.abs(height - np.percentile(height, 90)) < LEVEL
-    flat = size.max() <= most and np.ptp(height) <= HEAP_HEIGHT * most
+    flat = rectangle.size.max() <= most and np.ptp(height) <= HEAP_HEIGHT * most
     return bool(flat and (side | level).mean() < BOX_SHARE)
 
 
