@@ -11,7 +11,13 @@ from scipy.spatial import cKDTree
 
 from edgegrasp_model.kernels import heights_and_distances, least_spread
 from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane
-from edgegrasp_model.scene.things import PlaneView, find_things, occupied_cells, plan_axes
+from edgegrasp_model.scene.things import (
+    PlaneView,
+    find_things,
+    number_cells,
+    occupied_cells,
+    plan_axes,
+)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -42,6 +48,8 @@ GIVEN_MARGIN = 0.005  # metres, over a plane that is given and not seen
 DEVIATIONS = 4.0  # of a plane's own points that still belong to it
 MAX_BOW = 0.025  # metres by which a support may rise over its plane, as seen
 STIFF = 1e-6 * np.eye(6)  # keeps a support flat where too little of it is seen
+DECAY = 0.35  # of the heights of what is left of a support, within which half of its points are
+TAIL = 5.0  # times as high as half of its points are nearly all
 MIN_SEEN = 200  # points of a given plane from which its residual is measured
 
 
@@ -196,6 +204,7 @@ def measured(
     # Where the cloud was cut off above the plane, only what stands on it is near.
     if near.sum() < MIN_SEEN or (height[near] < 0).mean() < 0.2:
         flat, unknown = np.zeros(6), math.nan
+        least = max(least, _left_over((points - origin) @ axes[:2].T, height))
         return Support(plane, unknown, share or 0.0, unknown, USUAL_DISTANCE, least, flat, axes)
     terms = _squares((points - origin) @ axes[:2].T)
     bow: Float64 = np.zeros(6)
@@ -208,6 +217,22 @@ def measured(
     spread = 1.4826 * float(np.median(off / np.square(apart / middle)))
     found = share or float(near.mean())
     return Support(plane, float(np.median(off)), found, spread, middle, least, bow, axes)
+
+
+def _left_over(plan: Float64, height: Float64) -> float:
+    """How high noise takes points (N, 2), (N,) of a support that was cut off, but not all; metres.
+
+    They become fewer with height, unlike those of flat things.
+    """
+    over = height > 0
+    cell, height = number_cells(plan[over], CELL), height[over]
+    top = np.zeros(cell.max(initial=-1) + 1)
+    np.maximum.at(top, cell, height)
+    bare = height[top[cell] < MAX_MARGIN]
+    if np.count_nonzero(top[top > 0] < MAX_MARGIN) * CELL**2 < MIN_AREA:
+        return 0.0
+    low, middle, high = np.quantile(bare, (0.01, 0.5, 0.99))
+    return float(low + TAIL * (middle - low)) if middle - low < DECAY * (high - low) else 0.0
 
 
 def raised(support: Support, seen: Seen) -> Support:

@@ -26,7 +26,7 @@ INSIDE = 0.8  # share of a thing that lies over the support
 OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
-STANDS_OUT = 1.5  # margins over the plane that a thing rises at least
+STANDS_OUT = 0.003  # metres over what belongs to the plane that a thing rises at least
 # In place of a thing's number: furniture; what may belong to one; the floor of an open box.
 FIXED, UNKNOWN, BOX_FLOOR = -1, -2, -3
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
@@ -99,7 +99,7 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
     outline = support_outline(view.on)
     for mine in clusters(view.plan, view.height, cell):
         some = mine[:: len(mine) // MEASURED + 1]
-        if np.percentile(view.height[some] / view.margin[some], 98) < STANDS_OUT:
+        if np.percentile(view.height[some] - view.margin[some], 98) < STANDS_OUT:
             continue
         length = _length(view.plan[some], view.height[some])
         if view.beyond is not None and (view.beyond[mine] == 0).mean() > SURE:
@@ -254,17 +254,17 @@ def _around_workspace(rows: Int64, view: PlaneView) -> Contents | None:
 
 def _dense(plan: Float64) -> Bools:
     """Which points (M, 2) have about as many around them as the others."""
-    number = _cells(plan)
+    number = number_cells(plan)
     count = np.bincount(number)
     return np.asarray(count[number] >= SPARSE * np.median(count[count > 0]))
 
 
 def occupied_cells(plan: Float64, size: float = CELL) -> int:
     """How many cells of a size points (M, 2) lie in."""
-    return int(np.count_nonzero(np.bincount(_cells(plan, size))))
+    return int(np.count_nonzero(np.bincount(number_cells(plan, size))))
 
 
-def _cells(plan: Float64, size: float = CELL) -> Int64:
+def number_cells(plan: Float64, size: float = CELL) -> Int64:
     """The number (M,) of the cell that each point (M, 2) is in."""
     if len(plan) == 0:
         return np.zeros(0, dtype=np.int64)
