@@ -219,9 +219,10 @@ def test_a_thing_that_leans_on_a_wall_is_a_thing_up_to_it(height: float) -> None
     assert size == pytest.approx([0.05, 0.12], abs=0.015)
 
 
-def test_one_large_thing_in_the_corner_of_a_shallow_bin_is_found() -> None:
+@pytest.mark.parametrize("place", [(0.19, 0.115), (0.0, 0.0)])  # a corner, the middle
+def test_one_large_thing_in_a_shallow_bin_is_found(place: tuple[float, float]) -> None:
     walls = bin_walls(0.5, 0.35, 0.05, wall=0.01)  # its floor is near enough to be the support
-    jar = box((0.19, 0.115, 0.045), (0.03, 0.04, 0.035))
+    jar = box((*place, 0.045), (0.03, 0.04, 0.035))
     found = detect(render([table(), *walls, jar], camera(0.1, -1.5, 0.8)))
     assert len(found.objects) == 1
     assert found.grasps

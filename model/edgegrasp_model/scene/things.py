@@ -46,11 +46,13 @@ FILLED = 0.6  # share of a side along which a wall is seen at one height
 LEVEL = 0.02  # metres of height within which a rim is level
 MIN_WIDTH = 0.2  # metres between the walls of an open box
 WALL = 0.02  # metres inside the outline that belong to a wall whose rim is not seen
+BARE = 30  # percent of a wall's length, at least, on which nothing leans
 BESIDE = 0.006  # metres further in that noise takes a wall's points
 FREE = 0.010  # metres further in still, where what is seen is no part of a wall
 HOLLOW = 0.02  # metres that the inside is seen below the rim
-SPARSE = 0.2  # of the usual number of points in a cell, below which they are noise beside a box
+SPARSE = 0.5  # of the usual number of points in a cell, below which they are noise beside a box
 FLOOR, MIN_FLOOR = 0.012, 0.2  # metres over a box's floor; share of the box where it is seen
+MOST_FLOOR = 0.5  # that share where the support, too, is seen in the box
 
 
 class PlaneView(NamedTuple):
@@ -228,18 +230,18 @@ def box_contents(plan: Float64, height: NDArray[np.floating], on: Float64) -> Co
     wall = np.array([_wall(*side) for side in zip(along[:, rim], from_side[:, rim], strict=True)])
     from_wall = (from_side - wall[:, None]).min(axis=0)
     between: Bools = from_wall > 0
-    if len(levels) < 3 or between.sum() < MIN_POINTS:
-        return None
     bare = (around.from_sides(on) > wall[:, None]).all(axis=0)
     floor_seen = occupied_cells(on[bare]) * CELL**2 > MIN_FLOOR * around.size.prod()
-    if np.percentile(height[between], 5) > level - HOLLOW and not floor_seen:
+    seen = between.sum() >= MIN_POINTS
+    lowest, low = np.percentile(height[between], (3, 5)) if seen else (np.inf, np.inf)
+    if len(levels) < 3 or not (floor_seen or low < level - HOLLOW):
         return None
     on_rim = (height > level + LEVEL) & (from_side.min(axis=0) > 0)
     inside = between | on_rim
     walls, deep = ~inside, from_wall > FREE
-    lowest = np.percentile(height[between], 3)
     floor = between & (height < lowest + FLOOR)
-    if floor_seen or occupied_cells(plan[floor]) * CELL**2 < MIN_FLOOR * around.size.prod():
+    least = MOST_FLOOR if floor_seen else MIN_FLOOR
+    if occupied_cells(plan[floor]) * CELL**2 < least * around.size.prod():
         floor[:] = False
     return Contents(inside & ~floor, walls, deep, floor)
 
@@ -329,12 +331,12 @@ def _rims(
 def _wall(along: Float64, distance: Float64) -> float:
     """How far in a wall goes whose rim's points are at places (M,) and distances (M,); metres.
 
-    The median along it: what leans on it here or there does not count.
+    What leans on it, as far as most of its length, does not count.
     """
     near = distance < 2 * STRIP
     step, distance = (along[near] / STEP).astype(np.int64), distance[near]
     ends = [np.percentile(distance[step == one], 90) for one in np.unique(step)]
-    return float(np.median(ends)) + BESIDE if ends else WALL
+    return float(np.percentile(ends, BARE)) + BESIDE if ends else WALL
 
 
 def _rim(along: Float64, height: NDArray[np.floating], length: float) -> float | None:
