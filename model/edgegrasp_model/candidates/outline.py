@@ -31,6 +31,7 @@ Bools = NDArray[np.bool_]
 OUTLINE_RADIUS = 0.016  # metres of surface that say where an outline runs
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
 THIN = 0.003  # metres of standard deviation across a rim, which is all outline
+LEAN, LEANING = np.float32(np.radians(30.0)), 8  # off above; directions around it
 DROP = 0.006  # metres below an edge from which a surface is another one
 GAP = 0.007  # metres without a point in which a surface ends
 ONE_VIEW = np.cos(np.radians(15.0))  # directions nearer to each other show the same outline
@@ -48,19 +49,28 @@ class Outline:
     is_edge: Bools  # (N,)
 
 
-def outlines(points: Float32, viewpoint: Float32 | None, rows: Int64) -> list[Outline]:
+def outlines(
+    points: Float32, viewpoint: Float32 | None, rows: Int64, *, leaning: bool = False
+) -> list[Outline]:
     """The outlines of a cloud from above and, where that is another direction, from the camera.
 
     Args:
         points: (N, 3) canonical frame, metres.
         viewpoint: (3,) the only camera; None where it is unknown, or there are several.
         rows: (M,) of the points to look at.
+        leaning: Also from all around, LEAN off above.
     """
     seen = [_outline(points, np.broadcast_to(UP, points.shape), rows)]
     if viewpoint is not None:
         toward = viewpoint - points
         toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
         seen.append(_outline(points, toward, rows[toward[rows] @ UP < ONE_VIEW]))
+    if leaning:
+        turns = np.linspace(0.0, 2 * np.pi, LEANING, endpoint=False, dtype=np.float32)
+        for turn in turns:
+            level = np.array([np.cos(turn), np.sin(turn), 0.0], dtype=np.float32)
+            toward = np.cos(LEAN) * UP + np.sin(LEAN) * level
+            seen.append(_outline(points, np.broadcast_to(toward, points.shape), rows))
     return seen
 
 

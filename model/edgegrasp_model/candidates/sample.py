@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,7 +30,8 @@ from edgegrasp_model.scene.scene import Scene
 Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-SAMPLING_ATTEMPTS = 4  # further approach points are tried where every hand collides
+SAMPLING_ATTEMPTS = 4  # further approach points are tried where few hands are free
+FEW = 16  # hands free of collision
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
@@ -66,6 +68,14 @@ class Sample:
     row: Int64  # (E,) their rows in it
 
 
+class _Tried(NamedTuple):
+    approach_index: Int64  # (A,)
+    crop: BallCrop
+    attempt: Attempt
+    row: Int64  # (C,) of its candidates, those that were checked for collision
+    free: Bools  # (C,) which of those do not collide
+
+
 def sample_candidates(
     scene: Scene,
     options: DetectOptions,
@@ -88,36 +98,31 @@ def sample_candidates(
         At most num_candidates candidates. With `collision: avoid` none of them collides.
     """
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
-    rng_candidates = np.random.default_rng([options.seed, CANDIDATE_STREAM])
+    rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
-    limit = OVERSAMPLING * options.num_candidates
-    attempts: list[Attempt] = []
-    while True:
+    mode, limit = options.collision.mode, OVERSAMPLING * options.num_candidates
+    tried: list[_Tried] = []
+    while len(tried) < SAMPLING_ATTEMPTS:
         approach_index = approach_points(scene, approach_rows, options, rng_approach)
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        this = _constrained(scene, approach_index, crop, options, gripper, counts, centre)
-        attempts.append(this)
-        passed = np.flatnonzero(this.outcome == CODE[Outcome.RETURNED])
-        row = passed[random_rows(len(passed), limit, rng_candidates)]
-        this.outcome[passed] = CODE[Outcome.NOT_CHECKED]
-        candidates = this.candidates.take(row)
-        free = ~collides(scene, candidates.T_cloud_hand, gripper, options.collision)
-        ignored = options.collision.mode == "ignore"
-        this.outcome[row] = CODE[Outcome.NOT_SCORED]
-        if not ignored:
-            this.outcome[row[~free]] = CODE[Outcome.COLLISION]
-        add_count(counts, "checked", len(row))
-        add_count(counts, "collision_free", int(free.sum()))
-        found = len(row) > 0 if ignored else free.any()
+        attempt = _constrained(
+            scene, approach_index, crop, options, gripper, counts, centre, leaning=bool(tried)
+        )
+        row, free = _checked(attempt, scene, options, gripper, limit, counts, rng)
+        tried.append(_Tried(approach_index, crop, attempt, row, free))
+        found = len(row) if mode == "ignore" else int(free.sum())
         # A further attempt would draw the same approach points and candidates.
-        exhausted = len(approach_rows) <= len(approach_index) and len(passed) <= limit
-        if found or exhausted or len(attempts) == SAMPLING_ATTEMPTS:
+        exhausted = len(approach_rows) <= len(approach_index) and len(row) < limit
+        if found >= FEW or (len(tried) > 1 and (found or exhausted)):
             break
-    new = free | (options.collision.mode != "avoid")
+    tried.sort(key=lambda one: int(one.free.sum()))
+    approach_index, crop, attempt, row, free = tried[-1]
+    candidates = attempt.candidates.take(row)
+    new = free | (mode != "avoid")
     T_cloud_tcp = candidates.T_cloud_hand[new] @ gripper.T_hand_tcp
     new[new] = distinct_hands(T_cloud_tcp, free[new], *alike(options))
-    scored = rows_to_score(free, new, options, rng_candidates)
-    this.outcome[row[scored]] = CODE[Outcome.RETURNED]
+    scored = rows_to_score(free, new, options, rng)
+    attempt.outcome[row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
     candidates = candidates.take(scored)
     return Sample(
@@ -126,9 +131,32 @@ def sample_candidates(
         candidates,
         hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
         free[scored],
-        attempts,
+        [one.attempt for one in tried],
         row[scored],
     )
+
+
+def _checked(
+    attempt: Attempt,
+    scene: Scene,
+    options: DetectOptions,
+    gripper: Gripper,
+    limit: int,
+    counts: dict[str, int],
+    rng: np.random.Generator,
+) -> tuple[Int64, Bools]:
+    """At most `limit` of an attempt's candidates (C,), and which of them (C,) do not collide."""
+    passed = np.flatnonzero(attempt.outcome == CODE[Outcome.RETURNED])
+    row = passed[random_rows(len(passed), limit, rng)]
+    attempt.outcome[passed] = CODE[Outcome.NOT_CHECKED]
+    T_cloud_hand = attempt.candidates.T_cloud_hand[row]
+    free = ~collides(scene, T_cloud_hand, gripper, options.collision)
+    attempt.outcome[row] = CODE[Outcome.NOT_SCORED]
+    if options.collision.mode != "ignore":
+        attempt.outcome[row[~free]] = CODE[Outcome.COLLISION]
+    add_count(counts, "checked", len(row))
+    add_count(counts, "collision_free", int(free.sum()))
+    return row, free
 
 
 def approach_points(
@@ -175,6 +203,8 @@ def _constrained(
     gripper: Gripper,
     counts: dict[str, int],
     centre: bool,
+    *,
+    leaning: bool,
 ) -> Attempt:
     """The edge grasps of some balls, and which satisfy every constraint but collision avoidance."""
     add_count(counts, "approach_points", len(approach_index))
@@ -192,7 +222,7 @@ def _constrained(
     is_contact[pairs[1]] = True
     across = [
         outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-        for each in outlines(points, scene.viewpoint, np.flatnonzero(is_contact))
+        for each in outlines(points, scene.viewpoint, np.flatnonzero(is_contact), leaning=leaning)
     ]
     candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))
