@@ -100,6 +100,23 @@ def test_a_bin_has_contents_and_no_rims(polar: float, height: float) -> None:
         assert min(one.distance(contact[None])[0] for one in contents) < 0.01
 
 
+@pytest.mark.parametrize(("noise", "height"), [(0.003, 0.022), (0.0, 0.012)])
+def test_what_is_left_of_a_table_that_was_cut_off_is_no_thing(noise: float, height: float) -> None:
+    flat = box((0.02, 0.01, height / 2), (0.03, 0.06, height / 2), 0.3)
+    T_world_camera = camera(0.5, -1.5, 0.6)
+    cloud = render([table(), flat], T_world_camera).reshape(-1, 3)
+    points = cloud[np.isfinite(cloud).all(axis=1)] @ T_world_camera[:3, :3].T
+    points += T_world_camera[:3, 3]
+    points += np.random.default_rng(1).normal(0, noise, points.shape)
+    near = (np.abs(points[:, :2]) < 0.15).all(axis=1) & (points[:, 2] > 0.005)
+    plane = {"normal": (0, 0, 1), "offset": 0.0}
+    options = {"viewpoint": T_world_camera[:3, 3].tolist(), "support": plane}
+    found = detector().detect(points[near].astype(np.float32), parse_options(options))
+    assert len(found.objects) == 1
+    assert 2 * found.objects[0].half_extents[:2].max() == pytest.approx(0.12, abs=0.03)
+    assert found.grasps
+
+
 def test_a_workspace_is_where_grasps_are_and_what_is_beyond_stays() -> None:
     boxes = [box((-0.05, 0, 0.05), (0.02, 0.03, 0.05)), box((0.12, 0, 0.05), (0.02, 0.03, 0.05))]
     cloud = render([table(), *boxes], camera(0.8, -1.5, 0.7))
