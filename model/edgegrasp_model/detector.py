@@ -57,6 +57,7 @@ NO_APPROACH_POINT = (
     "half of its points: around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
+MANY_HANDS = 30  # different ones that weights have learned from; then any will do
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
@@ -308,7 +309,8 @@ class GraspDetector:
         if options.gripper is not None:  # the ball has to hold every contact within reach
             radius = max(radius, gripper.max_opening / 2)
         prepared = Prepared(options, gripper, radius, warnings=list(sent.warnings))
-        if gripper.name != self.gripper.name:
+        hands = self.metadata.training.get("training_hands", 1)
+        if gripper.name != self.gripper.name and hands < MANY_HANDS:
             prepared.warnings.append(
                 f"the weights were trained for the gripper {self.gripper.name!r}: for "
                 f"{gripper.name!r} their scores rank grasps, but promise less."

@@ -138,6 +138,15 @@ def engine_of(path: Path) -> str:
         return str(arrays.get("engine", LabelledView.engine))
 
 
+def hands_of(paths: Iterable[Path]) -> int:
+    """How many different hands tried the grasps of some views."""
+    hands = set()
+    for path in paths:
+        with np.load(path, allow_pickle=False) as arrays:
+            hands.add(str(arrays.get("gripper", "")))
+    return len(hands)
+
+
 def find_views(folders: list[Path]) -> list[Path]:
     """All view files of some folders, sorted by name.
 

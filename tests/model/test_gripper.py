@@ -1,6 +1,7 @@
 """Grippers from files and requests, and what each of them makes of edges and points."""
 
 import tomllib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import TIP_MARGIN, edge_grasps, support_clearance
 from edgegrasp_model.candidates.outline import MAX_INSERTION
+from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.gripper import (
     GRIPPER_FOLDER,
@@ -209,6 +211,15 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         assert grasp.width <= np.float32(gripper.max_opening)
     told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
     assert told == (gripper.name != "panda")
+
+
+def test_weights_that_learned_from_many_hands_promise_as_much_for_any_other() -> None:
+    of_one = detector()
+    metadata = replace(of_one.metadata, training={"training_hands": 400})
+    of_many = GraspDetector(of_one.network, metadata, of_one.gripper)
+    found = of_many.detect(box_on_table(), DetectOptions(viewpoint=VIEW, gripper="wsg-50"))
+    assert found.grasps
+    assert not any("trained for" in warning for warning in found.warnings)
 
 
 def test_a_wider_gripper_reaches_contacts_beyond_the_ball_of_the_weights() -> None:
