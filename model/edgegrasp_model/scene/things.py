@@ -26,7 +26,7 @@ INSIDE = 0.8  # share of a thing that lies over the support
 OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
-STANDS_OUT = 0.003  # metres over what belongs to the plane that a thing rises at least
+STANDS_OUT = 0.004  # metres over what belongs to the plane that a thing rises at least
 # In place of a thing's number: furniture; what may belong to one; the floor of an open box.
 FIXED, UNKNOWN, BOX_FLOOR = -1, -2, -3
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
