@@ -13,7 +13,7 @@ import numpy as np
 from edgegrasp_sim.camera import TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
-from edgegrasp_sim.surroundings import SIZE, TABLE_HEIGHT
+from edgegrasp_sim.surroundings import SIZE, TABLE_DEPTH, TABLE_HEIGHT
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
@@ -32,6 +32,7 @@ class SceneRules:
         num_objects: how many objects to try to place, in turn from round to round.
         packed_scale: range of the factor on the objects' size in packed scenes and on tables.
         pile_scale: the same for piles and bins.
+        table_thickness: of packed and pile scenes, metres.
     """
 
     workspace_size: float
@@ -39,6 +40,7 @@ class SceneRules:
     num_objects: tuple[int, ...]
     packed_scale: Range
     pile_scale: Range
+    table_thickness: float = TABLE_DEPTH
 
     def __post_init__(self) -> None:
         # The simulated workspace has a fixed size; a protocol only records it.

@@ -41,8 +41,10 @@ from edgegrasp_sim.scene import (
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
+    TABLE_DEPTH,
     TABLE_HEIGHT,
     Surroundings,
+    open_table,
     random_bin,
     random_table,
 )
@@ -196,6 +198,7 @@ class ClutterSimulation:
         rng: np.random.Generator,
         num_objects: int = 5,
         scales: tuple[float, float] | None = None,
+        table_thickness: float = TABLE_DEPTH,
     ) -> int:
         """Make a new scene at rest.
 
@@ -204,6 +207,7 @@ class ClutterSimulation:
             rng: the scene's own stream.
             num_objects: how many to try to place.
             scales: range of the factor on the objects' size; by default the scene's own.
+            table_thickness: of packed and pile scenes, metres.
 
         Returns:
             How many objects are there.
@@ -219,10 +223,10 @@ class ClutterSimulation:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
         match kind:
             case SceneKind.PACKED:
-                self._clear(OPEN_TABLE)
+                self._clear(open_table(table_thickness))
                 made = make_packed(self.world, objects, rng, num_objects, scales or PACKED_SCALE)
             case SceneKind.PILE:
-                self._clear(OPEN_TABLE)
+                self._clear(open_table(table_thickness))
                 made = make_pile(self.world, objects, rng, num_objects, scales or PILE_SCALE)
             case SceneKind.BIN:
                 around = self._clear(random_bin(rng))

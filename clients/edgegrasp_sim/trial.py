@@ -201,6 +201,7 @@ class RoundDriver:
             random_stream(seed, index, Stream.SCENE),
             protocol.num_objects(index),
             protocol.scene.scale(scene),
+            protocol.scene.table_thickness,
         )
         self.view = -1
         self.end: RoundEnd | None = None

@@ -17,6 +17,10 @@ def test_variants_differ_from_the_paper_s_protocol_in_one_thing() -> None:
     planning = replace(memory.planning, selection="best")
     assert memory.planning.selection == "elsewhere"
     assert replace(memory, name="edgegrasp", source=paper.source, planning=planning) == paper
+    thin = load_protocol("edgegrasp-thin")
+    scene = replace(thin.scene, table_thickness=paper.scene.table_thickness)
+    assert thin.scene.table_thickness == 0.012
+    assert replace(thin, name="edgegrasp", version=paper.version, scene=scene) == paper
 
 
 def test_a_protocol_comes_back_from_a_manifest() -> None:
@@ -62,6 +66,6 @@ def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: st
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         FileNotFoundError,
-        match="bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, giga, robot, table, vgn",
+        match="bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, robot, table, vgn",
     ):
         load_protocol("paper")

@@ -38,6 +38,16 @@ def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: Sce
     assert resting.mean() >= 0.5  # round ones roll on a while
 
 
+@pytest.mark.parametrize("thickness", [0.012, 0.2])
+def test_a_table_is_as_thick_as_the_protocol_has_it(
+    simulation: ClutterSimulation, thickness: float
+) -> None:
+    simulation.reset(SceneKind.PILE, np.random.default_rng(0), 1, table_thickness=thickness)
+    (table,) = simulation.surroundings.boxes
+    assert table.size[2] == thickness
+    assert table.centre[2] + thickness / 2 == pytest.approx(TABLE_HEIGHT)
+
+
 def test_a_bin_has_a_floor_and_walls_around_it() -> None:
     heights = set()
     for seed in range(8):
