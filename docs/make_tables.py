@@ -177,9 +177,10 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
                 f"{seconds:.2f} s" if seconds is not None else "",
             )
         )
-    for row in published("edgegrasp", scene):
-        title = f"*{row['method']}* ({row['source']})"
-        lines.append((title, "edgegrasp", row.get("samples", ""), "", *published_rates(row), ""))
+    for protocol in ("edgegrasp", "giga"):
+        for row in published(protocol, scene):
+            title, samples = f"*{row['method']}* ({row['source']})", row.get("samples", "")
+            lines.append((title, protocol, samples, "", *published_rates(row), ""))
     return table(head, lines)
 
 
