@@ -171,6 +171,16 @@ def test_a_speck_before_a_thing_is_no_part_of_it() -> None:
         assert boxes[0].distance(contact[None])[0] < 0.012
 
 
+def test_points_scattered_over_the_table_are_no_thing() -> None:
+    boxes, T_world_camera = [box((0.1, 0, 0.05), (0.03, 0.04, 0.05))], camera(0.5, -1.5, 0.7)
+    cloud = render([table(), *boxes], T_world_camera)
+    in_world = cloud @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    patch = np.flatnonzero(np.abs(in_world[..., :2] - (-0.1, 0.0)).max(axis=2) < 0.03)
+    raised = np.random.default_rng(2).choice(patch, 30, replace=False)
+    cloud.reshape(-1, 3)[raised] *= 0.98  # 12 mm over the table
+    assert standing(detect(cloud), boxes, T_world_camera) == {0}
+
+
 def test_without_a_support_in_view_everything_is_a_thing_and_the_answer_says_so() -> None:
     cloud = render([box((0, 0, 0), (0.03, 0.04, 0.06), 0.4)], camera(0.8, -1.5, 0.5))
     found = detect(cloud)

@@ -159,14 +159,15 @@ def _standing_on(
     # Where the cloud was cut off above the support, what is near it does not tell its outline.
     near = (np.abs(height) < thick) & math.isfinite(support.spread)
     on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
-    on_plan = support.plan(sent.points[on[:: max(len(on) // ON, 1)]])
+    each = max(len(on) // ON, 1)
+    on_plan = support.plan(sent.points[on[::each]])
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
     plan = support.plan(sent.points)
     height, margin = height[above], margin[above]
     number = np.full(len(plan), FIXED)
     rest = np.flatnonzero(~np.isin(sent.row, [] if walls is None else walls))
     border = None if seen.at_border is None else seen.at_border[rest]
-    view = PlaneView(plan[rest], height[rest], margin[rest], on_plan, border)
+    view = PlaneView(plan[rest], height[rest], margin[rest], on_plan, border, each)
     number[rest] = _numbers(view, sent.take(rest), seen.take(rest), inside[rest], options, warnings)
     return _Standing(sent, seen, inside, plan, number)
 

@@ -27,6 +27,8 @@ OVERHANG = 0.02  # metres beyond the support's outline that a thing may reach
 CUT_OFF = 0.005  # share of a thing's points at the image's border from which it is cut off
 CUT_OFF_POINTS = 3
 STANDS_OUT = 0.004  # metres over what belongs to the plane that a thing rises at least
+BESIDE_THING = 0.06  # metres around a thing within which the support's points are counted
+SCATTERED = 0.3  # of their number in a cell, below which points are noise
 # In place of a thing's number: furniture; what may belong to one; the floor of an open box.
 FIXED, UNKNOWN, BOX_FLOOR = -1, -2, -3
 SURE = 0.85  # share of a cluster that lies where the caller says that things are
@@ -63,6 +65,7 @@ class PlaneView(NamedTuple):
     margin: NDArray[np.floating]  # (M,) metres over it that still belong to it
     on: Float64  # (K, 2) points that belong to it, metres along it
     at_border: Bools | None  # (M,) at the border of the camera's image; None: unknown
+    on_each: int = 1  # points that each of `on` stands for
     beyond: Int64 | None = None  # (M,) side of the workspace that each is beyond; 0: in it
 
 
@@ -102,6 +105,8 @@ def find_things(view: PlaneView, max_size: float, cell: float = CELL, strict: bo
     for mine in clusters(view.plan, view.height, cell):
         some = mine[:: len(mine) // MEASURED + 1]
         if np.percentile(view.height[some] - view.margin[some], 98) < STANDS_OUT:
+            continue
+        if _is_noise(mine, view):
             continue
         length = _length(view.plan[some], view.height[some])
         if view.beyond is not None and (view.beyond[mine] == 0).mean() > SURE:
@@ -368,6 +373,17 @@ def _length(plan: Float64, height: NDArray[np.floating]) -> float:
     around = plan - plan.mean(axis=0)
     _, vectors = np.linalg.eigh(around.T @ around)
     return max(float(np.ptp(around @ vectors, axis=0).max()), float(np.ptp(height)))
+
+
+def _is_noise(rows: Int64, view: PlaneView) -> bool:
+    """Whether points lie much further apart than those of the support around them."""
+    plan = view.plan[rows]
+    low, high = plan.min(axis=0) - BESIDE_THING, plan.max(axis=0) + BESIDE_THING
+    near = view.on[((view.on > low) & (view.on < high)).all(axis=1)]
+    if len(near) < MIN_POINTS:
+        return False
+    around = len(near) * view.on_each / occupied_cells(near)
+    return len(rows) / occupied_cells(plan) < SCATTERED * around
 
 
 def _whole(rows: Int64, view: PlaneView) -> bool:
