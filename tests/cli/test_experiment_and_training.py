@@ -74,7 +74,9 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(run, tmp_path, mo
     assert second["cases"][0]["planner"]["num_candidates"] == 4000  # the protocol's, as planned
 
 
-PROTOCOLS = "bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, robot, table, vgn"
+PROTOCOLS = (
+    "bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, robot, table, vgn"
+)
 
 
 @pytest.mark.parametrize(
