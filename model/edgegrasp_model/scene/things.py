@@ -376,7 +376,9 @@ def _length(plan: Float64, height: NDArray[np.floating]) -> float:
 
 
 def _is_noise(rows: Int64, view: PlaneView) -> bool:
-    """Whether points lie much further apart than those of the support around them."""
+    """Whether some points, not many, lie much further apart than the support's around them."""
+    if len(rows) > MEASURED:
+        return False
     plan = view.plan[rows]
     low, high = plan.min(axis=0) - BESIDE_THING, plan.max(axis=0) + BESIDE_THING
     near = view.on[((view.on > low) & (view.on < high)).all(axis=1)]
