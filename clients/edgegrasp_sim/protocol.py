@@ -13,7 +13,7 @@ import numpy as np
 from edgegrasp_sim.camera import TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
-from edgegrasp_sim.surroundings import SIZE, TABLE_DEPTH, TABLE_HEIGHT
+from edgegrasp_sim.surroundings import OPEN_THICKNESS, SIZE, TABLE_HEIGHT
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
@@ -40,7 +40,7 @@ class SceneRules:
     num_objects: tuple[int, ...]
     packed_scale: Range
     pile_scale: Range
-    table_thickness: float = TABLE_DEPTH
+    table_thickness: float = OPEN_THICKNESS
 
     def __post_init__(self) -> None:
         # The simulated workspace has a fixed size; a protocol only records it.

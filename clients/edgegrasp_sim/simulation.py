@@ -41,7 +41,7 @@ from edgegrasp_sim.scene import (
 from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
-    TABLE_DEPTH,
+    OPEN_THICKNESS,
     TABLE_HEIGHT,
     Surroundings,
     open_table,
@@ -198,7 +198,7 @@ class ClutterSimulation:
         rng: np.random.Generator,
         num_objects: int = 5,
         scales: tuple[float, float] | None = None,
-        table_thickness: float = TABLE_DEPTH,
+        table_thickness: float = OPEN_THICKNESS,
     ) -> int:
         """Make a new scene at rest.
 

@@ -12,8 +12,8 @@ from edgegrasp_sim.poses import Matrix
 
 SIZE = 0.30  # metres, edge of the workspace cube
 TABLE_HEIGHT = 0.05  # metres
-TABLE_LENGTHS = 1.2, 1.2  # metres
-TABLE_DEPTH = 0.2  # metres; objects sink into a thin table, as into the reference's of 12 mm
+OPEN_EXTENT = 1.2  # metres along both sides of an open table
+OPEN_THICKNESS = 0.2  # metres; objects sink into a thin table, as into the reference's of 12 mm
 TABLE_FRICTION = 0.5
 WALL_FRICTION = 0.5
 SUPPORT_CLEARANCE = 0.005  # metres over the table at which the workspace begins
@@ -101,9 +101,9 @@ def _slab(size: Matrix, top: float, x: float = MIDDLE, y: float = MIDDLE) -> Box
     return Box((length, width, height), centre, friction=TABLE_FRICTION, obstacle=False)
 
 
-def open_table(thickness: float = TABLE_DEPTH) -> Surroundings:
+def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
     """Nothing but a table, of a thickness in metres."""
-    table = _slab(np.array([*TABLE_LENGTHS, thickness]), TABLE_HEIGHT)
+    table = _slab(np.array([OPEN_EXTENT, OPEN_EXTENT, thickness]), TABLE_HEIGHT)
     return Surroundings((table,), WORKSPACE, ((0.0, 0.0, 0.0), (SIZE, SIZE, np.inf)))
 
 
@@ -124,7 +124,8 @@ def random_bin(rng: np.random.Generator) -> Surroundings:
         friction=TABLE_FRICTION,
         obstacle=False,
     )
-    boxes = [_slab(np.array([*TABLE_LENGTHS, TABLE_DEPTH]), TABLE_HEIGHT - wall - stand), floor]
+    size = np.array([OPEN_EXTENT, OPEN_EXTENT, OPEN_THICKNESS])
+    boxes = [_slab(size, TABLE_HEIGHT - wall - stand), floor]
     z = TABLE_HEIGHT + height / 2
     for side in (-1.0, 1.0):
         x, y = MIDDLE + side * (half + wall / 2)

@@ -223,23 +223,25 @@ def box_contents(plan: Float64, height: NDArray[np.floating], on: Float64) -> Co
     An open box has a level rim along at least three sides of the smallest rectangle around it, and
     is lower inside, or the support (K, 2) is seen there.
     """
-    around, levels = _rims(plan, height, plan)
+    _, _, from_side, levels = _rims(plan, height, plan)
     if len(levels) < 3:
         return None
     # Stray points beside the walls lie lower than the rim: again, around the rim alone.
     level = np.median(levels)
-    rim = (np.abs(height - level) < LEVEL) & (around.from_sides(plan).min(axis=0) < 2 * STRIP)
-    around, levels = _rims(plan, height, plan[rim])
-    from_side, along = around.from_sides(plan), around.along_sides(plan)
+    rim = (np.abs(height - level) < LEVEL) & (from_side.min(axis=0) < 2 * STRIP)
+    around, place, from_side, levels = _rims(plan, height, plan[rim])
+    if len(levels) < 3:
+        return None
     rim = np.abs(height - level) < LEVEL / 2
-    wall = np.array([_wall(*side) for side in zip(along[:, rim], from_side[:, rim], strict=True)])
+    along, near = place[:, rim], from_side[:, rim]
+    wall = np.array([_wall(along[1 - side // 2], near[side]) for side in range(4)])
     from_wall = (from_side - wall[:, None]).min(axis=0)
     between: Bools = from_wall > 0
-    bare = (around.from_sides(on) > wall[:, None]).all(axis=0)
+    bare = (around.from_sides(around.place(on)) > wall[:, None]).all(axis=0)
     floor_seen = occupied_cells(on[bare]) * CELL**2 > MIN_FLOOR * around.size.prod()
     seen = between.sum() >= MIN_POINTS
     lowest, low = np.percentile(height[between], (3, 5)) if seen else (np.inf, np.inf)
-    if len(levels) < 3 or not (floor_seen or low < level - HOLLOW):
+    if not (floor_seen or low < level - HOLLOW):
         return None
     on_rim = (height > level + LEVEL) & (from_side.min(axis=0) > 0)
     inside = between | on_rim
@@ -286,14 +288,14 @@ class Rectangle(NamedTuple):
     low: Float64  # (2,) its lowest corner, on them
     size: Float64  # (2,)
 
-    def from_sides(self, plan: Float64) -> Float64:
-        """Distances (4, M) of points (M, 2) from its sides, positive inside."""
-        x, y = (plan @ self.axes.T - self.low).T
-        return np.stack([x, self.size[0] - x, y, self.size[1] - y])
+    def place(self, plan: Float64) -> Float64:
+        """Places (2, M) of points (M, 2) on its axes, from its low corner."""
+        return np.asarray((plan @ self.axes.T - self.low).T)
 
-    def along_sides(self, plan: Float64) -> Float64:
-        """Places (4, M) of points (M, 2) along the same sides."""
-        return np.repeat((plan @ self.axes.T - self.low).T[::-1], 2, axis=0)
+    def from_sides(self, place: Float64) -> Float64:
+        """Distances (4, M) of places (2, M) from its sides, positive inside."""
+        (x, y), (length, width) = place, self.size
+        return np.stack([x, length - x, y, width - y])
 
 
 def smallest_rectangle(plan: Float64) -> Rectangle:
@@ -315,22 +317,20 @@ def smallest_rectangle(plan: Float64) -> Rectangle:
 
 def _rims(
     plan: Float64, height: NDArray[np.floating], around: Float64
-) -> tuple[Rectangle, list[float]]:
-    """The smallest rectangle around some points, and heights of the level rims along its sides.
+) -> tuple[Rectangle, Float64, Float64, list[float]]:
+    """The smallest rectangle around some points, and what of points (M, 2) lies at its sides.
 
-    Of a small rectangle there are none.
+    Returns:
+        The rectangle, their places (2, M) on its axes and distances (4, M) from its sides, and the
+        heights of the level rims along those; none of a small rectangle.
     """
     rectangle = smallest_rectangle(around[_dense(around)])
-    size, levels = rectangle.size, []
-    for length, along, distance in zip(
-        np.repeat(size[::-1], 2),
-        rectangle.along_sides(plan),
-        rectangle.from_sides(plan),
-        strict=True,
-    ):
-        at = distance < STRIP
-        levels.append(_rim(along[at], height[at], length) if size.min() > MIN_WIDTH else None)
-    return rectangle, [level for level in levels if level is not None]
+    place = rectangle.place(plan)
+    from_side, levels = rectangle.from_sides(place), []
+    for side in range(4 if rectangle.size.min() > MIN_WIDTH else 0):
+        at, along = from_side[side] < STRIP, 1 - side // 2
+        levels.append(_rim(place[along, at], height[at], float(rectangle.size[along])))
+    return rectangle, place, from_side, [level for level in levels if level is not None]
 
 
 def _wall(along: Float64, distance: Float64) -> float:
@@ -362,7 +362,7 @@ def _is_heap(plan: Float64, height: NDArray[np.floating], most: float) -> bool:
     Of a box, most points are on the sides of a rectangle, and on a level top.
     """
     rectangle = smallest_rectangle(plan)
-    side = rectangle.from_sides(plan).min(axis=0) < STRIP
+    side = rectangle.from_sides(rectangle.place(plan)).min(axis=0) < STRIP
     level = np.abs(height - np.percentile(height, 90)) < LEVEL
     flat = rectangle.size.max() <= most and np.ptp(height) <= HEAP_HEIGHT * most
     return bool(flat and (side | level).mean() < BOX_SHARE)
