@@ -47,7 +47,6 @@ EMPTY_STEPS = 2  # time steps without contact
 HELD_STEPS = 4  # time steps in which an object hangs from the fingers and moves with them
 SLIP = 2e-4  # metres that a firmly held object still moves in the hand in a time step
 LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clear: 0.4 m/s
-SHAKE_DISTANCE = 0.05  # metres to either side, along the hand's x and then its y
 # Metres behind the fingertips at which to look for the object between the fingers, best first.
 _TARGET_DEPTHS = (0.007, 0.002, 0.015, 0.025)
 
@@ -368,13 +367,14 @@ def _holds_when_shaken(
     held: SceneObject,
     objects: Mapping[int, SceneObject],
 ) -> bool:
-    """Shake the lifted hand from side to side; returns whether it still holds the object."""
+    """Shake the lifted hand; returns whether it still holds the object."""
+    shake = gripper.world.shake
     T_world_lifted = retreat_pose(T_world_hand)
     gripper.move_to(T_world_lifted, step_length=LIFT_STEP)
     for along in np.eye(3)[:2]:
-        for way in (SHAKE_DISTANCE, -SHAKE_DISTANCE, 0.0):
+        for way in (shake.distance, -shake.distance, 0.0):
             aside = T_world_lifted @ translation(*(way * along))
-            gripper.move_to(aside, step_length=gripper.world.shake_step)
+            gripper.move_to(aside, step_length=shake.step_length)
     return gripper.opening > MIN_OPENING and held in _touched(gripper, objects)
 
 

@@ -117,6 +117,13 @@ class Contact(NamedTuple):
     distance: float
 
 
+class Shake(NamedTuple):
+    """How a hand with something in it is dragged to either side and back, along its x and its y."""
+
+    distance: float  # metres to either side
+    step_length: float  # metres in each time step
+
+
 Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3) metres
 
 
@@ -165,7 +172,7 @@ class World(ABC):
 
     name: ClassVar[str]  # of the engine
     collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
-    shake_step: ClassVar[float]  # metres in each time step, with which a held object is shaken
+    shake: ClassVar[Shake]  # of a held object
 
     def __enter__(self) -> Self:
         return self

@@ -20,6 +20,7 @@ from edgegrasp_sim.engine import (
     Hand,
     HandModel,
     Intrinsics,
+    Shake,
     World,
 )
 from edgegrasp_sim.engine.urdf import Surface, read_urdf
@@ -29,7 +30,7 @@ SUBSTEPS = 4  # of 3.125 ms in each time step
 CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
-SHAKE_STEP = 0.003125  # metres in each time step, 0.25 m/s: the hand follows, and turns sharply
+SHAKE = Shake(0.0125, 0.003125)  # at 0.25 m/s: the hand follows, and turns sharply
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
@@ -63,7 +64,7 @@ class MujocoWorld(World):
 
     name = "mujoco"
     collision_depth = COLLISION_DEPTH
-    shake_step = SHAKE_STEP
+    shake = SHAKE
 
     def __init__(self) -> None:
         self._images = _Images()

@@ -17,13 +17,14 @@ from edgegrasp_sim.engine import (
     HandModel,
     Intrinsics,
     Parts,
+    Shake,
     World,
 )
 from edgegrasp_sim.poses import Matrix
 
 SOLVER_ITERATIONS = 100
 COLLISION_DEPTH = 0.001  # metres
-SHAKE_STEP = 0.0125  # metres in each time step, 1.0 m/s: the hand lags and comes half as far
+SHAKE = Shake(0.05, 0.0125)  # at 1 m/s: the hand lags and comes half as far
 FINGER_SPINNING_FRICTION = 0.05  # metres: torque about a contact's normal, by its force
 FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
@@ -52,7 +53,7 @@ class PybulletWorld(World):
 
     name = "pybullet"
     collision_depth = COLLISION_DEPTH
-    shake_step = SHAKE_STEP
+    shake = SHAKE
 
     def __init__(self) -> None:
         self.client: int = pybullet.connect(pybullet.DIRECT)
