@@ -8,8 +8,9 @@ TORCH ?= --no-deps --extra-index-url https://download.pytorch.org/whl/cpu torch
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-# What `make view` needs, which is installed sooner.
+# What `make view` needs, which is installed sooner; what only `make lint` and its like need.
 TO_LOOK := $(VENV)/.to_look
+TOOLS := $(VENV)/.tools
 GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
 	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
 
@@ -19,7 +20,7 @@ GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.js
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-venv: $(INSTALLED) ## make .venv with everything, and the system libraries it needs
+venv: $(INSTALLED) ## make .venv with what demo and test need, and the system libraries
 
 $(INSTALLED): EXTRA := dev
 $(TO_LOOK): EXTRA := service
@@ -30,7 +31,11 @@ $(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.
 	$(BIN)/python scripts/install.py constraints.txt --editable '.[$(EXTRA)]'
 	@touch $@
 
-lint: $(INSTALLED) ## style, types, import boundaries, generated code
+$(TOOLS): $(INSTALLED)
+	$(BIN)/python scripts/install.py constraints.txt --editable '.[tools]'
+	@touch $@
+
+lint: $(TOOLS) ## style, types, import boundaries, generated code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -44,7 +49,7 @@ lint: $(INSTALLED) ## style, types, import boundaries, generated code
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
 
-format: $(INSTALLED) ## rewrite the code in the project's style
+format: $(TOOLS) ## rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -63,13 +68,13 @@ view: $(or $(wildcard $(INSTALLED)),$(TO_LOOK)) ## look at a scene and its grasp
 demo: $(INSTALLED) ## scene, server, grasps over gRPC and REST, one executed, a picture
 	$(BIN)/python examples/demo.py
 
-docs: $(INSTALLED) ## build the site of docs/ into build/site, without network; warnings are errors
+docs: $(TOOLS) ## build the site of docs/ into build/site, without network; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 image-test: $(INSTALLED) ## build the container image, run it locked up (root, Debian: podman)
 	docker/test_image.sh $(BIN)/python
 
-proto: $(INSTALLED) ## generate the gRPC code, the contract and the OpenAPI document
+proto: $(TOOLS) ## generate the gRPC code, the contract and the OpenAPI document
 	PYTHON=$(BIN)/python scripts/generate_proto.sh
 
 constraints: ## resolve the dependencies afresh into constraints.txt

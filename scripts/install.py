@@ -42,8 +42,9 @@ def main(constraints: str, *arguments: str) -> int:
     shown = Shown(sum("==" in line for line in lines))
     folder = Path(sysconfig.get_path("purelib"))
     before = len(list(folder.glob("*.dist-info")))
-    words = [sys.executable, "-m", "pip", "install", "--progress-bar", "off", "--no-color"]
-    command = [*words, "--disable-pip-version-check", "--constraint", constraints, *arguments]
+    words = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-color"]
+    plain = ["--no-compile", "--progress-bar", "off"]  # compiled on import, what is used
+    command = [*words, "install", *plain, "--constraint", constraints, *arguments]
     chosen: set[str] = set()
     unpacking = threading.Event()
     with shown.bar, subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as pip:
