@@ -90,7 +90,7 @@ def extents_across(
         (M, 2) least and greatest distance from the edge into the object.
     """
     extent = np.zeros((len(frame), 2), dtype=np.float32)
-    _along_strips(columns_of(points), rows, first, last, frame, strip, extent)
+    _along_strips(columns_of(points[rows]), first, last, frame, strip, extent)
     return extent
 
 
@@ -271,29 +271,32 @@ def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
 @compiled("contract")
 def _along_strips(
     columns: Float32,
-    rows: Int64,
     first: Int64,
     last: Int64,
     frame: Float32,
     strip: Float32,
     extent: Float32,
 ) -> None:
-    xs, ys, zs = columns[0], columns[1], columns[2]
     half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
     cell = gap / STRIP_CELLS
     cells = int(np.ceil((length + gap) / cell)) + 1
     reached = np.empty(cells, np.float32)
+    depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)
     for m in range(len(frame)):
         origin, across, out, ahead = frame[m, 0], frame[m, 1], frame[m, 2], frame[m, 3]
-        reached[:] = -np.inf
-        least = np.float32(0.0)
-        for p in range(first[m], last[m]):
-            i = rows[p]
+        xs, ys, zs = columns[:, first[m] : last[m]]
+        for i in range(len(xs)):
             x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
             sideways = x * across[0] + y * across[1] + z * across[2]
             inward = -(x * out[0] + y * out[1] + z * out[2])
             below = x * ahead[0] + y * ahead[1] + z * ahead[2]
-            if (abs(sideways) < half) & (below < drop) & (inward > -gap) & (inward < length):
+            inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
+            depth[i] = inward if inside else length
+        reached[:] = -np.inf
+        least = np.float32(0.0)
+        for i in range(len(xs)):
+            inward = depth[i]
+            if inward < length:
                 least = min(least, inward)
                 place = int((inward + gap) / cell)
                 reached[place] = max(reached[place], inward)
