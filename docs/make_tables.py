@@ -27,6 +27,7 @@ from edgegrasp_sim.results import ResultFolder, percent, planner_title, record_o
 Curves = dict[str, list[dict[str, float]]]  # by run: its log's rows, numbers by column
 
 DOCS = Path(__file__).parent
+GRIPPERS = DOCS.parent / "examples" / "grippers"
 BLOCK = re.compile(r"(<!-- begin: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 KEPT_CURVE_POINTS = 40
 SCENES = ("packed", "pile")
@@ -65,6 +66,8 @@ def collect(results: Path, kept: Path) -> None:
         shutil.copyfile(folder / "picture.png", kept / f"{found['experiment']}.png")
     _merge(kept / "benchmarks.json", {f.name: record_of(ResultFolder(f)) for f in benchmarks})
     _merge(kept / "curves.json", {file.parent.name: _curve(file) for file in curves})
+    if hands := _hands(_read(kept / "benchmarks.json").values()):
+        hands_figure(hands).savefig(kept / "hands.png")
     if drawn := _read(kept / "curves.json"):
         curves_figure(drawn).savefig(kept / "curves.png")
 
@@ -117,11 +120,15 @@ def _range(field: Mapping[str, Any]) -> str:
 def blocks(kept: Path) -> dict[str, str]:
     """What results.md gets, from the folder of what is kept, by the name of its place."""
     records = _read(kept / "benchmarks.json").values()
+    others = [r for r in records if "/" not in r["objects"]["name"]]
+    pandas = [r for r in records if r not in others and r["hand"] == "panda"]
     written = {
-        scene: _benchmark_table([r for r in records if r["scene"] == scene], scene)
+        scene: _benchmark_table([r for r in pandas if r["scene"] == scene], scene)
         for scene in SCENES + CAMERA_SCENES
     }
-    written["commands"] = _console(sorted({command_of(record) for record in records}))
+    written["commands"] = _commands(pandas)
+    written["adversarial"] = _scores_table(others) + "\n" + _commands(others)
+    written["hands"] = _scores_table(_hands(records)) + "\n![Hands](results/hands.png)\n"
     for name, methods in EXPERIMENTS.items():
         found = _read(kept / f"{name}.json")
         measured = _experiment(name, found) if found else [NOT_YET]
@@ -146,12 +153,18 @@ def command_of(record: dict[str, Any]) -> str:
     planner, options = record["planner"], record["planner"].get("options", {})
     words = ["edgegrasp", "benchmark", "--scene", record["scene"]]
     words += ["--protocol", record["protocol"]["name"], "--planner", planner["name"]]
+    if record["engine"] != "pybullet":
+        words += ["--engine", record["engine"]]
+    if (hand := record["hand"]) != "panda":
+        own = GRIPPERS / f"{hand}.toml"
+        words += ["--gripper", f"examples/grippers/{own.name}" if own.is_file() else hand]
     if "model" in planner:
         words += ["--model", planner["model"]]
     words += ["--rounds", str(record["rounds"])]
     words += [word for seed in record["seeds"] for word in ("--seed", str(seed))]
-    if not record["objects"]["name"].startswith("builtin/"):
-        words += ["--objects", "OBJECTS"]
+    objects = record["objects"]["name"]
+    if not objects.startswith("builtin/"):
+        words += ["--objects", "OBJECTS" if "/" in objects else objects]
     for name in ("num_approach_points", "num_candidates", "collision", "min_score"):
         if name in planner or name in options:
             words += ["--" + name.replace("_", "-"), str(planner.get(name, options.get(name)))]
@@ -169,7 +182,7 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
         lines.append(
             (
                 planner_title(record["planner"]) + least,
-                _version(record["protocol"]),
+                _version(record),
                 "-".join(filter(None, numbers)) or "the protocol's",
                 f"{record['rounds']} for each of {', '.join(map(str, record['seeds']))}",
                 percent(record["grasp_success_rate"]),
@@ -177,17 +190,76 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
                 f"{seconds:.2f} s" if seconds is not None else "",
             )
         )
-    for protocol in ("edgegrasp", "giga"):
+    for protocol in ("edgegrasp", "giga-cropped"):
         for row in published(protocol, scene):
             title, samples = f"*{row['method']}* ({row['source']})", row.get("samples", "")
             lines.append((title, protocol, samples, "", *published_rates(row), ""))
     return table(head, lines)
 
 
-def _version(protocol: dict[str, Any]) -> str:
-    """A protocol's name, and its version where it is not the present one."""
-    name, version = protocol["name"], protocol["version"]
-    return name if version == load_protocol(name).version else f"{name}, version {version}"
+def _scores_table(records: Sequence[dict[str, Any]]) -> str:
+    """Rates, those without what no grasp can hold, and how far scores are probabilities."""
+    head = ("hand", "scene", "objects", "GSR", "DR", "too wide", "GSR of others", "DR of others")
+    lines = []
+    for record in records:
+        wide, scores = record["too_wide"], record["reliability"]
+        lines.append(
+            (
+                record["hand"],
+                record["scene"] + _engine(record),
+                str(record["objects_present"]),
+                *(percent(record[f"{name}_rate"]) for name in ("grasp_success", "declutter")),
+                str(wide["objects"]),
+                *(percent(wide[f"{n}_rate_of_others"]) for n in ("grasp_success", "declutter")),
+                f"{scores['mean_score']:.3f}",
+                f"{record['successes'] / record['attempts']:.3f}",
+                f"{scores['brier']:.3f}",
+            )
+        )
+    return table((*head, "mean score", "held", "Brier"), lines)
+
+
+def _hands(records: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those of every hand under the same protocol, the Panda's first."""
+    paper = [
+        r
+        for r in records
+        if (r["protocol"]["name"], r["engine"]) == ("edgegrasp", "pybullet")
+        and r["planner"].get("model") == "edgegrasp-plus"
+        and "/" in r["objects"]["name"]
+    ]
+    return sorted(paper, key=lambda r: (r["hand"] != "panda", r["hand"], r["scene"]))
+
+
+def hands_figure(records: Sequence[dict[str, Any]]) -> Figure:
+    """The share that held against the score, a line for each hand and scene."""
+    figure = Figure(figsize=(9.6, 3.8), dpi=90, layout="constrained")
+    for axes, scene in zip(figure.subplots(1, 2, sharey=True), SCENES, strict=True):
+        for record in (r for r in records if r["scene"] == scene):
+            tenths = record["reliability"]["tenths"]
+            places = [[each[name] for each in tenths] for name in ("score", "held")]
+            axes.plot(*places, "o-", ms=3, label=record["hand"])
+        axes.plot([0, 1], [0, 1], "--", color="black", linewidth=0.8)
+        axes.set(xlabel="score", ylabel="share that held", title=scene)
+        axes.grid(alpha=0.25)
+    lines = figure.axes[0].get_lines()[:-1]
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), fontsize=8)
+    return figure
+
+
+def _commands(records: Sequence[dict[str, Any]]) -> str:
+    return _console(sorted({command_of(record) for record in records}))
+
+
+def _version(record: dict[str, Any]) -> str:
+    """A protocol's name, its version where it is not the present one, and another engine."""
+    name, version = record["protocol"]["name"], record["protocol"]["version"]
+    now = load_protocol(name).version
+    return name + (f", version {version}" if version != now else "") + _engine(record)
+
+
+def _engine(record: dict[str, Any]) -> str:
+    return "" if record["engine"] == "pybullet" else f", {record['engine']}"
 
 
 def _training(curves: Curves) -> str:

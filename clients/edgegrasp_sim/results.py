@@ -37,6 +37,7 @@ GATED = ("scene", "engine", "protocol", "protocol_version")
 FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
+TENTHS, MIN_IN_TENTH = 10, 10  # of the scores; fewer attempts say nothing of one
 
 
 class ResultFolder:
@@ -226,10 +227,11 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
     manifest = folder.manifest()
     summary = json.loads((folder.path / "summary.json").read_text())
     run, times = manifest["run"], summary["planning_seconds"]
-    names = ("attempts", "successes", *RATE_LABELS, "failures", "attempts_digest")
+    names = ("attempts", "successes", *RATE_LABELS, "too_wide", "failures", "attempts_digest")
     return {
         "scene": run["scene"],
         "engine": run["engine"],
+        "hand": run.get("gripper", {}).get("name", "panda"),
         "protocol": {name: run["protocol"][name] for name in ("name", "version")},
         "planner": run["planner"],
         "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
@@ -237,7 +239,30 @@ def record_of(folder: ResultFolder) -> dict[str, Any]:
         "seeds": manifest["seeds"],
         "objects_present": summary["objects"],
         "planning_seconds_median": times["median"] if times else None,
+        "reliability": reliability(folder.rounds()),
         **{name: summary[name] for name in names},
+    }
+
+
+def reliability(rounds: Sequence[Round]) -> dict[str, Any]:
+    """How far scores are probabilities; ready for JSON.
+
+    Returns:
+        Brier score and mean score of all attempts; for each tenth of the scores with enough of
+        them their number, mean score and the share that held.
+    """
+    attempts = [attempt for item in rounds for attempt in item.attempts]
+    score = np.array([attempt.score for attempt in attempts])
+    held = np.array([attempt.success for attempt in attempts], dtype=float)
+    tenth = np.clip((score * TENTHS).astype(int), 0, TENTHS - 1)
+    groups = [rows for each in range(TENTHS) if (rows := tenth == each).sum() >= MIN_IN_TENTH]
+    return {
+        "brier": float(np.mean((score - held) ** 2)),
+        "mean_score": float(score.mean()),
+        "tenths": [
+            {"attempts": int(rows.sum()), "score": score[rows].mean(), "held": held[rows].mean()}
+            for rows in groups
+        ],
     }
 
 

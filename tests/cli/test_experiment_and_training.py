@@ -75,7 +75,8 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(run, tmp_path, mo
 
 
 PROTOCOLS = (
-    "bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, robot, table, vgn"
+    "bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, giga-cropped, "
+    "robot, table, vgn"
 )
 
 
