@@ -33,7 +33,8 @@ DRAWS = 400  # of scenes to learn from, for the intervals
 
 def try_grasps(scenes: int, seed: int, output: Path, friction: float, noise: float) -> None:
     """Append the outcomes of the best grasps of every object in simulated scenes."""
-    hand.FINGER_FRICTION = friction
+    hand.DYNAMICS["finger_friction"] = friction
+    hand.panda.cache_clear()
     detector = ModelCatalogue.load().get()
     for number in range(scenes):
         streams = [np.random.default_rng([seed, number, stream]) for stream in range(3)]
