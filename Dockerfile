@@ -36,7 +36,7 @@ RUN /tools/bin/pip install ${TORCH}
 RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
     extras = [p["optional-dependencies"][name] for name in ("cli", "files", "model", "service")]; \
     named = p["dependencies"] + [one for extra in extras for one in extra]; \
-    print(*(a for a in named if not a.startswith(("edgegrasp", "open3d", "torch"))), sep="\n")' \
+    print(*(a for a in named if not a.startswith(("edgegrasp", "torch"))), sep="\n")' \
     > requirements.txt \
     && /tools/bin/pip install -r requirements.txt \
     && /tools/bin/pip install --no-deps open3d-cpu \

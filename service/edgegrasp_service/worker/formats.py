@@ -331,7 +331,7 @@ def _read_compressed_pcd(
     try:
         import open3d  # it takes a second, and is needed for nothing else
     except ImportError:
-        fix = "Send a PCD file of DATA binary or ascii."
+        fix = "Send DATA binary or ascii, or have edgegrasp[open3d] installed at the server."
         raise UnsupportedMediaType("cloud", "DATA binary_compressed, without Open3D", fix) from None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cloud.pcd"
