@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from benchmarks.textbook import pipeline
 from scipy.spatial import cKDTree
+
+pipeline = pytest.importorskip("benchmarks.textbook.pipeline", exc_type=ImportError)
 
 TABLE = 0.05  # metres, of the reference's scenes
 SCENES = Path(__file__).parents[3] / "shared/reference/golden"
