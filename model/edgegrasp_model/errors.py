@@ -9,9 +9,11 @@ EdgeGraspError
 """
 
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from typing import Any
+
+from pydantic import ValidationError
 
 
 class EdgeGraspError(Exception):
@@ -32,6 +34,51 @@ class InvalidRequest(EdgeGraspError):  # noqa: N818
         self.value = value
         self.fix = fix
         super().__init__(f"{field}: got {value}. {fix}")
+
+
+def invalid_fields(
+    error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
+) -> InvalidRequest:
+    """Say the first thing wrong in a validation error as field, value and fix.
+
+    Args:
+        error: Of pydantic.
+        fields: What was validated.
+        prefix: Name of the request field that holds it.
+        known: Fields that there are at the top, for one that is not.
+    """
+    first = error.errors(include_url=False)[0]
+    named = first["type"] in ("missing", "extra_forbidden")
+    path = _path(first["loc"], fields, named)
+    field = ".".join([prefix, *path])
+    if first["type"] == "extra_forbidden":
+        there = f"; the {prefix} are: {', '.join(known)}" if len(path) == 1 and known else ""
+        return InvalidRequest(field, "an unknown field", f"Remove it{there}.")
+    value = "nothing" if first["type"] == "missing" else brief(first["input"])
+    fix = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "union_tag_invalid":
+        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
+    if first["type"] == "union_tag_not_found":
+        fix = "Send an object that names its kind"
+    return InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
+
+
+def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
+    """A location in the request, without the names that pydantic gives to members of unions.
+
+    Where `named`, the last part is a field that the request lacks or should not have.
+    """
+    path: list[str] = []
+    here: Any = fields
+    for place, part in enumerate(location):
+        if isinstance(part, int):
+            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
+        elif isinstance(here, Mapping) and part in here:
+            here = here[part]
+        elif not (named and place == len(location) - 1):
+            continue
+        path.append(str(part))
+    return path
 
 
 def brief(value: object) -> str:

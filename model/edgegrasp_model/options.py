@@ -6,7 +6,7 @@ are made from these models (`make proto`).
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -25,7 +25,7 @@ from pydantic import (
     model_validator,
 )
 
-from edgegrasp_model.errors import InvalidRequest, brief
+from edgegrasp_model.errors import invalid_fields
 
 FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
 
@@ -591,45 +591,4 @@ def parse_options(fields: object) -> DetectOptions:
     try:
         return DetectOptions.model_validate(fields)
     except ValidationError as error:
-        raise invalid_options(error, fields) from None
-
-
-def invalid_options(
-    error: ValidationError, fields: object, prefix: str = "options"
-) -> InvalidRequest:
-    """Say the first thing wrong in a validation error as field, value and fix."""
-    first = error.errors(include_url=False)[0]
-    named = first["type"] in ("missing", "extra_forbidden")
-    field = ".".join([prefix, *_path(first["loc"], fields, named)])
-    if first["type"] == "extra_forbidden":
-        known = "" if "." in field.removeprefix(prefix + ".") else _known_options()
-        return InvalidRequest(field, "an unknown field", f"Remove it{known}.")
-    value = "nothing" if first["type"] == "missing" else brief(first["input"])
-    fix = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "union_tag_invalid":
-        fix = f"Set its kind to one of {first['ctx']['expected_tags']}"
-    if first["type"] == "union_tag_not_found":
-        fix = "Send an object that names its kind"
-    return InvalidRequest(field, value, f"{fix[:1].upper()}{fix[1:]}.")
-
-
-def _known_options() -> str:
-    return f"; the options are: {', '.join(DetectOptions.model_fields)}"
-
-
-def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location in the request, without the names that pydantic gives to members of unions.
-
-    Where `named`, the last part is a field that the request lacks or should not have.
-    """
-    path: list[str] = []
-    here: Any = fields
-    for place, part in enumerate(location):
-        if isinstance(part, int):
-            here = here[part] if isinstance(here, (list, tuple)) and part < len(here) else None
-        elif isinstance(here, Mapping) and part in here:
-            here = here[part]
-        elif not (named and place == len(location) - 1):
-            continue
-        path.append(str(part))
-    return path
+        raise invalid_fields(error, fields, "options", DetectOptions.model_fields) from None

@@ -21,15 +21,8 @@ from pydantic import (
     ValidationError,
 )
 
-from edgegrasp_model.errors import InvalidRequest, brief
-from edgegrasp_model.options import (
-    MAX_VIEWS,
-    DetectOptions,
-    Integer,
-    Strict,
-    invalid_options,
-    numeric,
-)
+from edgegrasp_model.errors import InvalidRequest, brief, invalid_fields
+from edgegrasp_model.options import MAX_VIEWS, DetectOptions, Integer, Strict, numeric
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.depth import CameraView, Position, fuse_depth_images
 from edgegrasp_service.worker.formats import (
@@ -253,9 +246,7 @@ def parse(schema: type[Schema], fields: object, name: str) -> Schema:
     try:
         return schema.model_validate(fields)
     except ValidationError as error:
-        problem = invalid_options(error, fields, name)
-        if error.errors(include_url=False)[0]["type"] == "extra_forbidden":
-            problem = InvalidRequest(problem.field, problem.value, "Remove it.")
+        problem = invalid_fields(error, fields, name)
         if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
             problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
         raise problem from None
