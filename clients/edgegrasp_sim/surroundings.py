@@ -35,7 +35,6 @@ HEAP = 0.10  # metres that a heap may rise over a bin's walls
 
 TABLE_REACH = 0.16  # metres from the middle, along x and y, where objects are put
 TABLE_LENGTH = (0.5, 1.2)  # metres
-TABLE_THICKNESS = 0.04  # metres, seen at its edge; it is filled down to the floor
 TABLE_OVER_FLOOR = (0.4, 0.8)  # metres
 LARGE_THINGS = (1, 3)  # on a table
 LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
