@@ -165,7 +165,9 @@ async def test_nobody_is_read_before_there_is_a_place(serve, cloud) -> None:
 async def test_turns_come_in_order(serve, cloud) -> None:
     running = await serve()
     client, answered, asked = running.connect("grpc"), [], []
-    running.stages.shut("run")
+    stages = running.stages
+    stages.shut("prepare")
+    stages.shut("run")
 
     async def ask(number: int) -> None:
         assert (await client.detect(cloud)).fine
@@ -174,8 +176,15 @@ async def test_turns_come_in_order(serve, cloud) -> None:
     for number in range(4):
         asked.append(asyncio.create_task(ask(number)))
         await running.until(lambda number=number: running.waiting == number)
-        await running.until(lambda: running.stages.begun["run"] == 1)
-    running.stages.open("run")
+        await running.until(lambda: stages.begun["prepare"] == 1)
+    for turn in range(1, 5):  # one at a time gets through
+        await running.until(lambda turn=turn: stages.begun["prepare"] == turn)
+        stages.open("prepare")
+        await running.until(lambda turn=turn: stages.begun["run"] == turn)
+        stages.shut("prepare")
+        stages.open("run")
+        await running.until(lambda turn=turn: len(answered) == turn)
+        stages.shut("run")
     await asyncio.gather(*asked)
     await client.close()
     assert answered == [0, 1, 2, 3]
