@@ -1,4 +1,5 @@
 import contextlib
+import importlib
 import os
 import re
 import signal
@@ -15,6 +16,11 @@ import numpy as np
 import pytest
 from benchmarks import dummy
 from hypothesis import HealthCheck, settings
+
+# PyTorch with CUDA loads it for training, which on Debian 12 crashes once MuJoCo has drawn: both
+# bring an LLVM.
+with contextlib.suppress(ImportError):
+    importlib.import_module("triton.knobs")
 
 # No busy machine fails a test, and every run tries the same examples; `make fuzz` tries new ones.
 settings.register_profile("tests", max_examples=20, deadline=None, derandomize=True)
