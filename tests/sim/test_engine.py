@@ -1,5 +1,7 @@
 """The choice of an engine, and what both must agree on."""
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -50,6 +52,23 @@ def test_mujoco_stands_in_for_pybullet_and_says_so(monkeypatch: pytest.MonkeyPat
     assert "the protocol's pybullet is not" in choose_engine(None, "pybullet").reason
     with make_world() as world:
         assert world.name == "mujoco"
+
+
+DRAW_WHERE_MUJOCO_CAME_FIRST = """
+import mujoco, numpy
+from edgegrasp_sim.engine import Intrinsics, make_world
+with make_world("mujoco") as world:
+    world.add_box((9, 9, 1), (0, 0, 1.5), friction=1)
+    print(world.render_depth(numpy.eye(4), Intrinsics()).min().round(3))
+"""
+
+
+def test_mujoco_draws_where_it_was_imported_before() -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed")
+    command = [sys.executable, "-c", DRAW_WHERE_MUJOCO_CAME_FIRST]
+    usual = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run(command, env=usual, capture_output=True, text=True)
+    assert done.stdout == "1.0\n", done.stderr
 
 
 def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:

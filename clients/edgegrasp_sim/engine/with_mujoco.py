@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -470,9 +471,9 @@ class _Images:
 def _gl_context(width: int, height: int) -> Any:
     """What this process draws with; made once."""
     try:
-        from mujoco.gl_context import GLContext
-
-        context = GLContext(width, height)
+        # Not MuJoCo's own choice: who imported it before us made that before MUJOCO_GL was set.
+        drawing = import_module(f"mujoco.{os.environ['MUJOCO_GL'].lower()}")
+        context = drawing.GLContext(width, height)
         context.make_current()
     except Exception as error:  # ctypes, OpenGL and EGL raise whatever they stumble over
         raise RuntimeError(
