@@ -11,6 +11,7 @@ usage: python -m benchmarks.outcomes try --scenes 150 --output outcomes.jsonl
 import argparse
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,6 @@ from benchmarks.measuring import RESULTS, write_results
 
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_sim import hand
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_training.evaluation import cross_entropy
 from edgegrasp_training.outcomes import Outcomes, fit, read_outcomes
@@ -33,12 +33,11 @@ DRAWS = 400  # of scenes to learn from, for the intervals
 
 def try_grasps(scenes: int, seed: int, output: Path, friction: float, noise: float) -> None:
     """Append the outcomes of the best grasps of every object in simulated scenes."""
-    hand.DYNAMICS["finger_friction"] = friction
-    hand.panda.cache_clear()
     detector = ModelCatalogue.load().get()
     for number in range(scenes):
         streams = [np.random.default_rng([seed, number, stream]) for stream in range(3)]
         with ClutterSimulation() as simulation:
+            simulation.hand = replace(simulation.hand, finger_friction=friction)
             simulation.reset(("packed", "pile")[number % 2], streams[0], num_objects=8)
             seen = simulation.observe(streams[1], streams[2], noise_std=noise, table="auto")
             asked = {"viewpoint": seen.camera_position.tolist(), "seed": number, "top_k": 500}

@@ -238,7 +238,7 @@ def panda() -> HandModel:
         centre=(0.0, 0.0, CENTRE),
         max_opening=MAX_OPENING,
         meshes=("hand.obj", "finger.obj"),
-        **DYNAMICS,
+        **_OF_EVERY_HAND,
     )
 
 
@@ -265,7 +265,7 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
         centre=centre,
         max_opening=opening,
         advance=advance,
-        **DYNAMICS,
+        **_OF_EVERY_HAND,
     )
 
 
@@ -281,7 +281,7 @@ def swing_of(gripper: Mapping[str, Any]) -> tuple[float, ...] | None:
     return tuple(fit.coef.tolist())
 
 
-DYNAMICS: dict[str, Any] = {  # of every hand
+_OF_EVERY_HAND: dict[str, Any] = {
     "mass": HAND_MASS,
     "friction": HAND_FRICTION,
     "finger_mass": FINGER_MASS,

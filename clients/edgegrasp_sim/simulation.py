@@ -23,7 +23,7 @@ from edgegrasp_sim.camera import (
 )
 from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.engine.urdf import least_width, read_urdf
-from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, run_grasp
+from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.picture import lit
 from edgegrasp_sim.poses import Matrix, require_pose
@@ -127,6 +127,7 @@ class ClutterSimulation:
         gripper: Mapping[str, Any] | None = None,
     ) -> None:
         self.gripper = gripper
+        self.hand = panda() if gripper is None else hand_of(gripper)
         self.object_sets = (
             dict(objects)
             if objects is not None
@@ -422,7 +423,7 @@ class ClutterSimulation:
         return result
 
     def _add_gripper(self) -> Gripper:
-        return Gripper(self.world, None if self.gripper is None else hand_of(self.gripper))
+        return Gripper(self.world, self.hand)
 
     @property
     def _hand(self) -> Gripper:
