@@ -121,12 +121,12 @@ def blocks(kept: Path) -> dict[str, str]:
     """What results.md gets, from the folder of what is kept, by the name of its place."""
     records = _read(kept / "benchmarks.json").values()
     others = [r for r in records if "/" not in r["objects"]["name"]]
-    pandas = [r for r in records if r not in others and r["hand"] == "panda"]
+    with_panda = [r for r in records if r not in others and r["hand"] == "panda"]
     written = {
-        scene: _benchmark_table([r for r in pandas if r["scene"] == scene], scene)
+        scene: _benchmark_table([r for r in with_panda if r["scene"] == scene], scene)
         for scene in SCENES + CAMERA_SCENES
     }
-    written["commands"] = _commands(pandas)
+    written["commands"] = _commands(with_panda)
     written["adversarial"] = _scores_table(others) + "\n" + _commands(others)
     written["hands"] = _scores_table(_hands(records)) + "\n![Hands](results/hands.png)\n"
     for name, methods in EXPERIMENTS.items():

@@ -15,11 +15,11 @@ torch=2.13.0
 
 rm -rf "$environment"
 "$python" -m venv "$environment"
-"$environment/bin/pip" install --quiet --constraint <(echo "torch==$torch") --editable '.[tools]'
+"$environment/bin/pip" install --quiet --constraint <(echo "torch==$torch") --editable '.[open3d,tools]'
 
 # A local version label (+cpu) names one build; CUDA's own packages come with the other build.
 {
-    echo "# Exact versions of everything '.[tools]' installs; written by scripts/update_constraints.sh."
+    echo "# Exact versions of everything '.[open3d,tools]' installs; written by scripts/update_constraints.sh."
     "$environment/bin/pip" freeze --all --exclude-editable --exclude pip --exclude wheel |
         sed -e 's/+cpu$//' |
         grep -v -i -E '^(nvidia-|cuda-|triton==)'

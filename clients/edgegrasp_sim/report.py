@@ -15,13 +15,20 @@ from matplotlib.figure import Figure
 from edgegrasp_sim.page import Row, image, page, table
 from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.replay import Replay
-from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
+from edgegrasp_sim.results import (
+    BINS,
+    RATE_LABELS,
+    ResultFolder,
+    bins_of,
+    over_seeds,
+    percent,
+    planner_title,
+)
 from edgegrasp_sim.trial import Attempt, Round
 
 PICTURES = 6
 PUBLISHED = Path(__file__).parent / "published.toml"
 BLUE, GREY = "#2f6db3", "#9aa3ad"
-BINS = 10
 LABEL_WIDTH = 13  # letters
 MIN_IN_BIN = 5  # attempts; fewer say nothing about a score
 
@@ -139,7 +146,7 @@ def _draw_rates(axes: Any, summary: dict[str, Any], reported: Sequence[dict[str,
 def _draw_calibration(axes: Any, scores: Any, held: Any) -> None:
     """Success against score, and the distribution of scores."""
     edges = np.linspace(min(0.0, scores.min()), max(1.0, scores.max()), BINS + 1)
-    bins = np.clip(np.digitize(scores, edges) - 1, 0, BINS - 1)
+    bins = bins_of(scores, edges)
     middles = 0.5 * (edges[1:] + edges[:-1])
     counts = np.bincount(bins, minlength=BINS)
     rates = np.bincount(bins, held, BINS) / np.maximum(counts, 1)

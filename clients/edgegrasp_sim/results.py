@@ -37,7 +37,8 @@ GATED = ("scene", "engine", "protocol", "protocol_version")
 FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
-TENTHS, MIN_IN_TENTH = 10, 10  # of the scores; fewer attempts say nothing of one
+BINS = 10  # of the scores
+MIN_IN_TENTH = 10  # attempts; fewer say nothing of a tenth
 
 
 class ResultFolder:
@@ -248,14 +249,16 @@ def reliability(rounds: Sequence[Round]) -> dict[str, Any]:
     """How far scores are probabilities; ready for JSON.
 
     Returns:
-        Brier score and mean score of all attempts; for each tenth of the scores with enough of
-        them their number, mean score and the share that held.
+        Brier score and mean score of all attempts, None of none; for each tenth of the scores with
+        enough of them their number, mean score and the share that held.
     """
     attempts = [attempt for item in rounds for attempt in item.attempts]
+    if not attempts:
+        return {"brier": None, "mean_score": None, "tenths": []}
     score = np.array([attempt.score for attempt in attempts])
     held = np.array([attempt.success for attempt in attempts], dtype=float)
-    tenth = np.clip((score * TENTHS).astype(int), 0, TENTHS - 1)
-    groups = [rows for each in range(TENTHS) if (rows := tenth == each).sum() >= MIN_IN_TENTH]
+    of = bins_of(score, np.linspace(0.0, 1.0, BINS + 1))
+    groups = [rows for each in range(BINS) if (rows := of == each).sum() >= MIN_IN_TENTH]
     return {
         "brier": float(np.mean((score - held) ** 2)),
         "mean_score": float(score.mean()),
@@ -264,6 +267,11 @@ def reliability(rounds: Sequence[Round]) -> dict[str, Any]:
             for rows in groups
         ],
     }
+
+
+def bins_of(scores: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The bin (N,) between edges (BINS + 1,) that each score is in; the outer ones are open."""
+    return np.clip(np.digitize(scores, edges) - 1, 0, BINS - 1)
 
 
 def planner_title(planner: dict[str, Any]) -> str:
