@@ -139,13 +139,15 @@ def points_of(
     depth: NDArray[np.float64], T_world_camera: Matrix, camera: Intrinsics
 ) -> NDArray[np.float64]:
     """The points of a depth image (height, width) nearer than `far`: (N, 3) metres, world frame."""
-    row, column = np.nonzero(depth < FARTHEST * camera.far)
-    z = depth[row, column]
+    seen = depth < FARTHEST * camera.far
     # The renderer samples a pixel at its lower left corner.
-    x = (column - camera.centre_x) * z / camera.focal_length
-    y = (row + 1.0 - camera.centre_y) * z / camera.focal_length
-    in_camera = np.stack((x, y, z), axis=1)
-    return in_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    right = (np.arange(camera.width) - camera.centre_x) * depth
+    down = (np.arange(1, camera.height + 1)[:, None] - camera.centre_y) * depth
+    right, down = right[seen] / camera.focal_length, down[seen] / camera.focal_length
+    in_camera = np.stack((right, down, depth[seen]))
+    in_world = T_world_camera[:3, :3] @ in_camera + T_world_camera[:3, 3:]
+    points: NDArray[np.float64] = in_world.T
+    return points
 
 
 def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
@@ -159,7 +161,7 @@ def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:
     """The points (N, 3) in a box (2, 3), lowest and highest corner, grown by a margin."""
     inside = (points >= box[0] - margin) & (points <= box[1] + margin)
-    kept: NDArray[Float] = points[inside.all(axis=1)]
+    kept: NDArray[Float] = points[inside[:, 0] & inside[:, 1] & inside[:, 2]]
     return kept
 
 

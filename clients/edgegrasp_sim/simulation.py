@@ -314,7 +314,7 @@ class ClutterSimulation:
             std = seen.get("noise_std", NOISE_STD)
             points = points + rng_noise.normal(0.0, std, size=points.shape)
             points = points if box is None else crop(points, box)
-            clouds.append(points.astype(np.float32))
+            clouds.append(points.astype(np.float32, order="C"))
         whole = box is None and voxel == 0 and len(clouds) == 1
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(

@@ -50,14 +50,23 @@ def read_urdf(path: Path, scale: float) -> Shape:
     """
     if not path.is_file():
         raise FileNotFoundError(f"no object file at {path}; check the object folder")
+    centre, *surfaces = _read_urdf(path, path.stat().st_mtime_ns)
+    visible, hulls = (
+        [Surface(scale * points, faces) for points, faces in parts] for parts in surfaces
+    )
+    return Shape(scale * centre, visible, hulls)
+
+
+@lru_cache(maxsize=256)
+def _read_urdf(path: Path, _changed: int) -> Shape:
     try:
         link = ElementTree.parse(path).getroot().find("link")
         if link is None:
             raise ValueError("it has no link")
         inertial = link.find("inertial")
-        centre = scale * (np.zeros(3) if inertial is None else _origin(inertial)[0])
-        visible = [part for each in link.iter("visual") for part in _parts(each, path, scale)]
-        solid = [part for each in link.iter("collision") for part in _parts(each, path, scale)]
+        centre = np.zeros(3) if inertial is None else _origin(inertial)[0]
+        visible = [part for each in link.iter("visual") for part in _parts(each, path)]
+        solid = [part for each in link.iter("collision") for part in _parts(each, path)]
     except (ElementTree.ParseError, ValueError, IndexError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     hulls = [hull for part in solid if (hull := convex_hull(part.points - centre)) is not None]
@@ -133,7 +142,7 @@ def convex_hull(points: Matrix) -> Surface | None:
     return Surface(points[hull.vertices], rows[faces])
 
 
-def _parts(element: ElementTree.Element, urdf: Path, scale: float) -> list[Surface]:
+def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
     """The surfaces of a visual or collision element, in the link's frame."""
     move, turn = _origin(element)
     shape = element.find("geometry/*")
@@ -161,7 +170,7 @@ def _parts(element: ElementTree.Element, urdf: Path, scale: float) -> list[Surfa
         parts = _hulls(_numbers(shape, "radius") * np.stack([*around, z], axis=1))
     else:
         raise ValueError(f"its shape {shape.tag} is unknown; use box, cylinder, sphere or mesh")
-    return [Surface(scale * (turn.apply(size * p) + move), faces) for p, faces in parts]
+    return [Surface(turn.apply(size * p) + move, faces) for p, faces in parts]
 
 
 def _hulls(points: Matrix) -> list[Surface]:

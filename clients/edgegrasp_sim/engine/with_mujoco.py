@@ -31,7 +31,7 @@ SUBSTEPS = 4  # of 3.125 ms in each time step
 CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
-SHAKE = Shake(0.0125, 0.003125)  # at 0.25 m/s: the hand follows, and turns sharply
+SHAKE = Shake(0.01, 0.005)  # at 0.4 m/s: the hand follows, and turns sharply
 FRICTION_IMPEDANCE = 10.0  # that of friction over that of normal forces, lest held objects creep
 ARM_INERTIA = 1.0  # kg and kg m², of the arm behind the hand
 ARM_STIFFNESS = 30000.0  # N/m and N m/rad
@@ -82,7 +82,7 @@ class MujocoWorld(World):
         self._bodies = 0
         self._states: dict[int, Any] = {}
         self._hand: MujocoHand | None = None
-        self._uid_of_geom = np.empty(0, np.int64)
+        self._uid_of_geom: list[int] = []
         self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
     @property
@@ -92,7 +92,7 @@ class MujocoWorld(World):
             self._changed = False
             self._model, self._data = self.spec.recompile(self._model, self._data)
             names = [self._model.body(body).name for body in self._model.geom_bodyid]
-            self._uid_of_geom = np.array([int(name.split()[0]) for name in names])
+            self._uid_of_geom = [int(name.split()[0]) for name in names]
             self._places.clear()
         return self._data
 
@@ -131,7 +131,7 @@ class MujocoWorld(World):
         for start, end in zip(starts, ends, strict=True):
             way = end - start
             share = mujoco.mj_ray(model, data, start, way, solid, 1, -1, geom)
-            hits.append(int(self._uid_of_geom[geom[0]]) if 0 <= share <= 1 else -1)
+            hits.append(self._uid_of_geom[geom[0]] if 0 <= share <= 1 else -1)
         return hits
 
     def detect_collisions(self) -> None:
@@ -335,11 +335,14 @@ class MujocoWorld(World):
 
     def contacts(self, uid: int) -> list[Contact]:
         """The contact points of a body."""
-        found = self.data.contact
-        pairs = self._uid_of_geom[found.geom]
-        rows, side = np.nonzero(pairs == uid)
-        others, distances = pairs[rows, 1 - side].tolist(), found.dist[rows].tolist()
-        return [Contact(other, distance) for other, distance in zip(others, distances, strict=True)]
+        found, uids = self.data.contact, self._uid_of_geom
+        distances = found.dist.tolist()
+        pairs = [(uids[one], uids[other]) for one, other in found.geom.tolist()]
+        return [
+            Contact(other if one == uid else one, distance)
+            for (one, other), distance in zip(pairs, distances, strict=True)
+            if uid in (one, other)
+        ]
 
 
 class MujocoBody(Body):
@@ -504,6 +507,7 @@ def _look(eye: Any, T_world_camera: Matrix, camera: Intrinsics) -> None:
 def _empty() -> Any:
     """A model without bodies, and with the engine's settings."""
     spec = mujoco.MjSpec()
+    spec.compiler.usethread = 0  # for so few meshes, threads cost more than they save
     option, visual = spec.option, spec.visual
     option.timestep = TIME_STEP / SUBSTEPS
     option.gravity = (0.0, 0.0, -GRAVITY)
