@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from edgegrasp_model.kernels import heights_and_distances, least_spread
 from edgegrasp_model.options import AutoPlane, RansacPlane, SupportPlane
@@ -387,7 +387,12 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
 def _over_hull(on: Float64, others: Float64) -> int:
     """How many of other points lie over the middle part of a plane's points; plan, metres."""
     low, high = np.percentile(on, [2, 98], axis=0)
-    return int(((others > low) & (others < high)).all(axis=1).sum())
+    try:
+        sides = ConvexHull(on[((on > low) & (on < high)).all(axis=1)]).equations
+    except (QhullError, ValueError):  # too few points, or all in a line
+        return 0
+    # The front of what the plane is the top of lies at its edge.
+    return int((others @ sides[:, :2].T + sides[:, 2] < -CELL).all(axis=1).sum())
 
 
 def _seen_through(
