@@ -57,7 +57,7 @@ def read_urdf(path: Path, scale: float) -> Shape:
     return Shape(scale * centre, visible, hulls)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=128)
 def _read_urdf(path: Path, _changed: int) -> Shape:
     try:
         link = ElementTree.parse(path).getroot().find("link")
