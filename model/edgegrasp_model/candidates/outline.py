@@ -112,28 +112,30 @@ def outline_grasps(
     Returns:
         At most one for each contact point, with the approach point nearest to the hand's axis.
     """
+    y, z = outline.heading, -outline.toward
+    frame = np.stack([points, np.cross(y, z), y, z], axis=1)  # (N, 4, 3)
     pair = pair[outline.is_edge[crop.ball_rows[pair]]]
     contact, approach = crop.ball_rows[pair], approach_index[crop.ball_of_point[pair]]
-    y, z = outline.heading[contact], -outline.toward[contact]
-    frame = np.stack([points[contact], np.cross(y, z), y, z], axis=1)  # (M, 4, 3)
-    edge = np.einsum("md,mkd->km", points[contact] - points[approach], frame[:, 1:])
+    apart = points[contact] - points[approach]
+    edge = [np.einsum("md,md->m", apart, frame[contact, axis]) for axis in (1, 2, 3)]
     between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
     row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
-    extent = _extents(points, crop, pair[row], frame[row], gripper)
+    extent = _extents(points, crop, pair[row], frame[contact[row]], gripper)
     width = extent[:, 1] - extent[:, 0]
     held = (extent[:, 0] > -MIN_EDGE) & (width < gripper.max_opening - 2 * EDGE_MARGIN)
-    held &= edge[1, row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
-    off_axis = np.hypot(edge[0, row], edge[1, row] - extent.mean(axis=1))
+    held &= edge[1][row] < extent[:, 1] + MIN_EDGE  # the approach point lies on the same surface
+    off_axis = np.hypot(edge[0][row], edge[1][row] - extent.mean(axis=1))
     nearest = np.lexsort((off_axis, contact[row], ~held))[: held.sum()]
     chosen = nearest[np.unique(contact[row[nearest]], return_index=True)[1]]
     row, extent, width = row[chosen], extent[chosen], width[chosen]
+    contact, z = contact[row], z[contact[row]]
     pose = np.zeros((len(row), 4, 4), dtype=np.float32)
-    pose[:, :3, :3] = frame[row, 1:].transpose(0, 2, 1)
-    middle = points[contact[row]] - extent.mean(axis=1, keepdims=True) * y[row]
-    pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z[row]
+    pose[:, :3, :3] = frame[contact, 1:].transpose(0, 2, 1)
+    middle = points[contact] - extent.mean(axis=1, keepdims=True) * y[contact]
+    pose[:, :3, 3] = middle - gripper.contact_z_at(width)[:, None] * z
     pose[:, 3, 3] = 1.0
-    depth = np.maximum(edge[2, row], 0.0)
-    hands = Candidates(pair[row], approach[row], contact[row], -z[row], depth, pose)
+    depth = np.maximum(edge[2][row], 0.0)
+    hands = Candidates(pair[row], approach[row], contact, -z, depth, pose)
     return _inserted(points, hands, support, gripper, margin)
 
 

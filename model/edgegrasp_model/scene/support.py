@@ -36,6 +36,7 @@ MIN_SHARE = 0.02  # of the seen surface that a plane holds
 VIEW = 12_000  # points that say what stands on a plane
 CELL = 0.02  # metres
 NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
+OUTLINED = 1000  # points of a plane that say how far it goes
 MAX_BELOW = 0.5  # share of what is seen at and right under a plane that lies under it
 MIN_AREA = 0.03  # square metres of a support that are seen: more than of an object's side
 BARE = 0.5  # share of the seen surface from which a small plane is a support with nothing on it
@@ -386,6 +387,7 @@ def _worth(seen: Seen, plane: _Plane, max_size: float, least: float) -> float:
 
 def _over_hull(on: Float64, others: Float64) -> int:
     """How many of other points lie over the middle part of a plane's points; plan, metres."""
+    on = on[:: len(on) // OUTLINED + 1]
     low, high = np.percentile(on, [2, 98], axis=0)
     try:
         sides = ConvexHull(on[((on > low) & (on < high)).all(axis=1)]).equations
