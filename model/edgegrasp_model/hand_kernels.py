@@ -162,6 +162,43 @@ def _between(x: np.float32, y: np.float32, z: np.float32, low: Float32, high: Fl
 
 
 @compiled("contract")
+def _count_between(
+    columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
+) -> int:
+    """How many points of block k lie between two corners of a hand's frame."""
+    # In functions of their own, and of arrays without steps, such loops take 16 points at a time.
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    found = 0
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        found += _between(x, y, z, low, high)
+    return found
+
+
+@compiled("contract")
+def _least_between(
+    columns: Float32,
+    k: int,
+    turn: Float32,
+    shift: Float32,
+    low: Float32,
+    high: Float32,
+    ahead: Float32,
+) -> np.float32:
+    """Least z of the points of block k between two corners; `ahead` (BLOCK,) is written over."""
+    start, stop = k * BLOCK, (k + 1) * BLOCK
+    xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
+    for i in range(len(xs)):
+        x, y, z = _position(xs[i], ys[i], zs[i], turn, shift)
+        ahead[i] = z if _between(x, y, z, low, high) else np.float32(np.inf)
+    least = np.float32(np.inf)
+    for i in range(len(xs)):
+        least = min(least, ahead[i])
+    return least
+
+
+@compiled("contract")
 def _blocks(columns: Float32) -> Float32:
     """Spheres (K, 4) around BLOCK points at a time: middle and radius."""
     count = columns.shape[1]
@@ -216,11 +253,7 @@ def _count_within(
         found = 0
         for k in range(len(sphere)):
             if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                block = columns[:, k * BLOCK : (k + 1) * BLOCK]
-                xs, ys, zs = block[0], block[1], block[2]
-                for i in range(len(xs)):
-                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-                    found += _between(x, y, z, low, high)
+                found += _count_between(columns, k, turn[e], shift[e], low, high)
         count[e] = found
 
 
@@ -261,11 +294,7 @@ def _meet(columns: Float32, turn: Float32, shift: Float32, boxes: Float32, hit: 
             for b in range(len(boxes)):
                 low, high = boxes[b, 0], boxes[b, 1]
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    block = columns[:, k * BLOCK : (k + 1) * BLOCK]
-                    xs, ys, zs = block[0], block[1], block[2]
-                    for i in range(len(xs)):
-                        x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-                        inside += _between(x, y, z, low, high)
+                    inside += _count_between(columns, k, turn[e], shift[e], low, high)
             if inside:
                 hit[e] = True
                 break
@@ -317,6 +346,7 @@ def _until_met(
     way: Float32,
 ) -> None:
     sphere = _blocks(columns)
+    ahead = np.empty(BLOCK, np.float32)
     for e in range(len(turn)):
         nearest = np.float32(np.inf)
         for b in range(len(boxes)):
@@ -325,15 +355,9 @@ def _until_met(
             low[2] -= behind
             for k in range(len(sphere)):
                 high[2] = front + nearest  # what is further away changes nothing
-                if not _may_reach(sphere[k], turn[e], shift[e], low, high):
-                    continue
-                block = columns[:, k * BLOCK : (k + 1) * BLOCK]
-                xs, ys, zs = block[0], block[1], block[2]
-                for i in range(len(xs)):
-                    x, y, z = _position(xs[i], ys[i], zs[i], turn[e], shift[e])
-                    above = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
-                    if above & (z > low[2]):
-                        nearest = min(nearest, z - front)
+                if _may_reach(sphere[k], turn[e], shift[e], low, high):
+                    least = _least_between(columns, k, turn[e], shift[e], low, high, ahead)
+                    nearest = min(nearest, least - front)
         way[e] = nearest
 
 

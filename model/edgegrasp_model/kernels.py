@@ -19,6 +19,7 @@ Bools = NDArray[np.bool_]
 ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
+DIAGONAL = 1e-12  # share of a matrix's trace that its other elements together may be
 BLOCK = 512  # points at a time, so that their positions stay in the first cache
 
 
@@ -118,7 +119,7 @@ def level_spread(
     least = np.empty((len(rows), 3), dtype=np.float32)
     offset, deviation = np.empty((2, len(rows)), dtype=np.float32)
     _level_spread(
-        np.ascontiguousarray(points[order]),
+        columns_of(points[order]),
         key[order],
         points[rows],
         key[rows],
@@ -198,6 +199,9 @@ def _least_spread(points: Float32, rows: Int64, direction: Float32) -> None:
         for _ in range(JACOBI_SWEEPS):
             for turn in range(3):
                 _rotate_away(spread, axes, turn % 2, 1 if turn == 0 else 2)
+            off = abs(spread[0, 1]) + abs(spread[0, 2]) + abs(spread[1, 2])
+            if off <= DIAGONAL * (spread[0, 0] + spread[1, 1] + spread[2, 2]):
+                break
         least = 0
         for d in range(1, 3):
             least = d if spread[d, d] < spread[least, least] else least
@@ -277,29 +281,22 @@ def _along_strips(
     strip: Float32,
     extent: Float32,
 ) -> None:
-    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    length, gap = strip[1], strip[3]
     cell = gap / STRIP_CELLS
     cells = int(np.ceil((length + gap) / cell)) + 1
     reached = np.empty(cells, np.float32)
     depth = np.empty(np.max(last - first) if len(first) else 0, np.float32)
     for m in range(len(frame)):
-        origin, across, out, ahead = frame[m, 0], frame[m, 1], frame[m, 2], frame[m, 3]
-        xs, ys, zs = columns[:, first[m] : last[m]]
-        for i in range(len(xs)):
-            x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
-            sideways = x * across[0] + y * across[1] + z * across[2]
-            inward = -(x * out[0] + y * out[1] + z * out[2])
-            below = x * ahead[0] + y * ahead[1] + z * ahead[2]
-            inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
-            depth[i] = inward if inside else length
+        _into_strip(columns, first[m], last[m], frame[m], strip, depth)
         reached[:] = -np.inf
-        least = np.float32(0.0)
-        for i in range(len(xs)):
-            inward = depth[i]
-            if inward < length:
-                least = min(least, inward)
-                place = int((inward + gap) / cell)
-                reached[place] = max(reached[place], inward)
+        least, found = np.float32(0.0), 0
+        for i in range(last[m] - first[m]):
+            depth[found] = depth[i]
+            found += depth[i] < length
+        for inward in depth[:found]:
+            least = min(least, inward)
+            place = int((inward + gap) / cell)
+            reached[place] = max(reached[place], inward)
         furthest = np.float32(0.0)
         for place in range(int(gap / cell), cells):
             if reached[place] > furthest:
@@ -307,6 +304,24 @@ def _along_strips(
                     break
                 furthest = reached[place]
         extent[m, 0], extent[m, 1] = least, furthest
+
+
+@compiled("contract")
+def _into_strip(
+    columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
+) -> None:
+    """How far into the object points of a group lie; as far as a strip is long outside of it."""
+    # In functions of their own, and of arrays without steps, such loops take 16 points at a time.
+    xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
+    origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
+    half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
+    for i in range(len(xs)):
+        x, y, z = xs[i] - origin[0], ys[i] - origin[1], zs[i] - origin[2]
+        sideways = x * across[0] + y * across[1] + z * across[2]
+        inward = -(x * out[0] + y * out[1] + z * out[2])
+        below = x * ahead[0] + y * ahead[1] + z * ahead[2]
+        inside = (abs(sideways) < half) & (below < drop) & (inward > -gap)
+        depth[i] = inward if inside else length
 
 
 @compiled("contract")
@@ -323,7 +338,7 @@ def _first_of(key: Int64, wanted: int) -> int:
 
 @compiled("contract")
 def _level_spread(
-    points: Float32,
+    columns: Float32,
     key: Int64,
     middle: Float32,
     middle_key: Int64,
@@ -334,34 +349,20 @@ def _level_spread(
     offset: Float32,
     deviation: Float32,
 ) -> None:
-    radius, drop = reach[0], reach[1]
+    around, axes = np.empty(columns.shape, np.float32), np.zeros((3, 3), np.float32)
     for m in range(len(middle)):
-        px, py, pz = middle[m, 0], middle[m, 1], middle[m, 2]
-        ux, uy, uz = toward[m, 0], toward[m, 1], toward[m, 2]
-        # Two level directions: s from the axis that is the furthest from up, t = u x s.
-        if abs(ux) <= abs(uy) and abs(ux) <= abs(uz):
-            length = np.sqrt(uy * uy + uz * uz)
-            sx, sy, sz = np.float32(0.0), -uz / length, uy / length
-        elif abs(uy) <= abs(uz):
-            length = np.sqrt(ux * ux + uz * uz)
-            sx, sy, sz = uz / length, np.float32(0.0), -ux / length
-        else:
-            length = np.sqrt(ux * ux + uy * uy)
-            sx, sy, sz = -uy / length, ux / length, np.float32(0.0)
-        tx, ty, tz = uy * sz - uz * sy, uz * sx - ux * sz, ux * sy - uy * sx
-        a, b, aa, ab, bb, count = 0.0, 0.0, 0.0, 0.0, 0.0, 0
+        found = 0
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 start = middle_key[m] + (dx * sizes[1] + dy) * sizes[2] - 1
-                for j in range(_first_of(key, start), len(key)):
-                    if key[j] > start + 2:
-                        break
-                    x, y, z = points[j, 0] - px, points[j, 1] - py, points[j, 2] - pz
-                    near = x * x + y * y + z * z < radius * radius
-                    if near and x * ux + y * uy + z * uz > -drop:
-                        s, t = x * sx + y * sy + z * sz, x * tx + y * ty + z * tz
-                        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
-                        count += 1
+                for j in range(_first_of(key, start), _first_of(key, start + 3)):
+                    around[0, found] = columns[0, j]
+                    around[1, found] = columns[1, j]
+                    around[2, found] = columns[2, j]
+                    found += 1
+        _set_level_axes(toward[m], axes)
+        near = around[0, :found], around[1, :found], around[2, :found]
+        count, a, b, aa, ab, bb = _moments(near, middle[m], axes, reach)
         a, b = a / count, b / count
         aa, ab, bb = aa / count - a * a, ab / count - a * b, bb / count - b * b
         turn = 0.5 * np.arctan2(-2.0 * ab, bb - aa)
@@ -369,6 +370,42 @@ def _level_spread(
         outward = -(a * s + b * t)
         if outward < 0.0:
             s, t, outward = -s, -t, -outward
-        least[m, 0], least[m, 1], least[m, 2] = s * sx + t * tx, s * sy + t * ty, s * sz + t * tz
+        for d in range(3):
+            least[m, d] = s * axes[1, d] + t * axes[2, d]
         offset[m] = outward
         deviation[m] = np.sqrt(max(0.0, s * s * aa + 2.0 * s * t * ab + t * t * bb))
+
+
+@compiled("contract")
+def _set_level_axes(up: Float32, axes: Float32) -> None:
+    """Up and two level directions: one from the axis that is the furthest from up, up x that."""
+    first = 0
+    for d in range(1, 3):
+        first = d if abs(up[d]) < abs(up[first]) else first
+    after, last = (first + 1) % 3, (first + 2) % 3
+    length = np.sqrt(up[after] * up[after] + up[last] * up[last])
+    for d in range(3):
+        axes[0, d] = up[d]
+    axes[1, first], axes[1, after], axes[1, last] = 0.0, -up[last] / length, up[after] / length
+    for d in range(3):
+        one, other = (d + 1) % 3, (d + 2) % 3
+        axes[2, d] = up[one] * axes[1, other] - up[other] * axes[1, one]
+
+
+@compiled("contract", "reassoc", "nsz")
+def _moments(
+    points: tuple[Float32, Float32, Float32], middle: Float32, axes: Float32, reach: Float32
+) -> tuple[np.float32, ...]:
+    """How many points are near, and sums of their level places s, t, of s s, s t and t t."""
+    count, a, b, aa, ab, bb = np.zeros(6, np.float32)
+    xs, ys, zs = points
+    for i in range(len(xs)):
+        x, y, z = xs[i] - middle[0], ys[i] - middle[1], zs[i] - middle[2]
+        above = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] > -reach[1]
+        near = above & (x * x + y * y + z * z < reach[0] * reach[0])
+        one = np.float32(near)
+        s = one * (x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2])
+        t = one * (x * axes[2, 0] + y * axes[2, 1] + z * axes[2, 2])
+        a, b, aa, ab, bb = a + s, b + t, aa + s * s, ab + s * t, bb + t * t
+        count += one
+    return count, a, b, aa, ab, bb
