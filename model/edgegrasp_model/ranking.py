@@ -246,15 +246,11 @@ def debug_info(
         score: (E,) probabilities.
         outcome: (E,) codes of what became of them.
     """
-    attempts = [] if sample is None else sample.attempts
-    candidates = Candidates.concatenate(
-        [Candidates.none(), *(part.candidates for part in attempts)]
-    )
-    codes = np.concatenate([outcome[:0], *(part.outcome for part in attempts)])
+    candidates = Candidates.none() if sample is None else sample.drawn
+    codes = outcome[:0] if sample is None else sample.outcome.copy()
     scores = np.full(len(candidates), np.nan, dtype=np.float32)
     if sample is not None and len(outcome):
-        place = len(candidates) - len(attempts[-1].candidates) + sample.row
-        scores[place], codes[place] = score, outcome
+        scores[sample.row], codes[sample.row] = score, outcome
     plane = None
     if scene.support is not None:
         normal = scene.frame.directions_in_cloud(scene.support.normal)

@@ -27,11 +27,13 @@ from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
+Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-SAMPLING_ATTEMPTS = 4  # further approach points are tried where few hands are free
-FEW = 16  # hands free of collision
+FURTHER_ATTEMPTS = 3  # with other approach points, where few hands are free
+FEW = 16  # hands free of collision, of a scene
+ENOUGH = 150  # different ones of a scene's objects together, with half of the approach points
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
@@ -48,32 +50,45 @@ APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """Every candidate around one set of approach points, and what became of it so far."""
-
-    candidates: Candidates  # E of them
-    outcome: NDArray[np.int8]  # (E,) CODE of its Outcome; RETURNED: still in
-
-
-@dataclass(frozen=True)
 class Sample:
-    """The candidates to score, around one set of approach points; canonical frame."""
+    """The candidates to score; canonical frame."""
 
     approach_index: Int64  # (A,) rows of the cloud
     crop: BallCrop
     candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
     view: HandView  # of the same candidates
     collision_free: Bools  # (E,)
-    attempts: list[Attempt]  # the last of which holds these candidates
-    row: Int64  # (E,) their rows in it
+    drawn: Candidates  # all that there were, C of them
+    outcome: NDArray[np.int8]  # (C,) CODE of what became of each; RETURNED: it is to be scored
+    row: Int64  # (E,) places of the candidates among them
 
 
 class _Tried(NamedTuple):
+    """Every candidate around some approach points, and what became of it so far."""
+
     approach_index: Int64  # (A,)
     crop: BallCrop
-    attempt: Attempt
-    row: Int64  # (C,) of its candidates, those that were checked for collision
-    free: Bools  # (C,) which of those do not collide
+    candidates: Candidates  # C of them
+    outcome: NDArray[np.int8]  # (C,) CODE of its Outcome; RETURNED: still in
+    row: Int64  # (K,) of those that were checked for collision
+    free: Bools  # (K,) which of those do not collide
+
+    def and_further(self, other: "_Tried") -> "_Tried":
+        """This and what was tried after it."""
+        further = replace(other.candidates, pair=other.candidates.pair + len(self.crop.ball_rows))
+        ball = other.crop.ball_of_point + len(self.approach_index)
+        return _Tried(
+            np.concatenate([self.approach_index, other.approach_index]),
+            BallCrop(
+                np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
+                np.concatenate([self.crop.ball_of_point, ball]),
+                self.crop.radius,
+            ),
+            Candidates.concatenate([self.candidates, further]),
+            np.concatenate([self.outcome, other.outcome]),
+            np.concatenate([self.row, other.row + len(self.candidates)]),
+            np.concatenate([self.free, other.free]),
+        )
 
 
 def sample_candidates(
@@ -100,60 +115,82 @@ def sample_candidates(
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
     rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
-    mode, limit = options.collision.mode, OVERSAMPLING * options.num_candidates
-    tried: list[_Tried] = []
-    while len(tried) < SAMPLING_ATTEMPTS:
-        approach_index = approach_points(scene, approach_rows, options, rng_approach)
+
+    def look_around(approach_index: Int64, *, leaning: bool = False) -> _Tried:
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        attempt = _constrained(
-            scene, approach_index, crop, options, gripper, counts, centre, leaning=bool(tried)
+        candidates, outcome = _constrained(
+            scene, approach_index, crop, options, gripper, counts, centre, leaning=leaning
         )
-        row, free = _checked(attempt, scene, options, gripper, limit, counts, rng)
-        tried.append(_Tried(approach_index, crop, attempt, row, free))
-        found = len(row) if mode == "ignore" else int(free.sum())
-        # A further attempt would draw the same approach points and candidates.
-        exhausted = len(approach_rows) <= len(approach_index) and len(row) < limit
-        if found >= FEW or (len(tried) > 1 and (found or exhausted)):
+        row, free = _checked(candidates, outcome, scene, options, gripper, counts, rng)
+        return _Tried(approach_index, crop, candidates, outcome, row, free)
+
+    first, second = approach_points(scene, approach_rows, options, rng_approach)
+    tried = look_around(first)
+    second = second[_has_few_hands(scene, second, tried, gripper, options)]
+    if len(second):
+        tried = tried.and_further(look_around(second))
+    for attempt in range(FURTHER_ATTEMPTS):
+        found = len(_usable(tried, options))
+        if found >= FEW or (attempt and found):
             break
-    tried.sort(key=lambda one: int(one.free.sum()))
-    approach_index, crop, attempt, row, free = tried[-1]
-    candidates = attempt.candidates.take(row)
-    new = free | (mode != "avoid")
-    T_cloud_tcp = candidates.T_cloud_hand[new] @ gripper.T_hand_tcp
-    new[new] = distinct_hands(T_cloud_tcp, free[new], *alike(options))
-    scored = rows_to_score(free, new, options, rng)
-    attempt.outcome[row[scored]] = CODE[Outcome.RETURNED]
+        further = np.concatenate(approach_points(scene, approach_rows, options, rng_approach))
+        if attempt and len(approach_rows) <= len(further):  # they would be the same ones
+            break
+        tried = tried.and_further(look_around(further, leaning=True))
+    candidates = tried.candidates.take(tried.row)
+    new = tried.free | (options.collision.mode != "avoid")
+    new[new] = different(candidates.T_cloud_hand[new], tried.free[new], gripper, options)
+    scored = rows_to_score(tried.free, new, options, rng)
+    tried.outcome[tried.row[scored]] = CODE[Outcome.RETURNED]
     counts["scored"] = len(scored)
     candidates = candidates.take(scored)
     return Sample(
-        approach_index,
-        crop,
+        tried.approach_index,
+        tried.crop,
         candidates,
         hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
-        free[scored],
-        [one.attempt for one in tried],
-        row[scored],
+        tried.free[scored],
+        tried.candidates,
+        tried.outcome,
+        tried.row[scored],
     )
 
 
+def _usable(tried: _Tried, options: DetectOptions) -> Int64:
+    """Rows of the candidates that may be scored as they are."""
+    return tried.row if options.collision.mode == "ignore" else tried.row[tried.free]
+
+
+def _has_few_hands(
+    scene: Scene, approach_index: Int64, tried: _Tried, gripper: Gripper, options: DetectOptions
+) -> Bools:
+    """Which further approach points (A,) are on objects at which few different hands were found."""
+    hands = tried.candidates.take(_usable(tried, options))
+    new = different(hands.T_cloud_hand, np.ones(len(hands), dtype=bool), gripper, options)
+    number = scene.object_of_point[approach_index]
+    each = max(FEW, ENOUGH // max(len(np.unique(number)), 1))
+    of_hands = scene.object_of_point[hands.approach_index[new]]
+    objects, count = np.unique(of_hands, return_counts=True)
+    return np.isin(number, objects[count >= each], invert=True)
+
+
 def _checked(
-    attempt: Attempt,
+    candidates: Candidates,
+    outcome: NDArray[np.int8],
     scene: Scene,
     options: DetectOptions,
     gripper: Gripper,
-    limit: int,
     counts: dict[str, int],
     rng: np.random.Generator,
 ) -> tuple[Int64, Bools]:
-    """At most `limit` of an attempt's candidates (C,), and which of them (C,) do not collide."""
-    passed = np.flatnonzero(attempt.outcome == CODE[Outcome.RETURNED])
-    row = passed[random_rows(len(passed), limit, rng)]
-    attempt.outcome[passed] = CODE[Outcome.NOT_CHECKED]
-    T_cloud_hand = attempt.candidates.T_cloud_hand[row]
-    free = ~collides(scene, T_cloud_hand, gripper, options.collision)
-    attempt.outcome[row] = CODE[Outcome.NOT_SCORED]
+    """Some candidates that are still in (K,), and which of them (K,) do not collide."""
+    passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
+    row = passed[random_rows(len(passed), OVERSAMPLING * options.num_candidates, rng)]
+    outcome[passed] = CODE[Outcome.NOT_CHECKED]
+    free = ~collides(scene, candidates.T_cloud_hand[row], gripper, options.collision)
+    outcome[row] = CODE[Outcome.NOT_SCORED]
     if options.collision.mode != "ignore":
-        attempt.outcome[row[~free]] = CODE[Outcome.COLLISION]
+        outcome[row[~free]] = CODE[Outcome.COLLISION]
     add_count(counts, "checked", len(row))
     add_count(counts, "collision_free", int(free.sum()))
     return row, free
@@ -161,7 +198,7 @@ def _checked(
 
 def approach_points(
     scene: Scene, rows: Int64, options: DetectOptions, rng: np.random.Generator
-) -> Int64:
+) -> tuple[Int64, Int64]:
     """Approach points spread over the objects: small ones get some, large ones more.
 
     Args:
@@ -171,7 +208,8 @@ def approach_points(
         rng: Source of the random choice.
 
     Returns:
-        Rows of the cloud.
+        Rows of the cloud: the first half of each object's, which often are enough, and the others.
+        Where the request says how many, all come first.
     """
     number = scene.object_of_point[rows]
     objects, size = np.unique(number, return_counts=True)
@@ -187,12 +225,15 @@ def approach_points(
         wanted = np.floor(share).astype(np.int64)
         rest = most - wanted.sum()
         wanted[np.argsort(wanted - share, kind="stable")[:rest]] += 1
-    chosen = []
+    first, second = [rows[:0]], [rows[:0]]
     for which, count in zip(objects[wanted > 0], wanted[wanted > 0], strict=True):
         mine = rows[number == which]
         points = scene.cloud.points[mine]
-        chosen.append(mine[sample_approach_points(points, count, options.sampling, rng)])
-    return np.concatenate(chosen)
+        chosen = mine[sample_approach_points(points, count, options.sampling, rng)]
+        half = len(chosen) if options.num_approach_points else (len(chosen) + 1) // 2
+        first.append(chosen[:half])
+        second.append(chosen[half:])
+    return np.concatenate(first), np.concatenate(second)
 
 
 def _constrained(
@@ -205,8 +246,8 @@ def _constrained(
     centre: bool,
     *,
     leaning: bool,
-) -> Attempt:
-    """The edge grasps of some balls, and which satisfy every constraint but collision avoidance."""
+) -> tuple[Candidates, NDArray[np.int8]]:
+    """The edge grasps of some balls; RETURNED: they satisfy all constraints but collision's."""
     add_count(counts, "approach_points", len(approach_index))
     add_count(counts, "pairs", len(crop.ball_rows))
     pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
@@ -235,13 +276,17 @@ def _constrained(
     outcome[~allowed] = CODE[Outcome.DIRECTION]
     add_count(counts, "in_direction", int(allowed.sum()))
     add_count(counts, "clear_of_support", int((outcome == CODE[Outcome.RETURNED]).sum()))
-    return Attempt(candidates, outcome)
+    return candidates, outcome
 
 
-def alike(options: DetectOptions) -> tuple[float, float]:
-    """Metres and radians within which suppression drops the other of two hands, whatever it is."""
+def different(
+    T_cloud_hand: Float32, first: Bools, gripper: Gripper, options: DetectOptions
+) -> Bools:
+    """Hands (E,) none of which suppression drops for another, whatever it is; `first` go before."""
     rule = options.suppression
-    return (0.0, 0.0) if rule is None else (min(NEAR, rule.translation), min(TURNED, rule.rotation))
+    near = 0.0 if rule is None else min(NEAR, rule.translation)
+    turned = 0.0 if rule is None else min(TURNED, rule.rotation)
+    return distinct_hands(T_cloud_hand @ gripper.T_hand_tcp, first, near, turned)
 
 
 def rows_to_score(
