@@ -29,11 +29,12 @@ SAMPLE = 2000  # points that planes are made of and judged by
 NEIGHBORS = 12  # points around one, itself included, that give its normal
 JUDGED = 100  # planes that are judged in search of the next one
 MAX_PLANES = 8
-CROWD_RADIUS = 0.02  # metres around a point in which others share its surface
+CROWD_RADIUS = 0.02  # metres around a point in which those neighbours share its surface
 SAME_WAY, ROUGHLY_SAME_WAY = 0.9, 0.75  # cosines between a plane's normal and those of its points
 REFINEMENTS = 4  # least squares over the plane's points
 MIN_SHARE = 0.02  # of the seen surface that a plane holds
 VIEW = 12_000  # points that say what stands on a plane
+MEASURED = 6_000  # points that say how well a plane agrees with what is seen
 CELL = 0.02  # metres
 NEAR_BELOW = 0.3  # metres under a plane where a support shows nothing
 OUTLINED = 1000  # points of a plane that say how far it goes
@@ -192,7 +193,7 @@ def measured(
         least: Metres over it that belong to it anyway.
         share: Of the seen surface, where it is known.
     """
-    sample = seen.thinned(VIEW)
+    sample = seen.thinned(MEASURED)
     points, distance = sample.points.astype(np.float64), sample.distance()
     normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
     origin = points.mean(axis=0) if len(points) else np.zeros(3)
@@ -210,10 +211,10 @@ def measured(
     terms = _squares((points - origin) @ axes[:2].T)
     bow: Float64 = np.zeros(6)
     for _ in range(REFINEMENTS):
-        near = np.abs(height - terms @ bow) < thick
-        held = terms[near]
-        bow = np.asarray(np.linalg.solve(held.T @ held + STIFF, held.T @ height[near]))
-    off, apart = np.abs(height - terms @ bow)[near], distance[near]
+        near = np.abs(height - bow @ terms) < thick
+        held = near * terms
+        bow = np.asarray(np.linalg.solve(held @ terms.T + STIFF, held @ height))
+    off, apart = np.abs(height - bow @ terms)[near], distance[near]
     middle = float(np.median(apart))
     spread = 1.4826 * float(np.median(off / np.square(apart / middle)))
     found = share or float(near.mean())
@@ -244,9 +245,9 @@ def raised(support: Support, seen: Seen) -> Support:
 
 
 def _squares(plan: Float64) -> Float64:
-    """1, x, y, x^2, x y, y^2 (N, 6) of points (N, 2)."""
+    """1, x, y, x^2, x y, y^2 (6, N) of points (N, 2)."""
     x, y = plan.T
-    return np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+    return np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
 
 
 def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_Plane]:
@@ -258,11 +259,10 @@ def _planes(seen: Seen, up: Float64 | None, rng: np.random.Generator) -> list[_P
     sample = seen.take(rows)
     points = sample.points.astype(np.float64)
     thick = thickness(sample.distance())
-    tree = cKDTree(points)
-    _, around = tree.query(points, k=NEIGHBORS)
+    apart, around = cKDTree(points).query(points, k=NEIGHBORS)
     normals = _turned(least_spread(points, np.asarray(around)), points, seen.viewpoint, up)
     # Surfaces near the camera have more points: weigh each point by the surface it stands for.
-    weight = 1.0 / tree.query_ball_point(points, CROWD_RADIUS, return_length=True)
+    weight = 1.0 / (np.asarray(apart) < CROWD_RADIUS).sum(axis=1)
     weight /= weight.sum()
     left = np.arange(len(points))
     places, ways, limits = (each.astype(np.float32) for each in (points, normals, thick))
@@ -304,7 +304,7 @@ def _turned(
 
 def _fitted(points: Float64, weight: Float64, side: Float64) -> _Plane:
     """The plane nearest to points (N, 3), its normal on a side."""
-    middle = np.average(points, axis=0, weights=weight)
+    middle = weight @ points / weight.sum()
     around = points - middle
     _, vectors = np.linalg.eigh((around * weight[:, None]).T @ around)  # ascending
     normal: Float64 = vectors[:, 0] if vectors[:, 0] @ side >= 0 else -vectors[:, 0]

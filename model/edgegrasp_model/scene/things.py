@@ -193,10 +193,11 @@ def support_outline(plan: Float64) -> Float64 | None:
     """Half planes (H, 3) whose intersection is the outline of a plane's seen pieces."""
     if len(plan) < MIN_POINTS:
         return None
-    low = plan.min(axis=0)
-    cell = np.floor((plan - low) / SUPPORT_CELL).astype(np.int64)
-    held = np.zeros(cell.max(axis=0) + 5, dtype=bool)
-    held[cell[:, 0] + 2, cell[:, 1] + 2] = True
+    axes = np.ascontiguousarray(plan.T)
+    low = axes.min(axis=1)
+    x, y = ((axes - low[:, None]) / SUPPORT_CELL).astype(np.int64)
+    held = np.zeros((x.max() + 5, y.max() + 5), dtype=bool)
+    held[x + 2, y + 2] = True
     labels, _ = ndimage.label(ndimage.binary_closing(held, iterations=2), np.ones((3, 3)))
     size = np.bincount(labels[held], minlength=labels.max() + 1)
     size[0] = 0
@@ -277,8 +278,8 @@ def number_cells(plan: Float64, size: float = CELL) -> Int64:
     """The number (M,) of the cell that each point (M, 2) is in."""
     if len(plan) == 0:
         return np.zeros(0, dtype=np.int64)
-    cell = np.floor((plan - plan.min(axis=0)) / size).astype(np.int64)
-    return np.asarray(cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1])
+    x, y = (((axis - axis.min()) / size).astype(np.int64) for axis in np.ascontiguousarray(plan.T))
+    return np.asarray(x * (y.max() + 1) + y)
 
 
 class Rectangle(NamedTuple):
