@@ -224,7 +224,7 @@ class DetectOptions(TypedDict, total=False):
     model: str
     # name of a gripper, or a gripper; None: the one the weights were trained for
     gripper: str | GripperGeometry | None
-    # approach points sampled, spread over the objects; None: as many as their surface needs
+    # approach points sampled, spread over the objects; None: as many as they need
     num_approach_points: int | None
     # candidates scored at most
     num_candidates: int

@@ -592,7 +592,7 @@ class DetectOptions(_message.Message):
     model: _builtins.str
     """Weights to use; empty: the server's default."""
     num_approach_points: _builtins.int
-    """Approach points sampled, spread over the objects; absent: as many as their surface needs."""
+    """Approach points sampled, spread over the objects; absent: as many as they need."""
     num_candidates: _builtins.int
     """Candidates scored at most."""
     sampling: _builtins.str
