@@ -117,23 +117,30 @@ def distance_behind(
     return behind
 
 
-def distinct_hands(T_cloud_tcp: Float32, first: Bools, near: float, angle: float) -> Bools:
-    """Which hands are near no other one that was kept before them.
+def non_max_suppression(
+    T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
+) -> tuple[Int64, Int64]:
+    """Keep the first of each group of near duplicates.
+
+    A hand and the same hand turned by 180 degrees about its approach count as one.
 
     Args:
         T_cloud_tcp: (E, 4, 4).
-        first: (E,) which of them go before the others.
+        order: (M,) rows, the best first.
         near: Metres between two TCPs,
-        angle: and radians between two hands within which they are near. A hand turned by 180
-            degrees about its approach is the same.
+        angle: and radians between two hands within which they are duplicates.
+        most: How many to keep.
+
+    Returns:
+        (at most `most`,) rows kept, in order, and the rows that are near one of them.
     """
-    order = np.argsort(~first, kind="stable")
-    kept = np.zeros(len(order), dtype=np.bool_)
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
-    limits = np.array([near**2, 1.0 + 2.0 * np.cos(angle)], dtype=np.float32)
-    _keep_distinct(order, place, turn, limits, kept)
-    return kept
+    least_trace = 1.0 + 2.0 * np.cos(angle) if angle < np.pi else -np.inf
+    limits = np.array([near**2, least_trace], dtype=np.float32)
+    kept, dropped = np.zeros((2, len(order)), dtype=np.bool_)
+    _suppress(order, place, turn, limits, most, kept, dropped)
+    return order[kept], order[dropped]
 
 
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
@@ -384,22 +391,29 @@ def _between_pads(
 
 
 @compiled("contract")
-def _keep_distinct(
-    order: Int64, place: Float32, turn: Float32, limits: Float32, kept: Bools
+def _suppress(
+    order: Int64,
+    place: Float32,
+    turn: Float32,
+    limits: Float32,
+    most: int,
+    kept: Bools,
+    dropped: Bools,
 ) -> None:
     rows, found = np.empty(len(order), np.int64), 0
     xs, ys, zs = np.empty((3, len(order)), np.float32)
-    for row in order:
+    for m in range(len(order)):
+        row = order[m]
         px, py, pz = place[row]
-        kept[row] = True
         for k in range(found):
             x, y, z = xs[k] - px, ys[k] - py, zs[k] - pz
             if x * x + y * y + z * z < limits[0]:
                 along = (turn[row] * turn[rows[k]]).sum(axis=0)  # cosines of matching axes
                 if along[2] + abs(along[0] + along[1]) > limits[1]:
-                    kept[row] = False
+                    dropped[m] = True
                     break
-        if kept[row]:
+        if found < most and not dropped[m]:
+            kept[m] = True
             xs[found], ys[found], zs[found], rows[found] = px, py, pz, row
             found += 1
 

@@ -497,7 +497,8 @@ class DetectOptions(Strict):
     num_approach_points: Annotated[int, Field(ge=1, le=MAX_APPROACH_POINTS), numeric] | None = (
         Field(
             default=None,
-            description="approach points sampled, spread over the objects; null: as many as they need",
+            description="approach points sampled, spread over the objects; null: as many as they "
+            "need",
         )
     )
     num_candidates: Integer = Field(

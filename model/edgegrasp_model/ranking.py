@@ -12,7 +12,8 @@ from edgegrasp_model.candidates.collision import clearances
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.options import DetectOptions, Suppression
+from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import DebugInfo, DetectedObject, FoundSupport, Grasp, Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
@@ -65,8 +66,9 @@ def select(
     if options.order == "score":
         number = scene.object_of_point[sample.candidates.contact_index]
         order = objects_first(order, score, number)
-    if options.suppression is not None:
-        order, dropped = non_max_suppression(T_cloud_tcp, order, options.suppression, options.top_k)
+    if (rule := options.suppression) is not None:
+        near = rule.translation, rule.rotation
+        order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)
     order = order[: options.top_k]
     outcome[dropped], outcome[order] = CODE[Outcome.SUPPRESSED], CODE[Outcome.RETURNED]
     counts["suppressed"], counts["returned"] = len(dropped), len(order)
@@ -111,53 +113,6 @@ def ranked(
     if order == "clearance" and clearance is not None:
         keys = (-score, -clearance, ~collision_free)
     return np.lexsort(keys).astype(np.int64)
-
-
-def non_max_suppression(
-    T_cloud_tcp: Float32, order: NDArray[np.int64], suppression: Suppression, top_k: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Keep the best of each group of near duplicates.
-
-    A hand and the same hand turned by 180 degrees about its approach count as one.
-
-    Args:
-        T_cloud_tcp: (E, 4, 4).
-        order: (M,) rows, best first.
-        suppression: Two grasps nearer than both of its distances are duplicates.
-        top_k: How many to keep at most.
-
-    Returns:
-        (at most top_k,) rows kept, best first, and the rows that are near one of them.
-    """
-    kept: list[int] = []
-    dropped = [order[:0]]
-    left, place = order, np.ascontiguousarray(T_cloud_tcp[:, :3, 3].T)
-    while len(left) and len(kept) < top_k:
-        best, left = int(left[0]), left[1:]
-        kept.append(best)
-        x, y, z = place[:, left] - place[:, best, None]
-        near = x * x + y * y + z * z < suppression.translation**2
-        turned = rotation_distance(T_cloud_tcp[left[near], :3, :3], T_cloud_tcp[best, :3, :3])
-        near[near] = turned < suppression.rotation
-        dropped.append(left[near])
-        left = left[~near]
-    return np.asarray(kept, dtype=np.int64), np.concatenate(dropped)
-
-
-def rotation_distance(rotations: Float32, rotation: Float32) -> Float32:
-    """Smallest angle between hands, the flip about the approach allowed.
-
-    Args:
-        rotations: (E, 3, 3).
-        rotation: (3, 3).
-
-    Returns:
-        (E,) radians.
-    """
-    along = np.einsum("edk,dk->ek", rotations, rotation)  # (E, 3) cosines of matching axes
-    trace = along[:, 2] + np.abs(along[:, 0] + along[:, 1])
-    angle: Float32 = np.arccos(np.clip((trace - 1) / 2, -1.0, 1.0))
-    return angle
 
 
 def grasps_in_cloud(

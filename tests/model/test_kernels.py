@@ -5,13 +5,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_kernels import (
     any_point_in_boxes,
-    distinct_hands,
+    non_max_suppression,
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
@@ -20,7 +21,6 @@ from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import nearest_in_ball
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.options import Collision
-from edgegrasp_model.ranking import rotation_distance
 from edgegrasp_model.scene.cloud import Cloud
 
 from . import oracles
@@ -48,23 +48,42 @@ def test_hands_see_the_points_within_reach(seed: int) -> None:
     assert list(pairs[0]) == sorted(pairs[0])
 
 
-def test_of_hands_that_are_near_each_other_one_is_kept() -> None:
+def test_near_duplicates_fall_to_the_better_one() -> None:
+    T_cloud_tcp = np.repeat(np.eye(4, dtype=np.float32)[None], 4, axis=0)
+    T_cloud_tcp[1, :3, 3] = 0.005  # near the first
+    T_cloud_tcp[2, 0, 3] = 0.05  # elsewhere
+    T_cloud_tcp[3, :3, :3] = Rotation.from_euler("x", 1.0).as_matrix()  # turned away
+    order = np.array([1, 0, 2, 3])
+    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.01, 0.5, 10)
+    assert (kept.tolist(), dropped.tolist()) == ([1, 2, 3], [0])
+    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.01, 0.5, 2)
+    assert (kept.tolist(), dropped.tolist()) == ([1, 2], [0])
+    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.0, 0.0, 10)
+    assert (kept.tolist(), dropped.tolist()) == ([1, 0, 2, 3], [])
+    kept, _ = non_max_suppression(T_cloud_tcp, order, 0.01, 3.2, 10)  # however they are turned
+    assert kept.tolist() == [1, 2]
+
+
+def test_of_hands_that_are_near_each_other_the_first_is_kept() -> None:
     hands = random_hands(60, seed=1)
     hands[:, :3, 3] = np.random.default_rng(1).uniform(0, 0.015, (60, 3))
     hands[30:, :3, :3] = hands[:30, :3, :3] * (-1, -1, 1)  # turned about their approach
-    first = np.arange(60) >= 40
-    kept = distinct_hands(hands, first, 0.01, 0.8)
+    order = np.random.default_rng(2).permutation(60)
+    kept, dropped = non_max_suppression(hands, order, 0.01, 0.8, 60)
+    turns, flip = Rotation.from_matrix(hands[:, :3, :3]), Rotation.from_euler("z", np.pi)
 
-    def near(row: int) -> np.ndarray:
-        apart = np.linalg.norm(hands[:, :3, 3] - hands[row, :3, 3], axis=1)
-        return (apart < 0.01) & (rotation_distance(hands[:, :3, :3], hands[row, :3, :3]) < 0.8)
+    def near(row: int, others: np.ndarray) -> np.ndarray:
+        apart = np.linalg.norm(hands[others, :3, 3] - hands[row, :3, 3], axis=1)
+        between = turns[row].inv() * turns[others]
+        angle = np.minimum(between.magnitude(), (between * flip).magnitude())
+        return (apart < 0.01) & (angle < 0.8)
 
-    assert 10 < kept.sum() < 60
-    before = np.argsort(np.argsort(~first, kind="stable"))
+    assert 10 < len(kept) < 60
+    assert sorted([*kept, *dropped]) == list(range(60))
+    before = np.argsort(order)
     for row in range(60):
-        earlier = near(row) & (before < before[row]) & kept
-        assert kept[row] == (not earlier.any())
-    assert distinct_hands(hands, first, 0.0, 0.0).all()
+        earlier = kept[before[kept] < before[row]]
+        assert (row in kept) == (len(earlier) == 0 or not near(row, earlier).any())
 
 
 @grippers

@@ -20,7 +20,7 @@ from edgegrasp_model.candidates.edge_grasps import (
 )
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_kernels import distinct_hands
+from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
@@ -286,7 +286,10 @@ def different(
     rule = options.suppression
     near = 0.0 if rule is None else min(NEAR, rule.translation)
     turned = 0.0 if rule is None else min(TURNED, rule.rotation)
-    return distinct_hands(T_cloud_hand @ gripper.T_hand_tcp, first, near, turned)
+    kept, T_cloud_tcp = np.zeros(len(first), dtype=bool), T_cloud_hand @ gripper.T_hand_tcp
+    order = np.argsort(~first, kind="stable")
+    kept[non_max_suppression(T_cloud_tcp, order, near, turned, len(order))[0]] = True
+    return kept
 
 
 def rows_to_score(
