@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,12 +23,14 @@ from edgegrasp_model.given import (
     from_hand_poses,
 )
 from edgegrasp_model.gripper import Gripper, choose_gripper, load_gripper
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.ranking import (
+    SURE_SCORE,
     debug_info,
     detected_objects,
     found_support,
@@ -51,6 +53,7 @@ from edgegrasp_model.scene.scene import (
 )
 
 Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
 
 NO_APPROACH_POINT = (
     "the approach region holds no point of the processed cloud. Rows hold a voxel by "
@@ -75,19 +78,26 @@ class Prepared:
     crop_radius: float  # metres
     selected: SelectedPoints | None = None
     scene: Scene | None = None
-    sample: Sample | None = None
+    further: Generator[Sample, Int64 | None, None] | None = None  # where the sample is not enough
+    sample: Sample | None = None  # E candidates
     width: Float32 | None = None  # (E,) metres
-    batch: Batch | None = None  # None where there is nothing to score
+    batch: Batch | None = None  # the candidates that were sampled last; None where there are none
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Record the seconds spent inside as those of a stage."""
+        """Add the seconds spent inside to those of a stage."""
         start = time.perf_counter()
         yield
-        self.seconds[stage] = time.perf_counter() - start
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def draw_all(self) -> None:
+        """Add all further candidates to the sample, whatever it is worth."""
+        for further in self.further or ():
+            assert self.sample is not None
+            self.sample = self.sample.and_further(further)
 
     def warn_of_few_points(self) -> None:
         """Say that too few points are left for a scene."""
@@ -168,12 +178,10 @@ class GraspDetector:
             InvalidRequest: The cloud or an option cannot be used; names field, value and fix.
         """
         prepared = self.prepare(cloud, options or DetectOptions())
-        with prepared.timed("network"):
-            logits = self.run(prepared.batch) if prepared.batch is not None else np.empty(0)
-        return self.finish(prepared, logits)
+        return self.finish(prepared, self.evaluate(prepared))
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
-        """First stage: everything before the network."""
+        """First stage: the scene, and candidates around half of the approach points."""
         prepared = self._with_scene(check_cloud(cloud, options.num_approach_points or 1), options)
         scene, gripper = prepared.scene, prepared.gripper
         if scene is None:
@@ -181,20 +189,29 @@ class GraspDetector:
         if not scene.approach_allowed.any():
             prepared.warnings.append(NO_APPROACH_POINT)
             return prepared
-        with prepared.timed("candidates"):
-            radius, counts = prepared.crop_radius, prepared.counts
-            sample = sample_candidates(scene, options, gripper, radius, counts, self.sees_hands)
-        prepared.sample = sample
-        if len(sample.candidates) == 0:
-            prepared.warnings.append(NO_CANDIDATE)
-            return prepared
-        with prepared.timed("description"):
-            prepared.width = required_openings(sample.view, gripper)
-            prepared.batch = self._batch(scene, sample, gripper)
+        radius, counts = prepared.crop_radius, prepared.counts
+        prepared.further = sample_candidates(
+            scene, options, gripper, radius, counts, self.sees_hands
+        )
+        self._sample(prepared, None)
         return prepared
 
+    def evaluate(self, prepared: Prepared) -> Float32:
+        """Second stage: the network's logits (E,); of further candidates too where none is sure."""
+        logits = np.empty(0, dtype=np.float32)
+        while prepared.sample is not None:
+            if prepared.batch is not None:
+                with prepared.timed("network"):
+                    logits = np.concatenate([logits, self.run(prepared.batch)])
+            sure = self._probability(logits) >= SURE_SCORE
+            if prepared.options.collision.mode != "ignore":
+                sure &= prepared.sample.collision_free
+            if not self._sample(prepared, sure):
+                break
+        return logits
+
     def run(self, batch: Batch) -> Float32:
-        """Second stage: the network's logits.  # (E,)."""
+        """The network's logits of a batch.  # (E,)."""
         with torch.inference_mode():
             logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
         return logits
@@ -206,6 +223,8 @@ class GraspDetector:
         grasps, debug = [], None
         with prepared.timed("ranking"):
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
+            if sample is not None and len(sample.candidates) == 0:
+                prepared.warnings.append(NO_CANDIDATE)
             if scene is not None and sample is not None and width is not None:
                 rows, outcome = select(scene, sample, score, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
@@ -332,10 +351,37 @@ class GraspDetector:
         """Whether scores are of hands where they are, not of edges wherever their hands are."""
         return self.metadata.network.architecture == "hand"
 
-    def _batch(self, scene: Scene, sample: Sample, gripper: Gripper) -> Batch:
+    def _sample(self, prepared: Prepared, sure: NDArray[np.bool_] | None) -> bool:
+        """Take the next candidates, for objects on which none (E,) is sure; whether there are any.
+
+        What they need to be scored becomes the batch.
+        """
+        scene, gripper, before = prepared.scene, prepared.gripper, prepared.sample
+        assert scene is not None
+        assert prepared.further is not None
+        numbers = None
+        if before is not None:
+            numbers = scene.object_of_point[before.candidates.approach_index[sure]]
+        with prepared.timed("candidates"):
+            try:
+                sample = prepared.further.send(numbers)
+            except StopIteration:
+                return False
+        prepared.sample = sample if before is None else before.and_further(sample)
+        prepared.batch = None
+        if len(sample.candidates):
+            with prepared.timed("description"):
+                view = hand_views(scene.cloud, sample.candidates.T_cloud_hand, reach_of(gripper))
+                width = required_openings(view, gripper)
+                earlier = width[:0] if prepared.width is None else prepared.width
+                prepared.width = np.concatenate([earlier, width])
+                prepared.batch = self._batch(scene, sample, view, gripper)
+        return True
+
+    def _batch(self, scene: Scene, sample: Sample, view: HandView, gripper: Gripper) -> Batch:
         candidates, network = sample.candidates, self.metadata.network
         if self.sees_hands:
-            return hand_batch(scene, candidates, gripper, network, sample.view)
+            return hand_batch(scene, candidates, gripper, network, view)
         return BallBatch.from_cloud(
             scene.cloud.points,
             scene.cloud.normals,

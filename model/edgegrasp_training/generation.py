@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -419,11 +419,12 @@ def choose_grasps(
         if scene is not None and scene.approach_allowed.any():
             gripper = choose_gripper(request, load_gripper(), {})
             radius = max(CROP_RADIUS, gripper.max_opening / 2)
-            sample = sample_candidates(scene, request, gripper, radius, {})
+            samples = sample_candidates(scene, request, gripper, radius, {})
+            sample = reduce(Sample.and_further, samples)
     else:
         prepared = guide.prepare(observation.cloud, request)
+        score = guide.evaluate(prepared)
         selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
-        score = None if prepared.batch is None else guide.run(prepared.batch)
     if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return None
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))

@@ -173,6 +173,7 @@ class OwnCandidates:
         prepared = self.detector.prepare(cloud, parse_options(options))
         if prepared.scene is None or prepared.sample is None:
             return np.empty((0, 4, 4), dtype=np.float32)
+        prepared.draw_all()
         sample = prepared.sample
         poses = sample.candidates.take(sample.collision_free).T_cloud_hand
         return prepared.scene.frame.poses_in_cloud(poses[rng.permutation(len(poses))])

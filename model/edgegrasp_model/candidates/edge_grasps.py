@@ -29,6 +29,7 @@ def sample_approach_points(
     count: int,
     method: Literal["farthest", "uniform"],
     rng: np.random.Generator,
+    before: Sequence[int] | Int64 = (),
 ) -> NDArray[np.int64]:
     """Rows of `count` different points, or of all where there are fewer.
 
@@ -37,22 +38,26 @@ def sample_approach_points(
         count: How many to choose.
         method: `farthest` spreads them over the cloud from a random start; `uniform` takes any.
         rng: Source of the random choice.
+        before: (B,) rows that were chosen before, which are not chosen again.
 
     Returns:
-        (min(count, N),) rows of `points`.
+        (min(count, N - B),) rows of `points`.
     """
-    count = min(count, len(points))
+    count = min(count, len(points) - len(before))
     if method == "uniform":
-        return rng.choice(len(points), count, replace=False).astype(np.int64)
-    chosen = np.empty(count, dtype=np.int64)
-    chosen[0] = rng.integers(len(points))
+        left = np.delete(np.arange(len(points)), before)
+        return rng.choice(left, count, replace=False).astype(np.int64)
+    chosen = np.empty(len(before) + count, dtype=np.int64)
+    chosen[: len(before)] = before
+    chosen[len(before) : 1] = rng.integers(len(points))
     nearest = np.full(len(points), np.inf, dtype=np.float32)
     columns = np.ascontiguousarray(points.T)
-    for i in range(1, count):
+    for i in range(1, len(chosen)):
         x, y, z = columns - points[chosen[i - 1], :, None]
         nearest = np.minimum(nearest, x * x + y * y + z * z)
-        chosen[i] = int(nearest.argmax())
-    return chosen
+        if i >= len(before):
+            chosen[i] = int(nearest.argmax())
+    return chosen[len(before) :]
 
 
 class BallCrop(NamedTuple):

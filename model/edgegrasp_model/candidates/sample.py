@@ -1,9 +1,8 @@
 """From a scene to the candidates that the network scores."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +20,6 @@ from edgegrasp_model.candidates.edge_grasps import (
 from edgegrasp_model.candidates.outline import outline_grasps, outlines
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import non_max_suppression
-from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
@@ -33,12 +31,11 @@ Bools = NDArray[np.bool_]
 
 FURTHER_ATTEMPTS = 3  # with other approach points, where few hands are free
 FEW = 16  # hands free of collision, of a scene
-ENOUGH = 150  # different ones of a scene's objects together, with half of the approach points
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
 FEWEST_EACH = 4  # of an object, however many there are
-OVERSAMPLING = 2  # hands checked for collision, in multiples of num_candidates
+OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 NEAR, TURNED = 0.004, math.radians(10)  # TCPs and turns of hands that one score stands for
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
@@ -51,43 +48,36 @@ APPROACH_STREAM, CANDIDATE_STREAM = 0, 1  # random streams of one request
 
 @dataclass(frozen=True)
 class Sample:
-    """The candidates to score; canonical frame."""
+    """Candidates to score, around some approach points; canonical frame."""
 
     approach_index: Int64  # (A,) rows of the cloud
     crop: BallCrop
     candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
-    view: HandView  # of the same candidates
     collision_free: Bools  # (E,)
     drawn: Candidates  # all that there were, C of them
     outcome: NDArray[np.int8]  # (C,) CODE of what became of each; RETURNED: it is to be scored
     row: Int64  # (E,) places of the candidates among them
 
-
-class _Tried(NamedTuple):
-    """Every candidate around some approach points, and what became of it so far."""
-
-    approach_index: Int64  # (A,)
-    crop: BallCrop
-    candidates: Candidates  # C of them
-    outcome: NDArray[np.int8]  # (C,) CODE of its Outcome; RETURNED: still in
-    row: Int64  # (K,) of those that were checked for collision
-    free: Bools  # (K,) which of those do not collide
-
-    def and_further(self, other: "_Tried") -> "_Tried":
-        """This and what was tried after it."""
-        further = replace(other.candidates, pair=other.candidates.pair + len(self.crop.ball_rows))
+    def and_further(self, other: "Sample") -> "Sample":
+        """This and what was sampled after it."""
         ball = other.crop.ball_of_point + len(self.approach_index)
-        return _Tried(
+        crop = BallCrop(
+            np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
+            np.concatenate([self.crop.ball_of_point, ball]),
+            self.crop.radius,
+        )
+        further, drawn = (
+            replace(candidates, pair=candidates.pair + len(self.crop.ball_rows))
+            for candidates in (other.candidates, other.drawn)
+        )
+        return Sample(
             np.concatenate([self.approach_index, other.approach_index]),
-            BallCrop(
-                np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
-                np.concatenate([self.crop.ball_of_point, ball]),
-                self.crop.radius,
-            ),
+            crop,
             Candidates.concatenate([self.candidates, further]),
+            np.concatenate([self.collision_free, other.collision_free]),
+            Candidates.concatenate([self.drawn, drawn]),
             np.concatenate([self.outcome, other.outcome]),
-            np.concatenate([self.row, other.row + len(self.candidates)]),
-            np.concatenate([self.free, other.free]),
+            np.concatenate([self.row, other.row + len(self.drawn)]),
         )
 
 
@@ -98,8 +88,11 @@ def sample_candidates(
     crop_radius: float,
     counts: dict[str, int],
     centre: bool = False,
-) -> Sample:
+) -> Generator[Sample, Int64 | None, None]:
     """Sample approach points and the candidates around them, collision-free where possible.
+
+    Half of the approach points first, then the other half on those objects that do not have a sure
+    grasp, then other ones where few hands are free.
 
     Args:
         scene: With at least one point in the approach region.
@@ -109,69 +102,48 @@ def sample_candidates(
         counts: Gets the number of candidates left after each constraint, over all attempts.
         centre: Whether there are centred hands among them: for networks that see where a hand is.
 
-    Returns:
-        At most num_candidates candidates. With `collision: avoid` none of them collides.
+    Yields:
+        Candidates, num_candidates at most in all, and takes the numbers of the objects that have a
+        sure grasp. With `collision: avoid` no candidate collides.
     """
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
     rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
+    add_count(counts, "scored", 0)
 
-    def look_around(approach_index: Int64, *, leaning: bool = False) -> _Tried:
+    def spread(number: Int64, before: Int64 = approach_rows[:0]) -> Int64:
+        return _spread(scene, approach_rows, objects, number, options, rng_approach, before)
+
+    def around(approach_index: Int64, *, leaning: bool = False) -> Sample:
         crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
-        candidates, outcome = _constrained(
+        drawn, outcome = _constrained(
             scene, approach_index, crop, options, gripper, counts, centre, leaning=leaning
         )
-        row, free = _checked(candidates, outcome, scene, options, gripper, counts, rng)
-        return _Tried(approach_index, crop, candidates, outcome, row, free)
+        row, free = _checked(drawn, outcome, scene, options, gripper, counts, rng)
+        new = free | (options.collision.mode != "avoid")
+        new[new] = different(drawn.T_cloud_hand[row[new]], free[new], gripper, options)
+        scored = rows_to_score(free, new, options, options.num_candidates - counts["scored"], rng)
+        row, free = row[scored], free[scored]
+        outcome[row] = CODE[Outcome.RETURNED]
+        add_count(counts, "scored", len(row))
+        return Sample(approach_index, crop, drawn.take(row), free, drawn, outcome, row)
 
-    first, second = approach_points(scene, approach_rows, options, rng_approach)
-    tried = look_around(first)
-    second = second[_has_few_hands(scene, second, tried, gripper, options)]
+    objects, wanted = share_approach_points(scene, approach_rows, options)
+    half = wanted if options.num_approach_points else (wanted + 1) // 2
+    first = spread(half)
+    sure = yield around(first)
+    unsure = np.where(np.isin(objects, () if sure is None else sure), 0, wanted)
+    second = spread(unsure * (wanted - half).sum() // max(unsure.sum(), 1), first)
     if len(second):
-        tried = tried.and_further(look_around(second))
+        yield around(second)
     for attempt in range(FURTHER_ATTEMPTS):
-        found = len(_usable(tried, options))
-        if found >= FEW or (attempt and found):
-            break
-        further = np.concatenate(approach_points(scene, approach_rows, options, rng_approach))
+        usable = "checked" if options.collision.mode == "ignore" else "collision_free"
+        if counts[usable] >= FEW or (attempt and counts[usable]):
+            return
+        further = spread(wanted)
         if attempt and len(approach_rows) <= len(further):  # they would be the same ones
-            break
-        tried = tried.and_further(look_around(further, leaning=True))
-    candidates = tried.candidates.take(tried.row)
-    new = tried.free | (options.collision.mode != "avoid")
-    new[new] = different(candidates.T_cloud_hand[new], tried.free[new], gripper, options)
-    scored = rows_to_score(tried.free, new, options, rng)
-    tried.outcome[tried.row[scored]] = CODE[Outcome.RETURNED]
-    counts["scored"] = len(scored)
-    candidates = candidates.take(scored)
-    return Sample(
-        tried.approach_index,
-        tried.crop,
-        candidates,
-        hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper)),
-        tried.free[scored],
-        tried.candidates,
-        tried.outcome,
-        tried.row[scored],
-    )
-
-
-def _usable(tried: _Tried, options: DetectOptions) -> Int64:
-    """Rows of the candidates that may be scored as they are."""
-    return tried.row if options.collision.mode == "ignore" else tried.row[tried.free]
-
-
-def _has_few_hands(
-    scene: Scene, approach_index: Int64, tried: _Tried, gripper: Gripper, options: DetectOptions
-) -> Bools:
-    """Which further approach points (A,) are on objects at which few different hands were found."""
-    hands = tried.candidates.take(_usable(tried, options))
-    new = different(hands.T_cloud_hand, np.ones(len(hands), dtype=bool), gripper, options)
-    number = scene.object_of_point[approach_index]
-    each = max(FEW, ENOUGH // max(len(np.unique(number)), 1))
-    of_hands = scene.object_of_point[hands.approach_index[new]]
-    objects, count = np.unique(of_hands, return_counts=True)
-    return np.isin(number, objects[count >= each], invert=True)
+            return
+        yield around(further, leaning=True)
 
 
 def _checked(
@@ -196,44 +168,48 @@ def _checked(
     return row, free
 
 
-def approach_points(
-    scene: Scene, rows: Int64, options: DetectOptions, rng: np.random.Generator
-) -> tuple[Int64, Int64]:
-    """Approach points spread over the objects: small ones get some, large ones more.
+def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> tuple[Int64, Int64]:
+    """How many approach points each object gets: small ones some, large ones more.
 
     Args:
         scene: Its cloud, and the object of each point.
         rows: (R,) points that may be chosen.
-        options: How many, and how they are sampled.
-        rng: Source of the random choice.
+        options: How many in all.
 
     Returns:
-        Rows of the cloud: the first half of each object's, which often are enough, and the others.
-        Where the request says how many, all come first.
+        The numbers (O,) of the objects, and approach points (O,) of each.
     """
-    number = scene.object_of_point[rows]
-    objects, size = np.unique(number, return_counts=True)
+    objects, size = np.unique(scene.object_of_point[rows], return_counts=True)
     most = options.num_approach_points
     if most is None and len(objects) <= MAX_APPROACH_POINTS:
         wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
         wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
         wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
-        wanted = np.maximum(wanted, FEWEST_EACH)
-    else:  # the largest objects first where there are fewer approach points than objects
-        most = most or MAX_APPROACH_POINTS
-        share = np.sqrt(size) / np.sqrt(size).sum() * most
-        wanted = np.floor(share).astype(np.int64)
-        rest = most - wanted.sum()
-        wanted[np.argsort(wanted - share, kind="stable")[:rest]] += 1
-    first, second = [rows[:0]], [rows[:0]]
-    for which, count in zip(objects[wanted > 0], wanted[wanted > 0], strict=True):
+        return objects, np.maximum(wanted, FEWEST_EACH)
+    # The largest objects first where there are fewer approach points than objects.
+    most = most or MAX_APPROACH_POINTS
+    share = np.sqrt(size) / np.sqrt(size).sum() * most
+    wanted = np.floor(share).astype(np.int64)
+    wanted[np.argsort(wanted - share, kind="stable")[: most - wanted.sum()]] += 1
+    return objects, wanted
+
+
+def _spread(
+    scene: Scene,
+    rows: Int64,
+    objects: Int64,
+    counts: Int64,
+    options: DetectOptions,
+    rng: np.random.Generator,
+    before: Int64,
+) -> Int64:
+    """Further approach points, `counts` (O,) on each of some objects (O,); rows of the cloud."""
+    number, chosen = scene.object_of_point[rows], [rows[:0]]
+    for which, count in zip(objects[counts > 0], counts[counts > 0], strict=True):
         mine = rows[number == which]
-        points = scene.cloud.points[mine]
-        chosen = mine[sample_approach_points(points, count, options.sampling, rng)]
-        half = len(chosen) if options.num_approach_points else (len(chosen) + 1) // 2
-        first.append(chosen[:half])
-        second.append(chosen[half:])
-    return np.concatenate(first), np.concatenate(second)
+        points, used = scene.cloud.points[mine], np.flatnonzero(np.isin(mine, before))
+        chosen.append(mine[sample_approach_points(points, count, options.sampling, rng, used)])
+    return np.concatenate(chosen)
 
 
 def _constrained(
@@ -293,16 +269,16 @@ def different(
 
 
 def rows_to_score(
-    free: Bools, new: Bools, options: DetectOptions, rng: np.random.Generator
+    free: Bools, new: Bools, options: DetectOptions, most: int, rng: np.random.Generator
 ) -> Int64:
-    """Ascending rows of at most num_candidates new candidates, those free of collision first."""
+    """Ascending rows of at most so many new candidates, those free of collision first."""
     if options.collision.mode == "ignore":
         rows = np.flatnonzero(new)
-        return rows[random_rows(len(rows), options.num_candidates, rng)]
+        return rows[random_rows(len(rows), most, rng)]
     clear, hit = np.flatnonzero(free & new), np.flatnonzero(~free & new)
-    rows = clear[random_rows(len(clear), options.num_candidates, rng)]
+    rows = clear[random_rows(len(clear), most, rng)]
     if options.collision.mode == "penalise":
-        rest = random_rows(len(hit), options.num_candidates - len(rows), rng)
+        rest = random_rows(len(hit), most - len(rows), rng)
         rows = np.sort(np.concatenate([rows, hit[rest]]))
     return rows
 

@@ -98,8 +98,7 @@ class _Work:
             prepared = detector.prepare(cloud, options)
             self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
-            logits = np.empty(0) if prepared.batch is None else detector.run(prepared.batch)
-        prepared.seconds["network"] = self.facts.seconds["network"]
+            logits = detector.evaluate(prepared)
         with self._stage("finish"):
             detection: Detection = detector.finish(prepared, logits)
         self.facts.grasps = len(detection.grasps)
