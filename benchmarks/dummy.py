@@ -65,10 +65,11 @@ class DummyDetector:
         counts["crc32"] = zlib.crc32(points.tobytes())  # a caller sees that the cloud is its own
         return DummyPrepared(options, points, drawn, scores, counts)
 
-    def run(self, batch: Float32) -> Float32:
+    def evaluate(self, prepared: DummyPrepared) -> Float32:
         """Take the time of a network."""
         time.sleep(self._seconds)
-        return batch
+        prepared.seconds["network"] = self._seconds
+        return prepared.batch
 
     def finish(self, prepared: DummyPrepared, logits: Float32) -> Detection:
         """Put a grasp on each of the best approach points."""

@@ -105,9 +105,9 @@ class Detector(DummyDetector):
         stage("prepare")
         return super().prepare(*given, **named)
 
-    def run(self, batch: Any) -> Any:
-        stage("run")
-        return super().run(batch)
+    def evaluate(self, prepared: Any) -> Any:
+        stage("evaluate")
+        return super().evaluate(prepared)
 
     def finish(self, *given: Any) -> Any:
         stage("finish")

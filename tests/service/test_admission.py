@@ -125,9 +125,9 @@ async def test_one_slow_request_does_not_change_the_pace() -> None:
 async def test_a_full_server_refuses_at_once(serve, connect, is_error, cloud) -> None:
     running = await serve(max_queue_length=1)
     client = connect(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     accepted = [asyncio.create_task(client.detect(cloud))]
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     accepted.append(asyncio.create_task(client.detect(cloud, seed=1)))
     await running.until(lambda: running.waiting == 1)
     refused = await client.detect(cloud)
@@ -135,7 +135,7 @@ async def test_a_full_server_refuses_at_once(serve, connect, is_error, cloud) ->
     assert refused.retry_after is not None
     assert refused.retry_after >= 1
     assert is_error(await client.score(cloud), "overloaded")
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert [answer.fine for answer in await asyncio.gather(*accepted)] == [True, True]
     assert (await client.detect(cloud)).fine
 
@@ -167,7 +167,7 @@ async def test_turns_come_in_order(serve, cloud) -> None:
     client, answered, asked = running.connect("grpc"), [], []
     stages = running.stages
     stages.shut("prepare")
-    stages.shut("run")
+    stages.shut("evaluate")
 
     async def ask(number: int) -> None:
         assert (await client.detect(cloud)).fine
@@ -180,11 +180,11 @@ async def test_turns_come_in_order(serve, cloud) -> None:
     for turn in range(1, 5):  # one at a time gets through
         await running.until(lambda turn=turn: stages.begun["prepare"] == turn)
         stages.open("prepare")
-        await running.until(lambda turn=turn: stages.begun["run"] == turn)
+        await running.until(lambda turn=turn: stages.begun["evaluate"] == turn)
         stages.shut("prepare")
-        stages.open("run")
+        stages.open("evaluate")
         await running.until(lambda turn=turn: len(answered) == turn)
-        stages.shut("run")
+        stages.shut("evaluate")
     await asyncio.gather(*asked)
     await client.close()
     assert answered == [0, 1, 2, 3]

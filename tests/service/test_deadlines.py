@@ -11,11 +11,11 @@ async def test_a_request_that_expires_while_it_waits_is_never_computed(
 ) -> None:
     running = await serve()
     client = connect(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     first = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     assert is_error(await client.detect(cloud, timeout=0.1), "deadline-exceeded")
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await first).fine
     await running.until_idle()
     assert running.stages.begun["prepare"] == 1
@@ -26,7 +26,7 @@ async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
 ) -> None:
     running = await serve()
     client, before = connect(running), running.server.pool.pids
-    running.stages.fail("run", "spin")
+    running.stages.fail("evaluate", "spin")
     assert is_error(await client.detect(cloud, timeout=0.3), "deadline-exceeded")
     assert (await client.detect(cloud)).fine
     assert running.server.pool.pids != before
@@ -40,34 +40,34 @@ async def test_the_worker_itself_stops_after_the_deadline(serve, connect, is_err
     assert is_error(await client.detect(cloud, timeout=0.2), "deadline-exceeded")
     running.stages.open("prepare")
     assert (await client.detect(cloud)).fine
-    assert running.stages.begun["run"] == 1
+    assert running.stages.begun["evaluate"] == 1
     assert running.server.pool.pids == before
 
 
 async def test_a_request_whose_client_left_frees_its_worker(serve, connect, cloud) -> None:
     running = await serve()
     client = connect(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     asked = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     asked.cancel()
     await running.until(lambda: running.ended == ["cancelled"])
     await running.until_idle()  # though the gate is shut
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await running.connect("grpc").detect(cloud)).fine
 
 
 async def test_a_client_that_left_while_it_waited_is_never_computed(serve, connect, cloud) -> None:
     running = await serve()
     client = connect(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     first = asyncio.create_task(client.detect(cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     second = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.waiting == 1)
     second.cancel()
     await running.until(lambda: running.waiting == 0)
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await first).fine
     await running.until_idle()
     assert running.stages.begun["prepare"] == 1
@@ -77,7 +77,7 @@ async def test_the_servers_own_limit_holds_without_a_deadline(
     serve, connect, is_error, cloud
 ) -> None:
     running = await serve(max_request_seconds=0.2)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     assert is_error(await connect(running).detect(cloud), "deadline-exceeded")
 
 

@@ -20,7 +20,7 @@ async def test_a_worker_that_dies_fails_its_own_request_only(
 ) -> None:
     running = await serve(max_worker_bytes=2**28)
     client, before = connect(running), running.server.pool.pids
-    running.stages.fail("run", fault)
+    running.stages.fail("evaluate", fault)
     assert is_error(await client.detect(cloud), "worker-lost")
     assert (await client.detect(cloud)).fine
     assert running.server.pool.pids != before

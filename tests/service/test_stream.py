@@ -77,14 +77,14 @@ async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, clou
 async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, streams, cloud) -> None:
     running = await serve()
     stream = streams(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     await stream.write(request("patient", cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     hasty = request("hasty", cloud)
     hasty.timeout = 0.05
     await stream.write(hasty)
     await running.until(lambda: running.ended == ["deadline-exceeded"])
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await stream.read()).WhichOneof("answer") == "detection"
     late = await stream.read()
     assert (late.request_id, late.error.detail.kind) == ("hasty", "deadline-exceeded")
@@ -94,14 +94,14 @@ async def test_a_request_of_a_stream_has_a_deadline_of_its_own(serve, streams, c
 async def test_no_more_is_read_than_may_be(serve, streams, cloud) -> None:
     running = await serve(max_stream_requests=3)
     stream = streams(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     for number in range(8):
         await stream.write(request(str(number), cloud))
     await stream.done_writing()
     await running.until(lambda: running.server.service.admission.tickets == 3)
     await asyncio.sleep(0.1)
     assert running.server.service.admission.tickets == 3
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert [answer.request_id async for answer in stream] == [str(number) for number in range(8)]
 
 
@@ -134,11 +134,11 @@ async def send(stream: Any, requests: list[grasp_pb2.DetectGraspsStreamRequest])
 async def test_a_full_server_is_told_of_in_the_stream(serve, streams, cloud) -> None:
     running = await serve(max_queue_length=0)
     stream = streams(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     for name in ("taken", "refused"):
         await stream.write(request(name, cloud))
     await running.until(lambda: running.ended == ["overloaded"])
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await stream.read()).WhichOneof("answer") == "detection"
     refused = await stream.read()
     assert refused.error.code == grpc.StatusCode.RESOURCE_EXHAUSTED.value[0]
@@ -159,14 +159,14 @@ async def test_streams_are_bounded(serve, streams, cloud) -> None:
 async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
     running = await serve()
     stream = streams(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     for name in ("first", "second"):
         await stream.write(request(name, cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     await running.until(lambda: running.waiting == 1)
     stream.cancel()
     await running.until(lambda: running.ended == ["cancelled", "cancelled"])
-    running.stages.open("run")
+    running.stages.open("evaluate")
     await running.until_idle()
     assert running.stages.begun["prepare"] == 1
 
@@ -176,12 +176,12 @@ async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(
 ) -> None:
     running = await serve()
     stream, idle = streams(running), streams(running)
-    running.stages.shut("run")
+    running.stages.shut("evaluate")
     await stream.write(request("read", cloud))
-    await running.until(lambda: running.stages.begun["run"] == 1)
+    await running.until(lambda: running.stages.begun["evaluate"] == 1)
     running.stop.set()
     await running.until(running.server.service.stopping.is_set)
-    running.stages.open("run")
+    running.stages.open("evaluate")
     assert (await stream.read()).WhichOneof("answer") == "detection"
     for each in (stream, idle):
         assert await each.code() is grpc.StatusCode.UNAVAILABLE

@@ -109,7 +109,6 @@ def sample_candidates(
     rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
     rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
     approach_rows = np.flatnonzero(scene.approach_allowed)
-    add_count(counts, "scored", 0)
 
     def spread(number: Int64, before: Int64 = approach_rows[:0]) -> Int64:
         return _spread(scene, approach_rows, objects, number, options, rng_approach, before)
@@ -122,7 +121,8 @@ def sample_candidates(
         row, free = _checked(drawn, outcome, scene, options, gripper, counts, rng)
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], gripper, options)
-        scored = rows_to_score(free, new, options, options.num_candidates - counts["scored"], rng)
+        most = options.num_candidates - counts.get("scored", 0)
+        scored = rows_to_score(free, new, options, most, rng)
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
         add_count(counts, "scored", len(row))

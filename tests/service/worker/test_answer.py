@@ -23,10 +23,10 @@ class FailingCatalogue(DummyCatalogue):
     def get(self, name: str = "") -> Any:
         detector = super().get(name)
 
-        def run(batch: object) -> Any:
+        def evaluate(prepared: object) -> Any:
             raise self.error
 
-        detector.run = run  # type: ignore[method-assign]
+        detector.evaluate = evaluate  # type: ignore[method-assign]
         return detector
 
 
