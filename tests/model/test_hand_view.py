@@ -180,6 +180,20 @@ def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it() -> Non
         assert torch.equal(scores(HandBatch(*parts), HAND), together[rows])
 
 
+def test_weights_that_were_changed_are_those_that_score() -> None:
+    batch = look(*scene(5))
+    changed, fresh = (build_network(TINY["hand"]).eval() for _ in range(2))
+    with torch.inference_mode():
+        before = changed(batch)
+    with torch.no_grad():
+        for weight in changed.parameters():
+            weight += 0.01
+    fresh.load_state_dict(changed.state_dict())
+    with torch.inference_mode():
+        assert not torch.equal(changed(batch), before)
+        assert torch.equal(changed(batch), fresh(batch))
+
+
 def test_the_description_is_standardised_within() -> None:
     batch = look(*scene(5))
     plain = scores(batch)

@@ -117,7 +117,7 @@ def outline_grasps(
     pair = pair[outline.is_edge[crop.ball_rows[pair]]]
     contact, approach = crop.ball_rows[pair], approach_index[crop.ball_of_point[pair]]
     apart = points[contact] - points[approach]
-    edge = [np.einsum("md,md->m", apart, frame[contact, axis]) for axis in (1, 2, 3)]
+    edge = np.einsum("md,mkd->km", apart, frame[contact, 1:])
     between = (np.abs(edge[0]) < gripper.pad_half_width) & (edge[2] > -DROP)
     row = np.flatnonzero(between & (edge[1] > MIN_EDGE) & (edge[1] < gripper.max_opening))
     extent = _extents(points, crop, pair[row], frame[contact[row]], gripper)

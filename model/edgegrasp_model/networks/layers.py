@@ -4,7 +4,7 @@ In inference no bit of a row depends on the other rows: a candidate's score is t
 else is scored with it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from edgegrasp_model.networks.balls import BallBatch
 
@@ -20,6 +21,8 @@ MIN_ROWS = 32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time
+# Weights as oneDNN reads them, of a version each.
+_PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
 class RowLinear(nn.Linear):
@@ -183,8 +186,11 @@ def _packed(weight: Tensor) -> Tensor | None:
     """A weight as oneDNN reads it; None where the plain product serves."""
     if len(weight) == 1 or not (float32_inference(weight) and onednn_is_faster()):
         return None
-    packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
-    return packed
+    version = -1 if weight.is_inference() else weight._version  # changes of those are not counted
+    if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
+        packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
+        _PACKED[weight] = version, packed
+    return _PACKED[weight][1]
 
 
 class BallChunk(NamedTuple):

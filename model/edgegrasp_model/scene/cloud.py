@@ -245,15 +245,15 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
-    finite = _finite(cloud)
-    if not finite.all():
+    low, high = (np.array([axis(column) for column in cloud.T]) for axis in (np.min, np.max))
+    if not np.isfinite([low, high]).all():
+        finite = _finite(cloud)
         bad = int(np.argmin(finite))
         raise InvalidRequest(
             "cloud",
             f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
             "Remove points without a finite x, y, z.",
         )
-    low, high = (np.array([axis(column) for column in cloud.T]) for axis in (np.min, np.max))
     extent = float((high.astype(np.float64) - low).max())
     if extent > MAX_EXTENT:
         raise InvalidRequest(

@@ -341,12 +341,12 @@ def _most_stood_on(
 
 def _refined(seen: Seen, plane: _Plane) -> _Plane:
     """A plane fitted again to more points than it was found by."""
-    thick, weight = thickness(seen.distance()), np.ones(len(seen.points))
+    points, thick = seen.points.astype(np.float64), thickness(seen.distance())
     for within in (1.0, 0.7, 0.5):
-        near = np.abs(plane.heights(seen.points)) < within * thick
-        if near.sum() < NEIGHBORS:
+        near = np.flatnonzero(np.abs(plane.heights(points)) < within * thick)
+        if len(near) < NEIGHBORS:
             break
-        fitted = _fitted(seen.points[near].astype(np.float64), weight[near], plane.normal)
+        fitted = _fitted(points[near], np.ones(len(near)), plane.normal)
         plane = plane._replace(normal=fitted.normal, offset=fitted.offset)
     return plane
 

@@ -71,7 +71,7 @@ class PlaneView(NamedTuple):
 
 def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]) -> Float64:
     """Two unit axes (2, 3) along a plane, the first toward the camera, else the furthest point."""
-    middle = points.mean(axis=0, dtype=np.float64)
+    middle = np.array([axis.mean(dtype=np.float64) for axis in points.T])
     offsets = points[:: max(len(points) // 1000, 1)] - middle
     if viewpoint is not None:
         offsets = np.concatenate([[viewpoint - middle], offsets])
@@ -201,8 +201,8 @@ def support_outline(plan: Float64) -> Float64 | None:
     labels, _ = ndimage.label(ndimage.binary_closing(held, iterations=2), np.ones((3, 3)))
     size = np.bincount(labels[held], minlength=labels.max() + 1)
     size[0] = 0
-    good = size >= max(MIN_PATCH, SMALL_PATCH * size.max())
-    middles = (np.argwhere(held & good[labels]) - 1.5) * SUPPORT_CELL + low
+    held &= (size >= max(MIN_PATCH, SMALL_PATCH * size.max()))[labels]
+    middles = (np.argwhere(held & ~ndimage.binary_erosion(held)) - 1.5) * SUPPORT_CELL + low
     try:
         return np.asarray(ConvexHull(middles).equations)
     except (QhullError, ValueError):  # too few cells, or all in a line
@@ -371,9 +371,10 @@ def _is_heap(plan: Float64, height: NDArray[np.floating], most: float) -> bool:
 
 def _length(plan: Float64, height: NDArray[np.floating]) -> float:
     """The longest side of the box along the principal axes of points, or their height; metres."""
-    around = plan - plan.mean(axis=0)
-    _, vectors = np.linalg.eigh(around.T @ around)
-    return max(float(np.ptp(around @ vectors, axis=0).max()), float(np.ptp(height)))
+    axes = np.ascontiguousarray(plan.T)
+    around = axes - axes.mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(around @ around.T)
+    return max(float(np.ptp(vectors.T @ around, axis=1).max()), float(np.ptp(height)))
 
 
 def _is_noise(rows: Int64, view: PlaneView) -> bool:
