@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def main() -> None:
         "paper": lambda: {
             name: beside_textbook(config, observation) for name, config in PAPER.items()
         },
-        "simulator": lambda: {str(kind): simulator(kind) for kind in CLUTTER},
+        "simulator": simulators,
         "server": server_footprint,
     }
     for name, part in parts.items():
@@ -196,6 +197,12 @@ def server_footprint() -> dict[str, float]:
             for seed in range(10):
                 client.detect(seen.cloud, seed=seed, viewpoint=viewpoint)
         return {"ready_seconds": ready, "rest_mb": at_rest, "used_mb": server.memory()}
+
+
+def simulators() -> dict[str, Any]:
+    """The simulator with each kind of scene, in a process of its own, as its workers are."""
+    with get_context("spawn").Pool(1) as process:
+        return {str(kind): process.apply(simulator, (kind,)) for kind in CLUTTER}
 
 
 def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
