@@ -13,7 +13,9 @@ from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequ
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Outcome
+from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
 
+from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, camera, render, table, things
 from .scenes import PANDA, box_on_table, detector
 
 CLOUD = box_on_table()
@@ -38,6 +40,22 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
     first = detect(seed=0)
     assert same(first, detect(seed=0))
     assert not same(first, detect(seed=1))
+
+
+def test_several_depth_images_give_grasps_with_the_defaults() -> None:
+    boxes, poses = [table(), *things(1)], [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
+    intrinsics = [FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2]
+    views = [CameraView(intrinsics=intrinsics, T_cloud_camera=pose.tolist()) for pose in poses]
+    depths = [render(boxes, pose)[..., 2] for pose in poses]
+    network = ModelCatalogue.load().get("edgegrasp-plus")
+    found = []
+    for number in (1, 3):
+        cloud, cameras = fuse_depth_images(depths[:number], views[:number])
+        options = DetectOptions.model_validate({"viewpoint": cameras})
+        found.append(network.detect(cloud, options))
+    one, three = found
+    assert len(three.grasps) >= len(one.grasps) > 0
+    assert len(three.objects) == len(one.objects) == 4
 
 
 def test_the_order_of_the_points_does_not_matter() -> None:

@@ -133,8 +133,11 @@ def test_depth_camera(tmp_path: Path) -> None:
 
 
 def test_several_views(address: str) -> None:
-    counts = re.findall(r"(\d) views: (\d+) points", example("05_several_views.py", address))
-    (one, few), (three, many) = counts
+    printed = re.findall(
+        r"(\d) views: (\d+) points over the table, best score 0\.\d+",
+        example("05_several_views.py", address),
+    )
+    (one, few), (three, many) = printed
     assert (one, three) == ("1", "3")
     assert int(many) > 2 * int(few)
 

@@ -104,7 +104,8 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
     points = sent.points
     kept = size_of_image = None
     if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
-        size_of_image = points.shape[:2]
+        # A single row of points, such as those of several images, is no image.
+        size_of_image = None if 1 in points.shape[:2] else points.shape[:2]
         points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
             kept = np.flatnonzero(_finite(points))

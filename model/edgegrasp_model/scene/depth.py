@@ -87,8 +87,9 @@ def fuse_depth_images(
 
     Returns:
         A cloud whose rows are the pixels, one image after the other, with NaN where a pixel has no
-        reading: (H, W, 3) for one image, (1, N, 3) and the view of each for several; what is
-        doubtful about its cameras is in its warnings. And the position of each camera.
+        reading: (H, W, 3) for one image; for several (1, N, 3), which is no image, and the view of
+        each point; what is doubtful about its cameras is in its warnings. And the position of each
+        camera.
 
     Raises:
         InvalidRequest: An array is no image of depths, or cannot be that of its camera; names
