@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_model.errors import UnknownModel
+from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,
@@ -21,6 +22,7 @@ from edgegrasp_model.results import (
     Evaluation,
     Float32,
     Grasp,
+    GripperOutline,
     NoGrasp,
     Outcome,
     Scoring,
@@ -30,6 +32,7 @@ from edgegrasp_model.scene.cloud import CloudInput, check_cloud, check_edges, ch
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z
 DOWN = np.array([0.0, 0.0, -1.0], np.float32)
+PANDA = load_gripper("panda")
 APPROACH_POINTS = 32  # where a request names no number
 GRASPS = 10  # made at most
 WARNING = "The dummy detector made these grasps up."
@@ -92,7 +95,10 @@ class DummyDetector:
         )
         counts = prepared.counts | {"returned": len(grasps)}
         seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}
-        return Detection(grasps, counts, seconds, NAME, [WARNING], debug if options.debug else None)
+        gripper = choose_gripper(options, PANDA, {})
+        outline = GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z)
+        debug_info = debug if options.debug else None
+        return Detection(grasps, counts, seconds, NAME, outline, [WARNING], debug_info)
 
     def score(
         self,

@@ -239,7 +239,7 @@ def draw(
     title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
     picture = Picture(view, points, shades, image, title)
     picture.regions(options)
-    picture.grasps(shown)
+    picture.grasps(shown, (detection.gripper.palm_z, detection.gripper.tip_z))
     picture.save(path)
 
 

@@ -278,5 +278,13 @@ def _picture(found: "Detection", viewpoint: Any) -> bytes:
     eye = np.zeros(3) if viewpoint is None else np.reshape(viewpoint, (-1, 3))[0]
     file = io.BytesIO()
     title = f"{len(grasps)} grasps of {found.model}; axes turned so that z is up"
-    draw_grasps(file, found.debug.points @ turn, grasps, camera_position=eye @ turn, title=title)
+    hand = found.gripper.palm_z, found.gripper.tip_z
+    draw_grasps(
+        file,
+        found.debug.points @ turn,
+        grasps,
+        camera_position=eye @ turn,
+        title=title,
+        palm_and_tip=hand,
+    )
     return file.getvalue()

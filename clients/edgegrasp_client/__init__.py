@@ -48,6 +48,7 @@ from edgegrasp_client.results import DebugInfo as DebugInfo
 from edgegrasp_client.results import Detection as Detection
 from edgegrasp_client.results import Evaluation as Evaluation
 from edgegrasp_client.results import Grasp as Grasp
+from edgegrasp_client.results import GripperOutline as GripperOutline
 from edgegrasp_client.results import Model as Model
 from edgegrasp_client.results import Scoring as Scoring
 from edgegrasp_client.results import StreamAnswer as StreamAnswer

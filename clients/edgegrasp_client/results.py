@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_client.errors import GraspClientError
 
@@ -28,6 +28,23 @@ class Grasp:
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
     object: int | None = None  # number of the object that the contact is on; None: of none
 
+    def pregrasp(self, distance: float = 0.05) -> Float32:
+        """The hand's pose (4, 4) `distance` metres back, where the straight way in begins."""
+        return self.retreat(distance)
+
+    def retreat(self, distance: float = 0.1, direction: ArrayLike | None = None) -> Float32:
+        """The hand's pose (4, 4) after a straight way out.
+
+        Args:
+            distance: Metres.
+            direction: (3,) cloud frame, of any length but zero, such as the detection's `up`;
+                None: back along the approach.
+        """
+        way = -self.approach_direction if direction is None else np.asarray(direction, np.float32)
+        pose: Float32 = self.T_cloud_hand.copy()
+        pose[:3, 3] += distance * way / np.linalg.norm(way)
+        return pose
+
 
 @dataclass(frozen=True, eq=False)
 class FoundSupport:
@@ -37,6 +54,15 @@ class FoundSupport:
     offset: float  # metres
     residual: float | None  # metres, median distance of its points; None: none of it is seen
     share: float  # of the seen surface that lies in it
+
+
+@dataclass(frozen=True)
+class GripperOutline:
+    """The gripper that grasps are for, as far as drawing it needs; metres along the hand's z."""
+
+    name: str
+    palm_z: float  # the palm's surface between the fingers
+    tip_z: float  # the fingertips of the open gripper
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +99,7 @@ class Detection:
     counts: dict[str, int]  # points, candidates and grasps that passed each stage
     seconds: dict[str, float]  # spent in each stage, and their `total`
     model: str  # name of the weights used
+    gripper: GripperOutline
     warnings: list[str]
     debug: DebugInfo | None  # where `debug` is asked for
     support: FoundSupport | None  # given or found
@@ -140,7 +167,7 @@ _STAGES = (
 )
 
 
-Record = TypeVar("Record", Model, FoundSupport, DetectedObject, Grasp)
+Record = TypeVar("Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
@@ -153,6 +180,7 @@ def detection_from(answer: Any, read: Read) -> Detection:
         up=_array(read(answer, "up")),
         support=None if support is None else _record(FoundSupport, support, read),
         objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
+        gripper=_record(GripperOutline, read(answer, "gripper"), read),
         debug=None if debug is None else _debug(debug, read),
         **_common(answer, read),
     )

@@ -8,16 +8,15 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, Self
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+from typing_extensions import Self
 
 Points = NDArray[np.float64]
 
-PALM_Z = 0.0658  # metres along the hand's z: the palm's surface
-TIP_Z = 0.1122  # metres along the hand's z: the fingertips
+PANDA = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface and the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
 BAR = 0.005  # metres, thickness of a fork
 BARS = (2.0, 7.0)  # points that this is at least and at most
@@ -181,7 +180,7 @@ class Picture:
                 pixels, _ = self.view.project(line)
                 self._axes.plot(*pixels.T, style, color=REGION, linewidth=1.6)
 
-    def grasps(self, grasps: Sequence[Drawable]) -> None:
+    def grasps(self, grasps: Sequence[Drawable], palm_and_tip: tuple[float, float] = PANDA) -> None:
         """Draw a fork for every grasp, the best last, and the scale of their scores."""
         from matplotlib import colormaps
         from matplotlib.cm import ScalarMappable
@@ -189,9 +188,10 @@ class Picture:
 
         scale: Any = ScalarMappable(Normalize(0.0, 1.0), colormaps[MAP])
         for rank, grasp in reversed(list(enumerate(grasps))):
-            self._fork(fork(grasp.T_cloud_hand, grasp.width), scale.to_rgba(grasp.score))
+            pieces = fork(grasp.T_cloud_hand, grasp.width, palm_and_tip)
+            self._fork(pieces, scale.to_rgba(grasp.score))
             if rank < LABELLED and len(grasps) > 1:
-                self._label(grasp, str(rank + 1))
+                self._label(pieces[0, 0], str(rank + 1))
         if len(grasps) > 1:
             axes = self._figure.add_axes((0.78, 0.62 * self._foot, 0.2, 0.16 * self._foot))
             bar = self._figure.colorbar(
@@ -224,8 +224,8 @@ class Picture:
         at = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
         return np.where(inside, self._depth[at], np.nan)
 
-    def _label(self, grasp: Drawable, text: str) -> None:
-        (x, y), _ = self.view.project(fork(grasp.T_cloud_hand, grasp.width)[0, 0])
+    def _label(self, place: Points, text: str) -> None:
+        (x, y), _ = self.view.project(place)
         box = {"boxstyle": "circle,pad=0.2", "fc": "white", "ec": OUTLINE, "lw": 0.6}
         self._axes.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, clip_on=True)
 
@@ -243,6 +243,7 @@ def draw_grasps(
     *,
     camera_position: ArrayLike,
     title: str,
+    palm_and_tip: tuple[float, float] = PANDA,
 ) -> None:
     """Write a picture of a cloud and of grasps in it, as `Picture.save` does.
 
@@ -252,9 +253,10 @@ def draw_grasps(
         grasps: best first.
         camera_position: (3,) metres, cloud frame; the picture looks from there.
         title: a line below it.
+        palm_and_tip: metres along the hand's z.
     """
     picture = Picture(View.of(cloud, camera_position), cloud, title=title)
-    picture.grasps(grasps)
+    picture.grasps(grasps, palm_and_tip)
     picture.save(path)
 
 
@@ -274,23 +276,26 @@ def lit(depth: NDArray[np.floating], fx: float, fy: float) -> Points:
     return light
 
 
-def fork(T_cloud_hand: ArrayLike, width: float) -> Points:
+def fork(
+    T_cloud_hand: ArrayLike, width: float, palm_and_tip: tuple[float, float] = PANDA
+) -> Points:
     """A gripper's outline as four line pieces: stem, palm, both fingers.
 
     Args:
         T_cloud_hand: (4, 4), z out of the palm, y the closing direction.
         width: metres between the fingers' inner faces.
+        palm_and_tip: metres along z of the palm's surface and of the fingertips.
 
     Returns:
         (4, 2, 3) ends of each piece, metres, cloud frame.
     """
-    half = width / 2
+    half, (palm, tip) = width / 2, palm_and_tip
     in_hand = np.array(
         [
-            [(0.0, 0.0, PALM_Z - STEM_LENGTH), (0.0, 0.0, PALM_Z)],
-            [(0.0, -half, PALM_Z), (0.0, half, PALM_Z)],
-            [(0.0, -half, PALM_Z), (0.0, -half, TIP_Z)],
-            [(0.0, half, PALM_Z), (0.0, half, TIP_Z)],
+            [(0.0, 0.0, palm - STEM_LENGTH), (0.0, 0.0, palm)],
+            [(0.0, -half, palm), (0.0, half, palm)],
+            [(0.0, -half, palm), (0.0, -half, tip)],
+            [(0.0, half, palm), (0.0, half, tip)],
         ]
     )
     transform = np.asarray(T_cloud_hand, dtype=np.float64)
@@ -312,7 +317,9 @@ def _lines_of(shape: Mapping[str, Any]) -> Iterator[Points]:
             low, high = np.asarray(shape["min"]), np.asarray(shape["max"])
             corners = (low + high) / 2 + corners * (high - low) / 2
         else:
-            turn = Rotation.from_quat(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
-            corners = shape["center"] + turn.apply(corners * shape["half_extents"])
+            *axis, w = np.asarray(shape.get("quaternion", (0.0, 0.0, 0.0, 1.0)))  # xyzw
+            corners = corners * shape["half_extents"]
+            across = 2 * np.cross(axis, corners)
+            corners = shape["center"] + corners + w * across + np.cross(axis, across)
         for first, second in EDGES:
             yield corners[[first, second]]

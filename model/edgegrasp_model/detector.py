@@ -37,7 +37,7 @@ from edgegrasp_model.ranking import (
     grasps_in_cloud,
     select,
 )
-from edgegrasp_model.results import Detection, Evaluation, NoGrasp, Scoring
+from edgegrasp_model.results import Detection, Evaluation, GripperOutline, NoGrasp, Scoring
 from edgegrasp_model.scene.cloud import (
     CheckedCloud,
     check_cloud,
@@ -242,6 +242,7 @@ class GraspDetector:
             counts,
             seconds,
             name,
+            GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z),
             prepared.warnings,
             debug,
             found_support(prepared.selected.support),

@@ -62,6 +62,15 @@ class FoundSupport:
 
 
 @dataclass(frozen=True)
+class GripperOutline:
+    """The gripper that grasps are for, as far as drawing it needs; metres along the hand's z."""
+
+    name: str
+    palm_z: float  # the palm's surface between the fingers
+    tip_z: float  # the fingertips of the open gripper
+
+
+@dataclass(frozen=True)
 class DetectedObject:
     """A thing that grasps are for; cloud frame, metres."""
 
@@ -95,6 +104,7 @@ class Detection:
     counts: dict[str, int]  # points, candidates and grasps that passed each stage, in order
     seconds: dict[str, float]  # spent in each stage, and their `total`
     model: str  # name of the weights used
+    gripper: GripperOutline
     warnings: list[str] = field(default_factory=list)
     debug: DebugInfo | None = None  # where it was asked for
     support: FoundSupport | None = None  # given or found

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from benchmarks import load, soak
 
-from edgegrasp_client import DeadlineError, Detection, InvalidRequestError
+from edgegrasp_client import DeadlineError, Detection, GripperOutline, InvalidRequestError
 
 
 def test_load_tells_answers_from_refusals_and_the_server_from_the_detector() -> None:
@@ -38,7 +38,9 @@ def test_a_soak_finds_faults() -> None:
 def test_an_answer_to_another_cloud_is_noticed() -> None:
     plan = soak.Plan(3, "good", 50, 0.0, seed=0)
     digest = soak.zlib.crc32(plan.points().tobytes())
-    answer = Detection([], {"crc32": digest}, {}, "", [], None, None, plan.points()[0], [])
+    hand = GripperOutline("panda", 0.0658, 0.1122)
+    up = plan.points()[0]
+    answer = Detection([], {"crc32": digest}, {}, "", hand, [], None, None, up, [])
     assert soak.outcome(plan, answer) == soak.ANSWERED
     assert soak.outcome(plan, replace(answer, counts={"crc32": digest ^ 1})) == soak.CROSSED
     assert soak.outcome(plan, InvalidRequestError("")) == soak.REFUSED

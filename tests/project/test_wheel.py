@@ -83,6 +83,72 @@ def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> Non
     assert found.stdout.startswith(str(new))
 
 
+BARE = """
+import importlib, importlib.metadata, pkgutil, sys
+from types import SimpleNamespace
+import edgegrasp_client, numpy as np
+from edgegrasp_bridge import bridge
+for module in pkgutil.iter_modules(edgegrasp_client.__path__, "edgegrasp_client."):
+    importlib.import_module(module.name)
+stamp = SimpleNamespace(sec=1, nanosec=2)
+fields = [SimpleNamespace(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")]
+points = np.random.default_rng(0).uniform(0.1, 0.3, (500, 3)).astype("<f4")
+cloud = SimpleNamespace(
+    header=SimpleNamespace(stamp=stamp, frame_id="camera"), height=1, width=500, fields=fields,
+    is_bigendian=False, point_step=12, row_step=6000, data=points.tobytes(),
+)
+inbox, settings = bridge.Inbox(), bridge.Settings()
+assert inbox.take("cloud", cloud, settings.mask_age)
+for address in sys.argv[1:]:
+    with edgegrasp_client.GraspClient(address) as client:
+        asked = client, inbox.scene(settings.mask_age), settings, {}, lambda *_: np.eye(4)
+        found = bridge.detect(*asked)
+        assert len(bridge.pose_array(found)["poses"]) == len(client.detect(points).grasps) > 0
+        assert len(bridge.marker_array(found)["markers"]) == 1 + len(found.grasps)
+        assert bridge.moveit_grasps(found, settings, lambda *_: np.eye(4))["grasps"]
+        assert len(client.models()) == 1
+print(np.__version__, *sorted(each.metadata["Name"] for each in importlib.metadata.distributions()))
+"""
+
+
+def python_of(version: str) -> str:
+    """An interpreter of a version that runs."""
+    pyenv = Path.home().glob(f".pyenv/versions/{version}.*/bin/python{version}")
+    for program in (shutil.which(f"python{version}"), *map(str, pyenv)):
+        if program and not subprocess.run([program, "-c", ""], capture_output=True).returncode:
+            return program
+    pytest.skip(f"there is no Python {version} here")
+
+
+@pytest.mark.parametrize("version", ["3.10", "this"])
+def test_the_base_install_alone_asks_a_server(version: str, built, dummy_server, tmp_path) -> None:
+    """The client and the ROS 2 bridge without any extra, with the lowest numpy on 3.10."""
+    program = sys.executable if version == "this" else python_of(version)
+    subprocess.run([program, "-m", "venv", str(tmp_path / "venv")], check=True)
+    python = str(tmp_path / "venv/bin/python")
+    pip = [python, "-m", "pip", "install", "--quiet", "--no-cache-dir"]
+    pinned = ["numpy==1.24.*"] if version == "3.10" else ["-c", str(ROOT / "constraints.txt")]
+    reached = subprocess.run([*pip, "numpy", *pinned], capture_output=True, text=True, check=False)
+    if reached.returncode:
+        pytest.skip(f"pip reaches no index: {reached.stderr.strip().splitlines()[-1]}")
+    done = subprocess.run(
+        [*pip, *pinned, str(built[1])], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    addresses = [dummy_server.grpc_address, dummy_server.http_url]
+    ran = subprocess.run(
+        [python, "-W", "error", "-c", BARE, *addresses],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT / "clients" / "ros2")},
+    )
+    assert ran.returncode == 0, ran.stderr
+    numpy, *names = ran.stdout.split()
+    assert version == "this" or numpy.startswith("1.24.")
+    assert not {"scipy", "torch", "matplotlib", "typer"} & set(names)
+
+
 def test_the_version_is_that_of_the_project_file(built: tuple[Path, Path]) -> None:
     assert VERSION is not None
     assert built[1].name == f"edgegrasp-{VERSION[1]}-py3-none-any.whl"

@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_bridge import bridge
-from edgegrasp_bridge.bridge import Scene, Settings
+from edgegrasp_bridge.bridge import Inbox, Scene, Settings
 from edgegrasp_client import GraspClient, InvalidRequestError
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
+from edgegrasp_model.gripper import load_gripper
 
 STAMP = {"sec": 12, "nanosec": 345}
 HEADER = {"stamp": STAMP, "frame_id": "camera"}
@@ -105,6 +106,8 @@ def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud
     assert fingers.shape == (8, 3)
     in_hand = (fingers - hands[0][:3, 3]) @ hands[0][:3, :3]
     assert np.ptp(in_hand[:, 1]) == pytest.approx(expected[0].width, abs=1e-5)
+    before = sent("geometry_msgs/msg/PoseArray", bridge.pose_array(found, 0.07)).poses[0]
+    np.testing.assert_allclose(matrix(before), hands[0] @ shifted(-0.07), atol=1e-5)
 
     planned = bridge.moveit_grasps(found, settings, lookup)
     result = sent("grasping_msgs/msg/GraspPlanning_Result", planned)
@@ -119,11 +122,30 @@ def test_a_cloud_and_its_grasps_in_every_message(client, sent, make_cloud, cloud
         )
         assert grasp.pre_grasp_posture.points[0].positions.sum() == pytest.approx(wanted.width)
 
-    fields = bridge.object_results(found, "mug", most=2)
+    fields = bridge.object_results(found, settings, "mug", most=2)
     (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
     assert (each.object_id, each.success, len(each.candidates)) == ("mug", True, 2)
     assert 0 <= each.candidates[1].confidence <= each.candidates[0].confidence <= 1
     np.testing.assert_allclose(matrix(each.candidates[0].pose.pose), hands[0], atol=1e-5)
+    first = each.candidates[0]
+    np.testing.assert_allclose(matrix(first.pregrasp), hands[0] @ shifted(-0.05), atol=1e-5)
+    np.testing.assert_allclose(matrix(first.retreat), hands[0] @ shifted(-0.1), atol=1e-5)
+
+
+def shifted(z: float) -> np.ndarray:
+    return np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, z], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize("gripper", ["panda", "robotiq-2f-140"])
+def test_markers_show_the_gripper_that_was_asked_for(client, sent, make_cloud, cloud, gripper):
+    scene, options = Scene(make_cloud(cloud)), {"gripper": gripper, "top_k": 1}
+    found = bridge.detect(client, scene, Settings(), options, lookup)
+    outline, (grasp,) = load_gripper(gripper), found.grasps
+    markers = sent("visualization_msgs/msg/MarkerArray", bridge.marker_array(found)).markers
+    ends = np.array([[p.x, p.y, p.z] for p in markers[1].points])
+    z = (ends - grasp.T_cloud_hand[:3, 3]) @ grasp.T_cloud_hand[:3, 2]
+    assert z.max() == pytest.approx(outline.tip_z, abs=1e-5)
+    assert z[1] == pytest.approx(outline.palm_z, abs=1e-5)
 
 
 def matrix(pose: Any) -> np.ndarray:
@@ -172,6 +194,13 @@ def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cl
     bridge.detect(asked, Scene(make_cloud(cloud)), settings, {"viewpoint": [1, 2, 3]}, lookup)
     assert asked.given["viewpoint"] == [1, 2, 3]
     np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
+    in_base = Settings(target_frame="base")
+    bridge.detect(asked, Scene(make_cloud(cloud)), in_base, {}, lookup)
+    np.testing.assert_allclose(asked.given["up"], T_base_camera[2, :3], atol=1e-12)
+    bridge.detect(
+        asked, Scene(make_cloud(cloud)), replace(in_base, gravity_frame="none"), {}, lookup
+    )
+    assert "up" not in asked.given
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "32SC1", "rgb8"])
@@ -219,10 +248,42 @@ def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camer
 
 def test_no_grasp_says_why(asked, sent, make_cloud, cloud) -> None:
     found = bridge.detect(asked, Scene(make_cloud(cloud)), Settings(), {}, lookup)
-    fields = bridge.object_results(found, "mug")
+    fields = bridge.object_results(found, Settings(), "mug")
     (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
     assert not each.success
     assert "No grasp: 500 points" in each.message
+
+
+def test_an_aborted_goal_says_why(sent) -> None:
+    fields = bridge.failed_result("mug", LookupError("no frame base"))
+    (each,) = sent("edgegrasp_ros2/msg/GenerateGrasps_Result", fields).results
+    assert (each.object_id, each.success) == ("mug", False)
+    assert each.message == "LookupError: no frame base"
+
+
+def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera) -> None:
+    def at(second: int, pixels: np.ndarray, encoding: str) -> Any:
+        image = make_image(pixels, encoding)
+        image.header.stamp.sec = second
+        return image
+
+    inbox, mask = Inbox(), np.ones((24, 32), np.uint8)
+    assert inbox.scene(1.5) == Scene()
+    assert not inbox.take("camera", camera, 1.5)
+    first, second, third = (at(sec, DEPTH, "16UC1") for sec in (1, 2, 9))
+    assert inbox.take("depth", first, 1.5)
+    assert inbox.take("depth", second, 1.5)
+    assert inbox.scene(1.5) == Scene(depth=second, camera=camera)
+    of_first = at(1, mask, "mono8")
+    assert inbox.take("mask", of_first, 1.5)
+    assert inbox.scene(1.5) == Scene(depth=first, camera=camera, mask=of_first)
+    assert not inbox.take("depth", third, 1.5)  # its mask is still to come
+    with pytest.raises(ValueError, match="mask is 8 s older than the newest image"):
+        inbox.scene(2.0)
+    assert inbox.scene(0.0) == Scene(depth=third, camera=camera)
+    inbox.take("mask", at(8, mask, "mono8"), 1.5)
+    with pytest.raises(ValueError, match="No image has the stamp of the mask"):
+        inbox.scene(1.5)
 
 
 def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
@@ -256,6 +317,7 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
         (Scene(depth=image), None, "no CameraInfo yet"),
         (Scene(depth=image, camera=empty), None, "p and k are 0"),
         (Scene(depth=make_image(DEPTH, "bayer"), camera=camera), None, "encoding: got 'bayer'"),
+        (Scene(depth=make_image(DEPTH.astype("i4"), "32SC1"), camera=camera), None, "'32SC1' for"),
         (Scene(make_cloud(cloud)), flat, "Send x, y, z of floats"),
     ):
         with pytest.raises(ValueError, match=told):

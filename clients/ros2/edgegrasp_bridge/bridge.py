@@ -6,6 +6,7 @@ frame, but for `moveit_msgs/Grasp`, which has the end effector's parent link.
 """
 
 import json
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, cast
@@ -30,6 +31,7 @@ Lookup = Callable[[str, str, Any], Float64]
 """lookup(target, source, stamp): T_target_source (4, 4), as tf2 has it; stamp None: the latest."""
 
 OPTION = "options."  # prefix of the parameters that are options of a detection
+DEPTHS = ("16UC1", "mono16", "32FC1")  # encodings of depths: millimetres, or metres
 ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
     **dict.fromkeys(("mono8", "8UC1"), ("u1", 1)),
     **dict.fromkeys(("rgb8", "bgr8", "8UC3"), ("u1", 3)),
@@ -41,6 +43,7 @@ ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
 FLOATS = {7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
 LINE_WIDTH = 0.003  # metres
+KEPT = 30  # images or clouds that a mask may still be of
 
 
 @dataclass(frozen=True)
@@ -49,15 +52,18 @@ class Settings:
 
     server: str = "127.0.0.1:50051"  # host:port (gRPC) or http://host:port
     timeout: float = 30.0  # seconds for a request
-    on_message: bool = False  # detect at every cloud or depth image, not only for an action
+    on_message: bool = True  # detect at every cloud, image or mask, not only for an action
+    mask_age: float = 1.0  # seconds a mask may be behind the newest image; 0: no mask is used
     target_frame: str = ""  # what answers are in; empty: the frame of the cloud or image
     camera_frame: str = ""  # where the camera of a cloud stands; empty: the cloud's own origin
-    gravity_frame: str = ""  # whose z is up; empty: found from the support
+    gravity_frame: str = ""  # whose z is up; empty: target_frame; "none": found from the support
     hand_frame: str = ""  # the gripper's hand frame, such as panda_hand; beside parent_link
     parent_link: str = ""  # of the end effector, such as panda_link8; empty: the hand frame
     joint_names: tuple[str, ...] = PANDA_JOINTS.names
     joint_closed: float = 0.0  # position of each joint in the closed hand
     joint_per_metre: float = 0.5  # what each joint moves for a metre of opening
+    approach_distance: float = 0.05  # metres of straight way in, from the pregrasp pose
+    retreat_distance: float = 0.1  # metres of straight way out, back along the approach
 
     @property
     def joints(self) -> FingerJoints:
@@ -88,7 +94,7 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]
 
 
 class Scene(NamedTuple):
-    """The latest messages: a cloud, or a depth image with its camera, and perhaps a mask."""
+    """What to detect in: a cloud, or a depth image with its camera, and perhaps a mask."""
 
     cloud: Any = None  # sensor_msgs/PointCloud2
     depth: Any = None  # sensor_msgs/Image, rectified
@@ -100,6 +106,50 @@ class Scene(NamedTuple):
         """That of the message that the points are from; None: there is none yet."""
         source = self.cloud if self.cloud is not None else self.depth
         return None if source is None else source.header
+
+
+class Inbox:
+    """The messages that came last, and which of them belong together."""
+
+    def __init__(self) -> None:
+        self._clouds: deque[Any] = deque(maxlen=KEPT)
+        self._depths: deque[Any] = deque(maxlen=KEPT)
+        self._camera: Any = None
+        self._mask: Any = None
+
+    def take(self, field: str, message: Any, mask_age: float) -> bool:
+        """Keep a message of a field of Scene; whether there is something new to detect in."""
+        if field == "camera":
+            self._camera = message
+        elif field == "mask":
+            self._mask = message
+        else:
+            (self._clouds if field == "cloud" else self._depths).append(message)
+        masked = self._mask is not None and mask_age > 0
+        return field == "mask" if masked else field in ("cloud", "depth")
+
+    def scene(self, mask_age: float) -> Scene:
+        """The newest cloud, or else depth image; or that of the mask, where masks come.
+
+        Raises:
+            ValueError: The mask is too old, or the image that it was made of has not come.
+        """
+        sources = self._clouds or self._depths
+        if not sources:
+            return Scene()
+        source, mask = sources[-1], self._mask if mask_age > 0 else None
+        if mask is not None:
+            age = _seconds(source.header.stamp) - _seconds(mask.header.stamp)
+            if age > mask_age:
+                why = f"The mask is {age:.3g} s older than the newest image"
+                raise ValueError(f"{why}. Send masks, or set mask_age: {mask_age:g} s.")
+            same = [each for each in sources if each.header.stamp == mask.header.stamp]
+            if not same:
+                raise ValueError("No image has the stamp of the mask. Copy the image's header.")
+            source = same[-1]
+        if sources is self._clouds:
+            return Scene(cloud=source, mask=mask)
+        return Scene(depth=source, camera=self._camera, mask=mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +211,7 @@ def detect(
         found = client.detect(cloud, **cast("DetectOptions", asked))
     else:
         image: DepthImage = {
-            "depth": image_array(scene.depth),
+            "depth": depth_array(scene.depth),
             "intrinsics": camera_matrix(scene.camera),
         }
         found = client.detect(depth_images=[image], **cast("DetectOptions", asked))
@@ -171,16 +221,18 @@ def detect(
     return Found(grasps, found, target, {"sec": stamp.sec, "nanosec": stamp.nanosec})
 
 
-def pose_array(found: Found) -> Message:
-    """geometry_msgs/PoseArray of the hand's frame, best first."""
-    return {"header": found.header, "poses": [_pose(each.T_cloud_hand) for each in found.grasps]}
+def pose_array(found: Found, back: float = 0.0) -> Message:
+    """geometry_msgs/PoseArray of the hand's frame, best first; `back`: metres before the grasp."""
+    return {"header": found.header, "poses": [_pose(each.pregrasp(back)) for each in found.grasps]}
 
 
 def marker_array(found: Found) -> Message:
     """visualization_msgs/MarkerArray: a fork for each grasp, red to green by its score."""
     markers: list[Message] = [{"header": found.header, "action": DELETE_ALL}]
+    gripper = found.detection.gripper
     for number, grasp in enumerate(found.grasps):
-        ends = fork(grasp.T_cloud_hand, grasp.width).reshape(-1, 3)
+        pieces = fork(grasp.T_cloud_hand, grasp.width, (gripper.palm_z, gripper.tip_z))
+        ends = pieces.reshape(-1, 3)
         score = float(grasp.score)
         marker = {
             "header": found.header,
@@ -207,17 +259,20 @@ def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
             stamp=found.stamp,
             joints=settings.joints,
             T_hand_link=T_hand_link,
+            approach_distance=settings.approach_distance,
+            retreat_distance=settings.retreat_distance,
         )
         for number, grasp in enumerate(found.grasps)
     ]
     return {"grasps": grasps}
 
 
-def object_results(found: Found, object_id: str = "", most: int = 0) -> Message:
+def object_results(found: Found, settings: Settings, object_id: str = "", most: int = 0) -> Message:
     """Result of GenerateGrasps: the grasps of each object, or of the one that was asked for.
 
     Args:
         found: The grasps.
+        settings: The node's parameters.
         object_id: Name of the object whose cloud was sent; empty: all, by their numbers.
         most: Grasps for each at most; 0: all.
     """
@@ -228,16 +283,27 @@ def object_results(found: Found, object_id: str = "", most: int = 0) -> Message:
     ]
     if object_id or not numbers:
         groups = [(object_id, found.grasps)]
-    return {"results": [_object_result(found, *group, most) for group in groups]}
+    return {"results": [_object_result(found, settings, *group, most) for group in groups]}
 
 
-def _object_result(found: Found, name: str, grasps: list[Grasp], most: int) -> Message:
+def failed_result(object_id: str, why: Exception) -> Message:
+    """Result of GenerateGrasps whose goal is aborted."""
+    message = f"{type(why).__name__}: {why}"
+    told = {"object_id": object_id, "success": False, "message": message, "candidates": []}
+    return {"results": [told]}
+
+
+def _object_result(
+    found: Found, settings: Settings, name: str, grasps: list[Grasp], most: int
+) -> Message:
     stages = ", ".join(f"{count} {stage}" for stage, count in found.detection.counts.items())
     candidates = [
         {
             "pose": {"header": found.header, "pose": _pose(grasp.T_cloud_hand)},
             "confidence": min(max(float(grasp.score), 0.0), 1.0),
             "width": float(grasp.width),
+            "pregrasp": _pose(grasp.pregrasp(settings.approach_distance)),
+            "retreat": _pose(grasp.retreat(settings.retreat_distance)),
         }
         for grasp in (grasps[:most] if most else grasps)
     ]
@@ -248,6 +314,17 @@ def _object_result(found: Found, name: str, grasps: list[Grasp], most: int) -> M
         "message": "" if candidates else told,
         "candidates": candidates,
     }
+
+
+def depth_array(image: Any) -> NDArray[Any]:
+    """The depths (H, W) of a sensor_msgs/Image: uint16 millimetres, or float32 metres.
+
+    Raises:
+        ValueError: Of an encoding that is no depth.
+    """
+    if image.encoding not in DEPTHS:
+        raise ValueError(f"encoding: got {image.encoding!r} for depths. Send {', '.join(DEPTHS)}.")
+    return image_array(image)
 
 
 def image_array(image: Any) -> NDArray[Any]:
@@ -321,14 +398,15 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
     if scene.cloud is not None:
         camera = settings.camera_frame or frame_id
         asked["viewpoint"] = lookup(frame_id, camera, stamp)[:3, 3].tolist()
-    if settings.gravity_frame:
-        asked["up"] = lookup(frame_id, settings.gravity_frame, stamp)[:3, 2].tolist()
+    level = settings.gravity_frame or settings.target_frame
+    if level not in ("", "none"):
+        asked["up"] = lookup(frame_id, level, stamp)[:3, 2].tolist()
     return asked
 
 
 def _depth_points(scene: Scene) -> Float64:
     """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
-    depth = image_array(scene.depth)
+    depth = depth_array(scene.depth)
     matrix = camera_matrix(scene.camera)
     z = depth * (0.001 if depth.dtype.kind == "u" else 1.0)
     z = np.where(z > 0, z, np.nan)
@@ -353,6 +431,10 @@ def _pose(T: NDArray[Any]) -> Message:
         "position": _xyz(T[:3, 3]),
         "orientation": dict(zip("xyzw", orientation, strict=True)),
     }
+
+
+def _seconds(stamp: Any) -> float:
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
 def _xyz(vector: NDArray[Any]) -> Message:

@@ -22,7 +22,7 @@ from tf2_ros import Buffer, TransformListener
 from visualization_msgs.msg import MarkerArray
 
 from edgegrasp_bridge import bridge
-from edgegrasp_client import GraspClient, GraspClientError
+from edgegrasp_client import GraspClient
 
 INPUTS = {"points": PointCloud2, "depth": Image, "camera_info": CameraInfo, "mask": Image}
 FIELDS = {"points": "cloud", "depth": "depth", "camera_info": "camera", "mask": "mask"}
@@ -38,10 +38,11 @@ class EdgeGraspNode(Node):
             self.declare_parameter(name, default, dynamic)
         settings, _ = self._read()
         self._client = GraspClient(settings.server, timeout=settings.timeout)
-        self._scene = bridge.Scene()
+        self._inbox = bridge.Inbox()
         self._buffer = Buffer()
         self._listener = TransformListener(self._buffer, self)
         self._poses = self.create_publisher(PoseArray, "grasps", 1)
+        self._before = self.create_publisher(PoseArray, "pregrasps", 1)
         self._markers = self.create_publisher(MarkerArray, "grasp_markers", 1)
         inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
         for topic, kind in INPUTS.items():
@@ -49,9 +50,9 @@ class EdgeGraspNode(Node):
             self.create_subscription(
                 kind, topic, take, qos_profile_sensor_data, callback_group=inputs
             )
-        for package, name, answer in (
-            ("grasping_msgs", "GraspPlanning", self._plan),
-            ("edgegrasp_ros2", "GenerateGrasps", self._generate),
+        for package, name, answer, failed in (
+            ("grasping_msgs", "GraspPlanning", self._plan, None),
+            ("edgegrasp_ros2", "GenerateGrasps", self._generate, bridge.failed_result),
         ):
             try:
                 kind = getattr(importlib.import_module(f"{package}.action"), name)
@@ -59,7 +60,7 @@ class EdgeGraspNode(Node):
                 self.get_logger().warning(f"{package} is not installed: no action {name}")
                 continue
             topic = "plan_grasps" if name == "GraspPlanning" else "generate_grasps"
-            execute = self._executing(kind, answer)
+            execute = self._executing(kind, answer, failed)
             ActionServer(self, kind, topic, execute, callback_group=actions)
 
     def _read(self) -> Any:
@@ -69,37 +70,43 @@ class EdgeGraspNode(Node):
 
     def _take(self, field: str) -> Any:
         def take(message: Any) -> None:
-            self._scene = self._scene._replace(**{field: message})
-            if field in ("cloud", "depth") and self.get_parameter("on_message").value:
+            mask_age = self.get_parameter("mask_age").value
+            if (
+                self._inbox.take(field, message, mask_age)
+                and self.get_parameter("on_message").value
+            ):
                 try:
                     self._detect()
-                except (GraspClientError, ValueError) as error:
-                    self.get_logger().warning(str(error))
+                except Exception as error:  # tf2's too: the node goes on with the next message
+                    self.get_logger().warning(f"{type(error).__name__}: {error}")
 
         return take
 
     def _detect(self, object_cloud: Any = None) -> Any:
         settings, options = self._read()
-        found = bridge.detect(
-            self._client, self._scene, settings, options, self._lookup, object_cloud
-        )
+        scene = self._inbox.scene(0.0 if object_cloud is not None else settings.mask_age)
+        found = bridge.detect(self._client, scene, settings, options, self._lookup, object_cloud)
         for warning in found.detection.warnings:
             self.get_logger().warning(warning)
-        poses, markers = PoseArray(), MarkerArray()
-        set_message_fields(poses, bridge.pose_array(found))
-        set_message_fields(markers, bridge.marker_array(found))
-        self._poses.publish(poses)
-        self._markers.publish(markers)
+        for publisher, message, fields in (
+            (self._poses, PoseArray(), bridge.pose_array(found)),
+            (self._before, PoseArray(), bridge.pose_array(found, settings.approach_distance)),
+            (self._markers, MarkerArray(), bridge.marker_array(found)),
+        ):
+            set_message_fields(message, fields)
+            publisher.publish(message)
         return found, settings
 
-    def _executing(self, kind: Any, answer: Any) -> Any:
+    def _executing(self, kind: Any, answer: Any, failed: Any) -> Any:
         def execute(goal: Any) -> Any:
             result = kind.Result()
             try:
                 set_message_fields(result, answer(goal.request))
                 goal.succeed()
             except Exception as error:  # tf2's too: a goal that fails is told, the node goes on
-                self.get_logger().error(str(error))
+                self.get_logger().error(f"{type(error).__name__}: {error}")
+                if failed is not None:
+                    set_message_fields(result, failed(goal.request.object_id, error))
                 goal.abort()
             return result
 
@@ -112,8 +119,8 @@ class EdgeGraspNode(Node):
 
     def _generate(self, goal: Any) -> bridge.Message:
         cluster = goal.object_cloud
-        found, _ = self._detect(cluster if cluster.data else None)
-        return bridge.object_results(found, goal.object_id, goal.max_candidates)
+        found, settings = self._detect(cluster if cluster.data else None)
+        return bridge.object_results(found, settings, goal.object_id, goal.max_candidates)
 
     def _lookup(self, target: str, source: str, stamp: Any) -> bridge.Float64:
         if target == source:

@@ -1663,6 +1663,7 @@ class DetectGraspsResponse(_message.Message):
     SUPPORT_FIELD_NUMBER: _builtins.int
     UP_FIELD_NUMBER: _builtins.int
     OBJECTS_FIELD_NUMBER: _builtins.int
+    GRIPPER_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Name of the weights used."""
     @_builtins.property
@@ -1697,6 +1698,10 @@ class DetectGraspsResponse(_message.Message):
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedObject]:
         """The things that grasps are for, the largest first."""
 
+    @_builtins.property
+    def gripper(self) -> Global___GripperOutline:
+        """The gripper that they are for."""
+
     def __init__(
         self,
         *,
@@ -1709,14 +1714,44 @@ class DetectGraspsResponse(_message.Message):
         support: Global___FoundSupport | None = ...,
         up: _abc.Iterable[_builtins.float] | None = ...,
         objects: _abc.Iterable[Global___DetectedObject] | None = ...,
+        gripper: Global___GripperOutline | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug", "support", b"support"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug", "gripper", b"gripper", "support", b"support"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "model", b"model", "objects", b"objects", "seconds", b"seconds", "support", b"support", "up", b"up", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "gripper", b"gripper", "model", b"model", "objects", b"objects", "seconds", b"seconds", "support", b"support", "up", b"up", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___DetectGraspsResponse: _TypeAlias = DetectGraspsResponse  # noqa: Y015
+
+@_typing.final
+class GripperOutline(_message.Message):
+    """A gripper, as far as drawing it needs; metres along the z of the hand frame."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    PALM_Z_FIELD_NUMBER: _builtins.int
+    TIP_Z_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    palm_z: _builtins.float
+    """The palm's surface between the fingers."""
+    tip_z: _builtins.float
+    """The fingertips of the open gripper."""
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        palm_z: _builtins.float = ...,
+        tip_z: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["name", b"name", "palm_z", b"palm_z", "tip_z", b"tip_z"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___GripperOutline: _TypeAlias = GripperOutline  # noqa: Y015
 
 @_typing.final
 class FoundSupport(_message.Message):
