@@ -36,6 +36,10 @@ def generate_data(
         str,
         Option(help="Hand that tries them: a gripper's name or .toml file; random: one a scene."),
     ] = "panda",
+    household: Annotated[
+        float,
+        Option(min=0.0, max=1.0, help="Share of the scenes made of random household objects."),
+    ] = 0.0,
     workers: Workers = None,
     ray: Ray = None,
 ) -> None:
@@ -56,7 +60,15 @@ def generate_data(
     # Paths as other machines have them.
     weights, objects = weights and weights.resolve(), objects and objects.resolve()
     options = GenerationOptions(
-        scenes, views_per_scene, grasps_per_view, seed, weights, kind, chosen.name, gripper
+        scenes,
+        views_per_scene,
+        grasps_per_view,
+        seed,
+        weights,
+        kind,
+        chosen.name,
+        gripper,
+        household,
     )
     missing = len(missing_scenes(output, options))
     tried = held = 0

@@ -35,6 +35,7 @@ CONCAVITY = 0.05
 SEARCH = {"mcts_iterations": 20, "mcts_nodes": 8, "mcts_max_depth": 2, "resolution": 1000}
 CACHE_FOLDER = "edgegrasp"
 Size = tuple[float, float, float]
+Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]  # points (P, 3), triangles (F, 3)
 logger = logging.getLogger(__name__)
 
 
@@ -240,8 +241,38 @@ def write_object(name: str, surface: str, folder: Path) -> Path:
     return urdf
 
 
+def write_parts(
+    name: str,
+    visible: Iterable[Mesh],
+    parts: Iterable[Mesh],
+    centre: NDArray[np.float64],
+    inertia: NDArray[np.float64],
+    folder: Path,
+) -> Path:
+    """Write an object whose contacts use convex parts, so that its hollows are open.
+
+    Args:
+        name: of the object.
+        visible: meshes that a camera sees, metres.
+        parts: convex meshes; the engine takes the hull of each.
+        centre: (3,) its centre of mass, metres.
+        inertia: (3, 3) about it, kg m².
+        folder: gets the meshes and `<name>.urdf`; created if missing.
+
+    Returns:
+        The URDF file.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for kind, meshes in (("visual", visible), ("collision", parts)):
+        text = as_obj(meshes, decimals=7, named=True)
+        (folder / f"{name}_{kind}.obj").write_text(text)
+    urdf = folder / f"{name}.urdf"
+    urdf.write_text(_parts_urdf(name, centre, inertia))
+    return urdf
+
+
 def as_obj(
-    meshes: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]],
+    meshes: Iterable[Mesh],
     *,
     decimals: int = 6,
     named: bool = False,
@@ -399,11 +430,8 @@ def _write_object(mesh: Path, folder: Path) -> int:
     parts = _convex_parts(surface)
     solid: Any = trimesh.util.concatenate(parts)
     solid.density = OBJECT_MASS / solid.volume
-    for kind, meshes in (("visual", [surface]), ("collision", parts)):
-        text = as_obj(((m.vertices, m.faces) for m in meshes), decimals=7, named=True)
-        (folder / f"object_{kind}.obj").write_text(text)
-    urdf = _parts_urdf(solid.center_mass, solid.moment_inertia)
-    (folder / "object.urdf").write_text(urdf)
+    visible, hulls = ([(m.vertices, m.faces) for m in meshes] for meshes in ([surface], parts))
+    write_parts("object", visible, hulls, solid.center_mass, solid.moment_inertia, folder)
     return len(parts)
 
 
@@ -437,14 +465,14 @@ def _convex_parts(surface: Any) -> list[Any]:
     return [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in parts]
 
 
-def _parts_urdf(centre: NDArray[np.float64], inertia: NDArray[np.float64]) -> str:
+def _parts_urdf(name: str, centre: NDArray[np.float64], inertia: NDArray[np.float64]) -> str:
     """The URDF file of an object with this centre of mass and inertia, metres and kg."""
     xyz = " ".join(f"{value:.7f}" for value in centre)
     names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2),
              ("izz", 2, 2))  # fmt: skip
     moments = " ".join(f'{name}="{inertia[row, column]:.9f}"' for name, row, column in names)
     return f"""<?xml version="1.0"?>
-<robot name="object">
+<robot name="{name}">
   <link name="base_link">
     <contact><lateral_friction value="{OBJECT_FRICTION}"/></contact>
     <inertial>
@@ -452,8 +480,8 @@ def _parts_urdf(centre: NDArray[np.float64], inertia: NDArray[np.float64]) -> st
       <mass value="{OBJECT_MASS}"/>
       <inertia {moments}/>
     </inertial>
-    <visual><geometry><mesh filename="object_visual.obj"/></geometry></visual>
-    <collision><geometry><mesh filename="object_collision.obj"/></geometry></collision>
+    <visual><geometry><mesh filename="{name}_visual.obj"/></geometry></visual>
+    <collision><geometry><mesh filename="{name}_collision.obj"/></geometry></collision>
   </link>
 </robot>
 """

@@ -39,10 +39,18 @@ from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.hands import PANDA, hand_of_scene
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
-from edgegrasp_training.shapes import varied_objects
+from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 
-SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
+(
+    SCENE_STREAM,
+    CAMERA_STREAM,
+    NOISE_STREAM,
+    CHOICE_STREAM,
+    SHAPE_STREAM,
+    HAND_STREAM,
+    HOUSEHOLD_STREAM,
+) = range(7)
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
 # Four in ten scenes are those of the benchmark of the paper.
@@ -81,6 +89,8 @@ AROUND_MARGIN = 0.006  # metres around a thing that is no object
 PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
 VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
+NUM_HOUSEHOLD = 12  # household objects that a scene is drawn from,
+HOUSEHOLD_SCALE = 0.9, 1.1  # and the range of their scales
 WIDER_SCALES = 0.85, 1.15  # factors on the ends of a scene's range of scales
 HARD_SHARE = 0.8  # of the scenes, where one is looked for that the guiding network finds hard
 HARD_TRIES = 3  # scenes looked through for a hard one
@@ -110,6 +120,7 @@ class GenerationOptions:
     kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
     engine: str | None = None  # see `choose_engine`
     gripper: str = PANDA  # see `hand_of_scene`
+    household: float = 0.0  # share of the scenes made of household objects
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""
@@ -208,7 +219,7 @@ def generate_scene(
     sets: dict[SceneKind, ObjectSet], options: GenerationOptions, index: int
 ) -> list[LabelledView]:
     """Generate all views of one scene, of the built-in objects where there are no sets."""
-    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(6)]
+    streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(7)]
     kind = options.kind_of(index)
     # Some scenes are made of the other kind's objects, where there are any.
     source = kind.objects
@@ -220,11 +231,16 @@ def generate_scene(
         drawn = sets.get(source)
         if drawn is not None and streams[SHAPE_STREAM].random() < VARIED_SHARE:
             drawn = varied_objects(drawn, Path(shapes), streams[SHAPE_STREAM])
+        household = options.household > streams[HOUSEHOLD_STREAM].random()
+        if household:
+            count = NUM_HOUSEHOLD
+            drawn = household_objects(Path(shapes) / "household", count, streams[HOUSEHOLD_STREAM])
         made_of = None if drawn is None else {kind: drawn}
         gripper = hand_of_scene(options.gripper, streams[HAND_STREAM])
         hand = "" if gripper is None else json.dumps(gripper)
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
-            hard = _make_scene(simulation, kind, options, streams)
+            sizes = HOUSEHOLD_SCALE if household else _scales(kind)
+            hard = _make_scene(simulation, kind, sizes, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             for number in range(options.views_per_scene):
@@ -240,13 +256,12 @@ def generate_scene(
 def _make_scene(
     simulation: ClutterSimulation,
     kind: SceneKind,
+    scales: tuple[float, float],
     options: GenerationOptions,
     streams: list[np.random.Generator],
 ) -> Query | None:
     """Make a scene; with weights mostly one that they find hard, and return the hard view."""
     rng = streams[SCENE_STREAM]
-    low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
-    scales = low * WIDER_SCALES[0], high * WIDER_SCALES[1]
     guide = None
     if options.weights is not None and rng.random() < HARD_SHARE:
         guide = detector(options.weights)
@@ -256,6 +271,12 @@ def _make_scene(
         if hard is not None:
             return hard
     return None
+
+
+def _scales(kind: SceneKind) -> tuple[float, float]:
+    """The range of scales of a scene's objects, wider than a benchmark's."""
+    low, high = PACKED_SCALE if kind.objects is SceneKind.PACKED else PILE_SCALE
+    return low * WIDER_SCALES[0], high * WIDER_SCALES[1]
 
 
 def _hard_view(

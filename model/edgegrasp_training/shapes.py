@@ -13,7 +13,16 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_sim.objects import ObjectModel, ObjectSet, as_obj, blob, write_object
+from edgegrasp_sim.objects import (
+    OBJECT_MASS,
+    ObjectModel,
+    ObjectSet,
+    as_obj,
+    blob,
+    write_object,
+    write_parts,
+)
+from edgegrasp_training.household import Part, household_mesh
 
 STRETCH = 1.35  # greatest factor along an axis; its inverse is the least
 MADE_SHARE = 0.5  # of a scene's objects that are computed
@@ -59,6 +68,35 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
             factors[1] = factors[0]
         drawn[model.name] = stretched(model, (factors[0], factors[1], factors[2]), folder)
     return ObjectSet(f"{objects.name} varied", tuple(drawn.values()))
+
+
+def household_objects(folder: Path, count: int, rng: np.random.Generator) -> ObjectSet:
+    """Draw household objects and write them into a folder, each of its own size and truly hollow.
+
+    Args:
+        folder: Gets the files, from which `ObjectSet.from_folder` reads them again.
+        count: How many.
+        rng: Draws them.
+    """
+    models = []
+    for number in range(count):
+        family, parts = household_mesh(rng)
+        name = f"{family}-{number:03d}"
+        volume, middle = (
+            np.array([_volume_of(part) for part in parts]),
+            [v.mean(0) for v, _ in parts],
+        )
+        centre = np.average(middle, axis=0, weights=volume)
+        size = np.square(np.ptp(np.concatenate([v for v, _ in parts]), axis=0))
+        inertia = np.diag(size.sum() - size) * OBJECT_MASS / 12  # of the box around it
+        path = write_parts(name, parts, parts, centre, inertia, folder)
+        models.append(ObjectModel(name, path))
+    return ObjectSet("household", tuple(models))
+
+
+def _volume_of(part: Part) -> float:
+    a, b, c = part[0][part[1]].transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6)
 
 
 def stretched(model: ObjectModel, factors: tuple[float, float, float], folder: Path) -> ObjectModel:

@@ -9,6 +9,7 @@ from edgegrasp_sim.engine import ENGINES, choose_engine, installed
 from edgegrasp_sim.objects import SceneKind, blob
 from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+from edgegrasp_training.household import FAMILIES
 from edgegrasp_training.shapes import made_object
 from edgegrasp_training.views import find_views, load_view
 
@@ -79,6 +80,17 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
     paths[2].unlink()
     list(generate(tmp_path, None, options))
     assert paths[2].read_bytes() == before
+
+
+def test_scenes_of_household_objects_name_them_and_are_reproducible(tmp_path: Path) -> None:
+    options = replace(SMALL, scenes=1, kind=SceneKind.TABLE, household=1.0)
+    for folder in ("a", "b"):
+        list(generate(tmp_path / folder, None, options))
+    first, again = (load_view(find_views([tmp_path / folder])[0]) for folder in ("a", "b"))
+    assert {name.split("-")[0] for name in first.objects} <= set(FAMILIES)
+    assert len(first.tried()) > 0
+    assert first.object_digests == again.object_digests
+    np.testing.assert_array_equal(first.success, again.success)
 
 
 def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:

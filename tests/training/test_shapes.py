@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.engine import make_world
-from edgegrasp_sim.objects import ObjectModel, ObjectSet
+from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.shapes import (
     HOLLOW,
@@ -20,6 +20,7 @@ from edgegrasp_training.shapes import (
     STRETCH,
     THINNEST,
     drawn_shape,
+    household_objects,
     made_object,
     revolved,
     stretched,
@@ -137,3 +138,26 @@ def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_pa
     assert 1.05 < factors.max() <= STRETCH
     alike = factors[:, 0] == factors[:, 1]
     assert 0 < alike.sum() < len(factors)
+
+
+def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_folder(
+    tmp_path: Path,
+) -> None:
+    drawn = household_objects(tmp_path, 40, np.random.default_rng(2))
+    again = ObjectSet.from_folder(tmp_path, SceneKind.TABLE)
+    assert sorted(model.name for model in drawn.models) == [model.name for model in again.models]
+    trays = [model for model in again.models if model.name.startswith(("tray", "frame"))]
+    assert trays
+    for model in trays:
+        with make_world() as world:
+            body = load_object(world, model, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 1.0).body
+            low, high = body.bounds
+            assert (np.abs(body.position) < 0.2).all()  # it is loaded where it is put
+            world.detect_collisions()
+            middle, height = (low + high) / 2, high[2] - 0.3 * (high[2] - low[2])
+            start = np.array([[middle[0], middle[1], high[2] + 0.1]])
+            end = np.array([[middle[0], middle[1], height]])
+            wall = np.array([low[0] + 0.006, middle[1], 0.0])
+            over_wall = start * (0, 0, 1) + wall, end * (0, 0, 1) + wall
+            assert world.first_hits(start, end) == [-1]
+            assert world.first_hits(*over_wall) == [body.uid]
