@@ -92,6 +92,7 @@ class DummyDetector:
             score=np.where(returned, logits, np.float32(np.nan)),
             outcome=[Outcome.RETURNED if one else Outcome.NOT_SCORED for one in returned],
             support_plane=None,
+            labels=np.zeros(len(prepared.points), dtype=np.int64),
         )
         counts = prepared.counts | {"returned": len(grasps)}
         seconds = prepared.seconds | {"total": sum(prepared.seconds.values())}

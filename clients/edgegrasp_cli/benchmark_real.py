@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,22 +21,24 @@ from edgegrasp_cli.flags import (
 )
 
 if TYPE_CHECKING:
-    from edgegrasp_cli.real_scenes import PlaneFigures, RealScene, SceneFigures
+    from edgegrasp_cli.real_scenes import Int64, RealScene, SceneFigures
     from edgegrasp_model.gripper import Gripper
     from edgegrasp_sim.picture import Picture
 
 Option = typer.Option
-DECIDED = ("viewpoint",)  # options that the scene decides
+DECIDED = ("viewpoint", "debug")  # options that the scene decides, or this command
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
+SUPPORT, UNLABELLED = -2, -3  # labels of a detector, as in `DebugInfo`
+ON_SUPPORT, OBSTACLE, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # their colours
 CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
 @takes_flags(connection=CONNECTION, options=option_flags(*DECIDED))
 def benchmark_real(
-    scenes: Annotated[Path, Option(help="Folder of scenes, .npz; docs/benchmark.md: format.")],
+    scenes: Annotated[list[Path], Option(help="Folder of scenes, .npz; may be repeated.")],
     output: Annotated[
-        Path, Option(help="Folder for results.json, index.html and a picture of each scene.")
+        Path, Option(help="Folder for results.json, index.html and pictures of each scene.")
     ] = Path("results/real"),
     server: Server = None,
     timeout: Timeout = 60.0,
@@ -54,42 +57,68 @@ def benchmark_real(
     from rich.console import Console
     from rich.progress import track
 
+    from edgegrasp_cli.planners.detection import model_used
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)
     output.mkdir(parents=True, exist_ok=True)
     done: dict[str, SceneFigures] = {}
-    model = ""
     with open_client(server, timeout, connection, weights, grippers, device) as client:
-        client.detect(**loaded[0].request, **fields)  # what is loaded or compiled first takes time
+        model = model_used(client, fields.get("model", ""))
+        gripper = _gripper(model.gripper, grippers, fields)
+        _ask(client, loaded[0], fields)  # what is loaded or compiled first takes time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
-            detection = client.detect(**scene.request, **fields)
+            found, refused = _ask(client, scene, fields)
             milliseconds = 1000 * (time.perf_counter() - start)
-            model = detection.model
-            gripper = _gripper(client, model, grippers, fields)
-            plane = _plane(detection)
-            done[scene.name] = judge(scene, detection.grasps, plane, gripper, milliseconds)
+            grasps = [] if found is None else found.grasps
+            plane, labels = _plane(found), _labels(client, scene, fields, found)
+            answer = np.maximum(labels + 1, 0)
+            figures = judge(scene, grasps, plane, answer, gripper, milliseconds)
+            done[scene.name] = replace(figures, refused=refused)
             title = f"{scene.name}: {_sentence(done[scene.name])}"
-            draw(output / f"{scene.name}.png", scene, detection.grasps[:BEST], plane, title)
-    _write(output, model, fields, done)
+            draw(output / f"{scene.name}.png", scene, grasps[:BEST], plane, title)
+            draw_labels(output / f"{scene.name}-labels.png", scene, labels)
+    _write(output, model.name, fields, done)
 
 
-def _gripper(
-    client: Any, model: str, files: Sequence[Path] | None, options: Mapping[str, Any]
-) -> "Gripper":
-    """The hand that a request with these options is answered for."""
+def _ask(client: Any, scene: "RealScene", fields: Mapping[str, Any]) -> tuple[Any | None, str]:
+    """The answer for a scene; None and why where the request is refused."""
+    from edgegrasp_client import InvalidRequestError
+    from edgegrasp_model.errors import InvalidRequest
+
+    try:
+        return client.detect(**scene.request, **fields), ""
+    except (InvalidRequest, InvalidRequestError) as error:
+        return None, str(error)
+
+
+def _labels(
+    client: Any, scene: "RealScene", fields: Mapping[str, Any], found: Any | None
+) -> "Int64":
+    """What the detector calls each point (R,), as in `DebugInfo`, by a request that is not timed.
+
+    All is unlabelled where it refuses, or finds no object.
+    """
+    if found is not None and found.objects:
+        found, _ = _ask(client, scene, {**fields, "debug": True})
+        if found is not None and found.debug is not None:
+            return np.asarray(found.debug.labels, dtype=np.int64)
+    return np.full(len(scene.points), UNLABELLED)
+
+
+def _gripper(name: str, files: Sequence[Path] | None, options: Mapping[str, Any]) -> "Gripper":
+    """The hand that a request with these options is answered for; else that of the model."""
     from edgegrasp_model.gripper import choose_gripper, load_gripper
     from edgegrasp_model.options import parse_options
 
     own = {file.stem: load_gripper(file) for file in files or ()}
-    name = next(row.gripper for row in client.models() if row.name == model)
     return choose_gripper(parse_options(options), load_gripper(name), own)
 
 
-def _plane(detection: Any) -> tuple[Any, float] | None:
+def _plane(detection: Any | None) -> tuple[Any, float] | None:
     """Normal (3,) and offset of the support plane that was found, camera frame."""
-    found = detection.support
+    found = None if detection is None else detection.support
     return None if found is None else (np.asarray(found.normal, dtype=np.float64), found.offset)
 
 
@@ -106,16 +135,18 @@ def _write(
     scenes = {name: figures.document() for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
     (output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    rows = [HEAD, *(_row(name, figures) for name, figures in done.items()), _total_row(total)]
-    pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in done)
+    tables = [_grasp_table(done, total), _segmentation_table(done, total)]
+    names = [name + part for name in done for part in ("", "-labels")]
+    pictures = (image("png", (output / f"{name}.png").read_bytes(), name) for name in names)
     title = f"{model} in {len(done)} scenes of real cameras"
-    (output / "index.html").write_text(page(title, [table(rows), *pictures]))
-    shown = Table(*HEAD, box=None)
-    for column in shown.columns:
-        column.no_wrap = column.header in ("scene", "plane")
-    for row in rows[1:]:
-        shown.add_row(*row)
-    Console().print(shown)
+    (output / "index.html").write_text(page(title, [*map(table, tables), *pictures]))
+    for head, *rows in tables:
+        shown = Table(*head, box=None)
+        for column in shown.columns:
+            column.no_wrap = column.header in ("scene", "plane")
+        for row in rows:
+            shown.add_row(*row)
+        Console().print(shown)
     print(f"report: {output / 'index.html'}")
 
 
@@ -126,46 +157,82 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
     def share(name: str) -> float | None:
         return sum(getattr(figures, name) for figures in done) / best if best else None
 
+    # Of a heap that is labelled as one object, neither the plane nor the objects are known.
+    apart = [figures for figures in done if figures.plane_labelled]
+
+    def mean(name: str, judged: "Sequence[SceneFigures]") -> float | None:
+        shares = [getattr(figures.segmentation, name) for figures in judged]
+        return float(np.mean(shares)) if shares else None
+
     return {
         "scenes": len(done),
+        "refused": sum(bool(figures.refused) for figures in done),
         "best": best,
         **{name: share(name) for name in ("on_object", "from_below", "through_points")},
-        "objects": sum(figures.objects for figures in done),
-        "objects_with_grasp": sum(figures.objects_with_grasp for figures in done),
-        "planes_right": sum(figures.plane is not None and figures.plane.right for figures in done),
+        "objects": sum(figures.objects for figures in apart),
+        "objects_with_grasp": sum(figures.objects_with_grasp for figures in apart),
+        **{name: mean(name, done) for name in ("pixel_precision", "pixel_recall")},
+        **{f"overlap_{name}": mean(f"overlap_{name}", apart) for name in ("precision", "recall")},
+        "overlap_f": mean("overlap_f", apart),
+        "instances": sum(figures.segmentation.labelled for figures in apart),
+        "instances_called": sum(figures.segmentation.called for figures in apart),
+        "instances_found": sum(figures.segmentation.found for figures in apart),
+        "planes": len(apart),
+        "planes_right": sum(figures.plane is not None and figures.plane.right for figures in apart),
         "milliseconds": float(np.median([figures.milliseconds for figures in done])),
     }
 
 
-# The table
-
-HEAD = (
-    "scene",
-    "best",
-    "on an object",
-    "from below",
-    "through points",
-    "objects with a grasp",
-    "plane",
-    "ms",
-)
+# The tables
 
 
-def _row(name: str, figures: "SceneFigures") -> tuple[str, ...]:
-    counts = (figures.best, figures.on_object, figures.from_below, figures.through_points)
-    found = f"{figures.objects_with_grasp} of {figures.objects}"
-    return name, *map(str, counts), found, _plane_text(figures.plane), f"{figures.milliseconds:.0f}"
+def _grasp_table(
+    done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
+) -> list[tuple[str, ...]]:
+    """What the best grasps are worth."""
+    head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
+    rows: list[tuple[str, ...]] = [head]
+    for name, one in done.items():
+        counts = (one.best, one.on_object, one.from_below, one.through_points)
+        held = f"{one.objects_with_grasp} of {one.objects}" if one.plane_labelled else "-"
+        rows.append((name, *map(str, counts), held, f"{one.milliseconds:.0f}"))
+    shares = (_shares(total[name]) for name in ("on_object", "from_below", "through_points"))
+    held = f"{total['objects_with_grasp']} of {total['objects']}"
+    of_best = (f"{share} %" for share in shares)
+    rows.append(("all", str(total["best"]), *of_best, held, f"{total['milliseconds']:.0f}"))
+    return rows
 
 
-def _total_row(total: Mapping[str, Any]) -> tuple[str, ...]:
-    shares = (total[name] for name in ("on_object", "from_below", "through_points"))
-    texts = ("-" if share is None else f"{100 * share:.0f} %" for share in shares)
-    found = f"{total['objects_with_grasp']} of {total['objects']}"
-    planes = f"{total['planes_right']} of {total['scenes']} right"
-    return "all", str(total["best"]), *texts, found, planes, f"{total['milliseconds']:.0f}"
+def _segmentation_table(
+    done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
+) -> list[tuple[str, ...]]:
+    """What is called an object, and the plane."""
+    head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
+    rows: list[tuple[str, ...]] = [head]
+    for name, one in done.items():
+        seen = one.segmentation
+        pixels = _shares(seen.pixel_precision, seen.pixel_recall)
+        overlap = _shares(seen.overlap_precision, seen.overlap_recall, seen.overlap_f)
+        found, called = f"{seen.found} of {seen.labelled}", str(seen.called)
+        known = (overlap, found, called) if one.plane_labelled else ("-", "-", "-")
+        rows.append((name, pixels, *known, "refused" if one.refused else _plane_text(one)))
+    pixels = _shares(total["pixel_precision"], total["pixel_recall"])
+    overlap = _shares(*(total[f"overlap_{name}"] for name in ("precision", "recall", "f")))
+    found = f"{total['instances_found']} of {total['instances']}"
+    planes = f"{total['planes_right']} of {total['planes']} right"
+    rows.append(("all", pixels, overlap, found, str(total["instances_called"]), planes))
+    return rows
 
 
-def _plane_text(plane: "PlaneFigures | None") -> str:
+def _shares(*shares: float | None) -> str:
+    """Shares as numbers of per cent."""
+    return "/".join("-" if share is None else f"{100 * share:.0f}" for share in shares)
+
+
+def _plane_text(figures: "SceneFigures") -> str:
+    plane = figures.plane
+    if not figures.plane_labelled:
+        return "-"
     if plane is None:
         return "none found"
     verdict = "right" if plane.right else "wrong"
@@ -173,9 +240,11 @@ def _plane_text(plane: "PlaneFigures | None") -> str:
 
 
 def _sentence(figures: "SceneFigures") -> str:
+    if figures.refused:
+        return f"refused: {figures.refused}"
     return (
         f"of the {figures.best} best {figures.on_object} on an object, {figures.from_below} from "
-        f"below, {figures.through_points} through points; plane {_plane_text(figures.plane)}"
+        f"below, {figures.through_points} through points; plane {_plane_text(figures)}"
     )
 
 
@@ -200,11 +269,42 @@ def draw(
     row = picture.row_of_pixel
     for label in scene.objects:
         picture.outline((row >= 0) & (scene.labels[row] == label))
-    _draw_plane(picture, scene, scene.normal, scene.offset, LABELLED, width=3.5)
-    if plane is not None:
-        _draw_plane(picture, scene, *plane, FOUND, width=1.4)
+    if scene.normal is not None:
+        _draw_plane(picture, scene, scene.normal, scene.offset, LABELLED, width=3.5)
+        if plane is not None:
+            _draw_plane(picture, scene, *plane, FOUND, width=1.4)
     picture.grasps(grasps)
     picture.save(path)
+
+
+def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
+    """Write three pictures side by side: the camera's image, its labels, the detector's (R,).
+
+    Support and obstacles are grey, objects in colour: a labelled object and the one that the
+    detector matches best have the same.
+    """
+    from matplotlib import colormaps
+    from matplotlib.image import imsave
+
+    from edgegrasp_sim.segmentation import renumbered
+
+    truth, paints = scene.object_of_point, colormaps["tab20"](np.arange(20))[:, :3]
+    found = renumbered(truth, np.maximum(labels + 1, 0))
+    row = scene.camera.rows_of_pixels(scene.points)
+
+    def painted(number: "Int64", support: Any) -> Any:
+        color = 255 * paints[(2 * number - 2 + (number > 10)) % len(paints)]
+        color[number == 0] = OBSTACLE
+        color[(number == 0) & support] = ON_SUPPORT
+        return np.where((row >= 0)[..., None], color[row], NO_READING)
+
+    depth = np.where(row >= 0, scene.camera.project(scene.points)[1][row], np.nan)
+    image = scene.rgb
+    if image is None:
+        near, far = np.nanpercentile(depth, (1, 95))
+        image = 255 * colormaps["gray"](1 - (depth - near) / (far - near))[..., :3]
+    parts = [image, painted(truth, scene.labels == 1), painted(found, labels == SUPPORT)]
+    imsave(path, np.hstack(parts).astype(np.uint8))
 
 
 def _draw_plane(

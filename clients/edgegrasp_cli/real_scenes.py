@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_sim.picture import View
+from edgegrasp_sim.segmentation import Segmentation, compare
 
 if TYPE_CHECKING:  # Numba is loaded where grasps are judged
     from edgegrasp_model.gripper import Gripper
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 Array = NDArray[Any]
 
 BEST = 10  # grasps of each scene that are judged
@@ -38,7 +40,7 @@ class RealScene:
     request: Mapping[str, Any]  # what a detector gets, as arguments of `GraspClient.detect`
     points: Float32  # (R, 3) NaN where there is no reading
     labels: NDArray[np.uint8]  # (R,) 0 anything else, 1 the support plane, 2 and up objects
-    normal: Float64  # (3,) of the support plane, toward the camera
+    normal: Float64 | None  # (3,) of the support plane, toward the camera; None: it is hidden
     offset: float  # normal . x of its points
     camera: View
     rgb: NDArray[np.uint8] | None  # (H, W, 3)
@@ -49,8 +51,14 @@ class RealScene:
         return [int(label) for label in np.unique(self.labels) if label >= FIRST_OBJECT]
 
     @property
+    def object_of_point(self) -> Int64:
+        """(R,) number of the object of each point, from 1; 0: of none."""
+        return np.maximum(self.labels.astype(np.int64) - FIRST_OBJECT + 1, 0)
+
+    @property
     def feet(self) -> Float64:
-        """(K, 3) the middle of each object, dropped onto the support plane."""
+        """(K, 3) the middle of each object, dropped onto the support plane, which is seen."""
+        assert self.normal is not None
         middles = [
             np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
         ]
@@ -79,12 +87,16 @@ class SceneFigures:
     grasps: int  # in the answer
     best: int  # of those judged, BEST at most
     on_object: int  # approach and contact point on one and the same object
-    from_below: int  # the hand comes up through the support
+    elsewhere: int  # the others
+    from_below: int  # the hand comes up through the support, whose plane is labelled
     through_points: int  # the open hand at the grasp holds measured points
     objects: int  # in the scene
     objects_with_grasp: int  # with a grasp of GOOD_SCORE or more in the answer
     plane: PlaneFigures | None  # None: none was found
+    plane_labelled: bool  # otherwise the scene is a heap: its objects are one, its plane hidden
+    segmentation: Segmentation
     milliseconds: float  # from the request to the answer
+    refused: str = ""  # why the request was
 
     def document(self) -> dict[str, Any]:
         """As plain JSON values."""
@@ -92,15 +104,21 @@ class SceneFigures:
         return {**asdict(self), "plane": plane}
 
 
-def load_scenes(folder: Path) -> list[RealScene]:
-    """The scenes of a folder, by name.
+def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
+    """The scenes of folders, by name in each.
 
     Raises:
-        ValueError: There are none, or a file is none; names file, field and fix.
+        ValueError: One has none, or a file is none, or two have one name; names file and fix.
     """
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise ValueError(f"scenes: got {folder}, without .npz files. Give a folder of scenes.")
+    files: list[Path] = []
+    for folder in folders:
+        found = sorted(folder.glob("*.npz"))
+        if not found:
+            raise ValueError(f"scenes: got {folder}, without .npz files. Give a folder of scenes.")
+        files += found
+    names = [file.stem for file in files]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"scenes: got two of the name {', '.join(twice)}. Rename one.")
     return [load_scene(file) for file in files]
 
 
@@ -118,10 +136,7 @@ def load_scene(file: Path) -> RealScene:
             f"{file.name}: {error}. Give what numpy.savez(file, ...) writes."
         ) from None
     checked = _Arrays(file.name, arrays)
-    normal = checked.get("support_normal", "f", "three numbers, of length 1", (3,))
-    if abs(np.linalg.norm(normal) - 1.0) > 1e-3:
-        checked.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
-    offset = float(checked.get("support_offset", "f", "one number, metres", ()))
+    normal, offset = _plane(checked)
     request, points = _cloud(checked)
     labels = checked.get("labels", "u", "an integer from 0 for each row", points.shape[:-1])
     labels = np.where(np.isfinite(points).all(axis=-1), labels, 0)
@@ -133,13 +148,13 @@ def load_scene(file: Path) -> RealScene:
     camera = _camera(arrays.get("intrinsics"), points)
     if camera is None:
         seen = points[np.isfinite(points).all(axis=-1)].reshape(-1, 3)
-        camera, rgb = View.of(seen, np.zeros(3), normal), None
+        camera, rgb = View.of(seen, np.zeros(3), (0, -1, 0) if normal is None else normal), None
     return RealScene(
         file.stem,
         request,
         points.reshape(-1, 3),
         labels.ravel().astype(np.uint8),
-        normal.astype(np.float64),
+        normal,
         offset,
         camera,
         rgb,
@@ -150,28 +165,40 @@ def judge(
     scene: RealScene,
     grasps: Sequence[Any],
     plane: tuple[Array, float] | None,
+    answer: Int64,
     gripper: "Gripper",
     milliseconds: float,
 ) -> SceneFigures:
     """What an answer is worth.
 
-    Grasps are best first and the plane that was found is its normal (3,) and offset, both in the
-    camera's frame.
+    Args:
+        scene: With its labels.
+        grasps: Best first, camera frame.
+        plane: Normal (3,) and offset of the support plane that was found, camera frame.
+        answer: (R,) number of the object that each point is of, from 1; 0: of none.
+        gripper: That the grasps are for.
+        milliseconds: From the request to the answer.
     """
     best = grasps[:BEST]
     on_object = _objects_held(scene, grasps)
     scores = np.array([grasp.score for grasp in grasps])
     well_held = {label for label in on_object[scores >= GOOD_SCORE] if label >= FIRST_OBJECT}
-    upward = [float(grasp.approach_direction @ scene.normal) for grasp in best]
+    apart = scene.normal is not None
+    up = np.zeros(3) if scene.normal is None else scene.normal
+    upward = [float(grasp.approach_direction @ up) for grasp in best]
+    held = int((on_object[:BEST] >= FIRST_OBJECT).sum())
     return SceneFigures(
         grasps=len(grasps),
         best=len(best),
-        on_object=int((on_object[:BEST] >= FIRST_OBJECT).sum()),
+        on_object=held,
+        elsewhere=len(best) - held,
         from_below=sum(sine > BELOW for sine in upward),
         through_points=int(_meet_points(scene, best, gripper).sum()),
         objects=len(scene.objects),
         objects_with_grasp=len(well_held),
-        plane=None if plane is None else _compare(scene, *plane),
+        plane=None if plane is None or not apart else _compare(scene, *plane),
+        plane_labelled=apart,
+        segmentation=compare(scene.object_of_point, answer if apart else np.minimum(answer, 1)),
         milliseconds=milliseconds,
     )
 
@@ -200,6 +227,7 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> NDArray[np.int64]:
 
 
 def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
+    assert scene.normal is not None
     cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
     apart = np.abs(scene.feet @ normal - offset)
     return PlaneFigures(float(np.degrees(np.arccos(cosine))), float(apart.max()))
@@ -225,6 +253,17 @@ class _Arrays:
 
     def refuse(self, field: str, value: str, wanted: str) -> NoReturn:
         raise ValueError(f"{self.file}: {field}: got {value}. Save {wanted}.")
+
+
+def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
+    """Normal (3,) and offset of the support plane; None and 0 where the file has neither."""
+    if not {"support_normal", "support_offset"} & arrays.arrays.keys():
+        return None, 0.0
+    normal = arrays.get("support_normal", "f", "three numbers, of length 1", (3,))
+    if abs(np.linalg.norm(normal) - 1.0) > 1e-3:
+        arrays.refuse("support_normal", f"length {np.linalg.norm(normal):g}", "a unit normal")
+    offset = float(arrays.get("support_offset", "f", "one number, metres", ()))
+    return normal.astype(np.float64), offset
 
 
 def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:

@@ -89,6 +89,9 @@ class DebugInfo:
     score: Float32  # (E,) NaN where it was not scored
     outcome: list[str]  # E of them: "returned", or what became of it
     support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
+    # (R,) of each row of the cloud as sent, images row by row: the number of its object; -1: an
+    # obstacle; -2: the support; -3: no reading, cut off or below the support.
+    labels: Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +239,7 @@ def _evaluation(answer: Any, read: Read) -> Evaluation:
 
 def _debug(answer: Any, read: Read) -> DebugInfo:
     def array(name: str, dtype: type, *shape: int) -> NDArray[Any]:
-        return np.array(read(answer, name), dtype=dtype).reshape(shape)
+        return np.array(read(answer, name) or (), dtype=dtype).reshape(shape)
 
     return DebugInfo(
         points=array("points", np.float32, -1, 3),
@@ -249,4 +252,5 @@ def _debug(answer: Any, read: Read) -> DebugInfo:
         support_plane=array("support_plane", np.float32, 4)
         if read(answer, "support_plane")
         else None,
+        labels=array("labels", np.int32, -1),
     )

@@ -232,8 +232,9 @@ class GraspDetector:
                 grasps = grasps_in_cloud(
                     scene, best, gripper, score[rows], width[rows], free, clear
                 )
-            if options.debug and scene is not None:
-                debug = debug_info(scene, sample, score, outcome)
+            if options.debug and scene is not None and prepared.selected is not None:
+                labels = prepared.selected.labels
+                debug = debug_info(scene, sample, score, outcome, labels)
         counts["returned"] = len(grasps)
         seconds, name = prepared.total_seconds(), self.metadata.name
         assert prepared.selected is not None

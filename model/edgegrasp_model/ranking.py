@@ -192,6 +192,7 @@ def debug_info(
     sample: Sample | None,
     score: NDArray[np.floating],
     outcome: NDArray[np.int8],
+    labels: Int64,
 ) -> DebugInfo:
     """The processed cloud and every candidate of a request.
 
@@ -200,6 +201,7 @@ def debug_info(
         sample: All candidates and which of them (E) were scored; None: there are none.
         score: (E,) probabilities.
         outcome: (E,) codes of what became of them.
+        labels: (R,) of the rows of the cloud as sent.
     """
     candidates = Candidates.none() if sample is None else sample.drawn
     codes = outcome[:0] if sample is None else sample.outcome.copy()
@@ -220,4 +222,5 @@ def debug_info(
         score=scores,
         outcome=[OUTCOMES[code] for code in codes.tolist()],
         support_plane=plane,
+        labels=labels,
     )

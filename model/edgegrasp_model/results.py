@@ -10,6 +10,9 @@ Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
 
+OBSTACLE, SUPPORT, UNLABELLED = -1, -2, -3  # labels of rows of a cloud that are no object's
+
+
 class Outcome(StrEnum):
     """What became of a candidate."""
 
@@ -94,6 +97,9 @@ class DebugInfo:
     score: Float32  # (E,) NaN where it was not scored
     outcome: list[Outcome]  # E of them
     support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
+    # (R,) of each row of the cloud as sent, images row by row: the number of its object;
+    # OBSTACLE; SUPPORT; UNLABELLED: no reading, cut off or below the support.
+    labels: Int64
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edgegrasp_cli.real_scenes import judge, load_scene
+from edgegrasp_cli.real_scenes import SceneFigures, judge, load_scene
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.results import Grasp
 
@@ -57,6 +57,13 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "box.npz"
 
 
+def judged(file: Path, grasps: list[Grasp], plane: Any = None) -> SceneFigures:
+    """What an answer is worth that calls nothing an object."""
+    scene = load_scene(file)
+    nothing = np.zeros(len(scene.points), dtype=np.int64)
+    return judge(scene, grasps, plane, nothing, load_gripper(), 5.0)
+
+
 def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
     top = TABLE + 2 * HALF[2] * NORMAL
     floor = TABLE + 0.2 * ALONG
@@ -67,13 +74,14 @@ def test_grasps_are_judged_by_the_labels(scene: Path) -> None:
         grasp(-NORMAL, floor + 0.02 * NORMAL, end=floor),  # beside the box
         grasp(-NORMAL, top - 0.08 * NORMAL, end=top),  # the palm is in the box
     ]
-    figures = judge(load_scene(scene), grasps, None, load_gripper(), 5.0)
+    figures = judged(scene, grasps)
     assert (figures.grasps, figures.best, figures.objects) == (4, 4, 1)
-    assert (figures.on_object, figures.from_below, figures.through_points) == (3, 1, 2)
+    assert (figures.on_object, figures.elsewhere) == (3, 1)
+    assert (figures.from_below, figures.through_points) == (1, 2)
     assert figures.objects_with_grasp == 1
-    doubtful = judge(load_scene(scene), grasps[1:3], None, load_gripper(), 5.0)
+    doubtful = judged(scene, grasps[1:3])
     assert doubtful.objects_with_grasp == 0
-    nothing = judge(load_scene(scene), [], None, load_gripper(), 5.0)
+    nothing = judged(scene, [])
     assert (nothing.best, nothing.on_object, nothing.objects_with_grasp) == (0, 0, 0)
 
 
@@ -85,7 +93,7 @@ def test_a_plane_is_right_within_5_degrees_and_10_mm(scene, tilt, shift, right) 
     turn = np.radians(tilt)
     normal = np.cos(turn) * NORMAL + np.sin(turn) * ALONG
     plane = normal, float(normal @ (TABLE + shift * NORMAL))
-    found = judge(load_scene(scene), [], plane, load_gripper(), 5.0).plane
+    found = judged(scene, [], plane).plane
     assert found is not None
     assert found.angle == pytest.approx(tilt, abs=0.1)
     assert found.right == right
@@ -120,8 +128,43 @@ def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
     results = json.loads((output / "results.json").read_text())
     assert results["scenes"]["box"]["on_object"] == results["scenes"]["box"]["best"] > 0
     assert results["all"]["on_object"] == results["all"]["planes_right"] == 1
-    assert (output / "box.png").read_bytes().startswith(b"\x89PNG")
+    assert results["all"]["instances_found"] == results["all"]["instances"] == 1
+    assert min(results["all"][f"pixel_{share}"] for share in ("precision", "recall")) > 0.9
+    for picture in ("box.png", "box-labels.png"):
+        assert (output / picture).read_bytes().startswith(b"\x89PNG")
     assert "box" in (output / "index.html").read_text()
+
+
+def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(
+    scene: Path, run, tmp_path: Path
+) -> None:
+    heap = tmp_path / "heap" / "heap.npz"
+    heap.parent.mkdir()
+    np.savez(heap, **{k: v for k, v in seen_box().items() if not k.startswith("support_")})
+    output = tmp_path / "results"
+    folders = ("--scenes", scene.parent, "--scenes", heap.parent)
+    run("benchmark-real", *folders, "--output", output)
+    results = json.loads((output / "results.json").read_text())
+    assert set(results["scenes"]) == {"box", "heap"}
+    assert results["all"]["planes"] == results["all"]["instances"] == 1
+    assert results["scenes"]["heap"]["segmentation"]["pixel_recall"] > 0.9
+
+
+def test_a_scene_that_is_refused_counts_as_one_without_grasps(
+    scene: Path, run, tmp_path: Path
+) -> None:
+    arrays, whole = seen_box(), load_scene(scene)
+    row = np.flatnonzero(whole.labels == 2)[:10]  # fewer points than grasps are asked around
+    few = {"points": whole.points[row], "labels": whole.labels[row]}
+    beside = {name: arrays[name] for name in ("support_normal", "support_offset")}
+    np.savez(scene.parent / "refused.npz", **few, **beside)
+    asked = ("--num-approach-points", 20, "--output", tmp_path / "results")
+    run("benchmark-real", "--scenes", scene.parent, *asked)
+    results = json.loads((tmp_path / "results" / "results.json").read_text())
+    refused = results["scenes"]["refused"]
+    assert refused["refused"]
+    assert (refused["best"], refused["segmentation"]["called"]) == (0, 0)
+    assert results["all"]["refused"] == 1
 
 
 @pytest.mark.parametrize(
@@ -141,15 +184,20 @@ def test_a_bad_file_is_named_with_field_and_fix(field, value, sentence, scene, r
     assert sentence in refused("benchmark-real", "--scenes", scene.parent)
 
 
-def test_what_is_no_scene_is_refused(refused, tmp_path: Path) -> None:
+def test_what_is_no_scene_is_refused(refused, scene: Path, tmp_path: Path) -> None:
+    twice = ("--scenes", scene.parent, "--scenes", scene.parent)
+    assert "two of the name box" in refused("benchmark-real", *twice)
+    scene.unlink()
     assert "Give a folder of scenes" in refused("benchmark-real", "--scenes", tmp_path)
     (tmp_path / "foreign.npz").write_bytes(b"foreign")
     assert "foreign.npz: " in refused("benchmark-real", "--scenes", tmp_path)
 
 
 def test_the_scenes_of_real_cameras_can_be_read(shared_dir: Path) -> None:
-    for file in sorted((shared_dir / "real_scenes").glob("*.npz")):
+    for file in sorted(shared_dir.glob("real_*/*.npz")):
         scene = load_scene(file)
+        assert scene.objects
+        if scene.normal is None:  # hidden by the heap
+            continue
         on_plane = scene.points[scene.labels == 1] @ scene.normal - scene.offset
         assert np.median(np.abs(on_plane)) < 0.005
-        assert scene.objects

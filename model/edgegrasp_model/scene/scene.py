@@ -17,6 +17,7 @@ from edgegrasp_model.options import (
     SupportPlane,
     Workspace,
 )
+from edgegrasp_model.results import OBSTACLE, SUPPORT, UNLABELLED
 from edgegrasp_model.scene.cloud import (
     UP,
     CanonicalFrame,
@@ -89,6 +90,7 @@ class SelectedPoints:
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras
+    labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
 
 
 def select_points(
@@ -120,7 +122,7 @@ def select_points(
     if support is None:
         counts["above_support"] = int(inside.sum())
         number = np.where(inside, _given_numbers(sent), UNKNOWN)
-        return SelectedPoints(sent, number, None, up, viewpoints)
+        return SelectedPoints(sent, number, None, up, viewpoints, _labels(sent, number))
     said: list[str] = []
     standing = _standing_on(support, sent, seen, inside, options, said)
     floor = standing.number == BOX_FLOOR
@@ -132,7 +134,18 @@ def select_points(
     warnings += said
     counts["above_support"] = int(standing.inside.sum())
     kept = near_things(standing.plan, standing.number)
-    return SelectedPoints(standing.sent.take(kept), standing.number[kept], support, up, viewpoints)
+    labels = _labels(standing.sent, standing.number)
+    labels[standing.on] = SUPPORT
+    near, number = standing.sent.take(kept), standing.number[kept]
+    return SelectedPoints(near, number, support, up, viewpoints, labels)
+
+
+def _labels(sent: CheckedCloud, number: Int64) -> Int64:
+    """Labels (R,) of the rows of a cloud as sent, of which M are numbered."""
+    labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
+    labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
+    labels[sent.row[number == BOX_FLOOR]] = SUPPORT
+    return labels
 
 
 class _Standing(NamedTuple):
@@ -143,6 +156,7 @@ class _Standing(NamedTuple):
     inside: Bools  # (M,) in the workspace
     plan: Float64  # (M, 2) metres along the support
     number: Int64  # (M,) as from `find_things`
+    on: Int64  # rows of the cloud as sent that belong to the support
 
 
 def _standing_on(
@@ -161,6 +175,7 @@ def _standing_on(
     on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
     each = max(len(on) // ON, 1)
     on_plan = support.plan(sent.points[on[::each]])
+    belongs = sent.row[np.abs(height) <= margin]
     sent, seen, inside = sent.take(above), seen.take(above), inside[above]
     plan = support.plan(sent.points)
     height, margin = height[above], margin[above]
@@ -169,7 +184,7 @@ def _standing_on(
     border = None if seen.at_border is None else seen.at_border[rest]
     view = PlaneView(plan[rest], height[rest], margin[rest], on_plan, border, each)
     number[rest] = _numbers(view, sent.take(rest), seen.take(rest), inside[rest], options, warnings)
-    return _Standing(sent, seen, inside, plan, number)
+    return _Standing(sent, seen, inside, plan, number, belongs)
 
 
 def build_scene(

@@ -1925,6 +1925,7 @@ class DebugInfo(_message.Message):
     SCORE_FIELD_NUMBER: _builtins.int
     OUTCOME_FIELD_NUMBER: _builtins.int
     SUPPORT_PLANE_FIELD_NUMBER: _builtins.int
+    LABELS_FIELD_NUMBER: _builtins.int
     @_builtins.property
     def points(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """V * 3 floats, metres, cloud frame."""
@@ -1957,6 +1958,12 @@ class DebugInfo(_message.Message):
     def support_plane(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """Unit normal and offset in metres of the support plane, given or found; empty: none."""
 
+    @_builtins.property
+    def labels(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Of each row of the cloud as sent, images row by row: the number of its object; -1: an
+        obstacle; -2: the support; -3: no reading, cut off or below the support.
+        """
+
     def __init__(
         self,
         *,
@@ -1968,10 +1975,11 @@ class DebugInfo(_message.Message):
         score: _abc.Iterable[_builtins.float] | None = ...,
         outcome: _abc.Iterable[_builtins.str] | None = ...,
         support_plane: _abc.Iterable[_builtins.float] | None = ...,
+        labels: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "approach_index", b"approach_index", "contact_index", b"contact_index", "normals", b"normals", "outcome", b"outcome", "points", b"points", "score", b"score", "support_plane", b"support_plane"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "approach_index", b"approach_index", "contact_index", b"contact_index", "labels", b"labels", "normals", b"normals", "outcome", b"outcome", "points", b"points", "score", b"score", "support_plane", b"support_plane"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
