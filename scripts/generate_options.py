@@ -32,6 +32,7 @@ MESSAGES = {"SupportPlane": "Support", "Linkage": "Swing"}
 CHOICES = {"GripperGeometry": "GripperChoice"}  # a name, or the object
 UNIONS = {"include": "Shape", "exclude": "Shape", "obstacles": "Obstacle"}  # lists of kinds
 PLAIN_KIND = "SupportPlane"  # what an object without a `kind` is
+WORDS = {"objects": "object_choice"}  # a word, or an object that has this field of its own in gRPC
 
 
 def main() -> None:
@@ -67,6 +68,12 @@ def name_of(schema: Schema) -> str:
     return str(schema.get("$ref", "")).rpartition("/")[2]
 
 
+def union_of(field: str, schema: Schema) -> str:
+    """The message of a list's objects, which have kinds; empty where they have none."""
+    kinds = alternatives(schema.get("items", {}))
+    return UNIONS.get(field, "") if all(map(name_of, kinds)) else ""
+
+
 def is_vector(schema: Schema) -> bool:
     """Whether a schema is a list of numbers with a length of its own."""
     parts = schema.get("prefixItems", [{}])
@@ -95,6 +102,11 @@ def _message(name: str, schema: Schema, options: Schema) -> str:
         for field, part in schema["properties"].items()
         if field != "kind"
     }
+    for field in WORDS.keys() & fields.keys():
+        _, part, kind = fields[field]
+        word, chosen = alternatives(part)
+        fields[field] = (fields[field][0], word, "optional string")
+        fields[WORDS[field]] = (f"`{field}` where it is an object in JSON", {}, name_of(chosen))
     if name == PLAIN_KIND:  # objects of the other kinds are fields of its message
         kinds = alternatives(options["properties"]["support"])
         for one in [kind for kind in kinds if name_of(kind) not in ("", PLAIN_KIND)]:
@@ -138,7 +150,7 @@ def _oneof(union: str, options: Schema) -> str:
         part
         for owner in options["$defs"].values()
         for field, part in owner["properties"].items()
-        if UNIONS.get(field) == union
+        if union_of(field, part) == union
     ]
     numbers = _Numbers(union)
     lines = ["// In JSON `kind` is the name of the field set here, its fields beside it."]
@@ -184,8 +196,8 @@ def _proto_type(name: str, schema: Schema) -> str:
     """The type of a field, or of its items."""
     kinds = alternatives(schema)
     last = kinds[-1]
-    if name in UNIONS:
-        return UNIONS[name]
+    if union_of(name, schema):
+        return union_of(name, schema)
     if len(kinds) > 1 and name_of(last):
         if kinds[0].get("type") == "string" and "enum" not in kinds[0]:
             return CHOICES[name_of(last)]
@@ -198,7 +210,7 @@ def _proto_type(name: str, schema: Schema) -> str:
             return _proto_type("", last["items"])
         if not is_vector(last):
             return "HandBox"
-        return {3: "Vector", 4: "Quaternion"}[len(last["prefixItems"])]
+        return {2: "Pixel", 3: "Vector", 4: "Quaternion"}[len(last["prefixItems"])]
     if last["type"] == "integer":
         high = last.get("maximum", 0) or last.get("exclusiveMaximum", 0)
         return "int64" if high > 2**31 else "int32"
@@ -247,9 +259,9 @@ def client_types() -> str:
         for other in re.findall(r'"#/\$defs/(\w+)"', json.dumps(parts[name]["properties"])):
             write(other)
         aliases = {
-            UNIONS[field]: [name_of(one) for one in alternatives(part["items"])]
+            union_of(field, part): [name_of(one) for one in alternatives(part["items"])]
             for field, part in parts[name]["properties"].items()
-            if field in UNIONS
+            if union_of(field, part)
         }
         for alias, names in aliases.items():
             written[alias] = f"{alias} = {' | '.join(names)}\n"
@@ -276,8 +288,8 @@ def _typed_dict(name: str, schema: Schema) -> str:
 
 def _python_type(name: str, schema: Schema) -> str:
     nullable = any(one.get("type") == "null" for one in schema.get("anyOf", ()))
-    if name in UNIONS:
-        return f"Sequence[{UNIONS[name]}]"
+    if union_of(name, schema):
+        return f"Sequence[{union_of(name, schema)}]"
     packed = "contentEncoding"  # text in JSON, where Python has arrays
     parts = [one for one in alternatives(schema) if packed not in one]
     kinds = list(dict.fromkeys(map(_one_python_type, parts)))
@@ -313,7 +325,8 @@ give the same grasps.
 
 Positions and directions are in the cloud's frame, in metres, within 10,000 km of its origin;
 directions are the way the hand *moves* ([pictures](frames.md)). A `Vector` is `[x, y, z]` in JSON,
-a `Quaternion` `[x, y, z, w]`. Options come first in the table, then the objects they are made of.
+a `Quaternion` `[x, y, z, w]`, a `Pixel` `[column, row]`. Options come first in the table, then the
+objects they are made of.
 Where a JSON object has a `kind`, gRPC has a message with one field for each kind; but a given
 support plane has its fields in `Support` itself, where one to look for is the field `auto` or
 `ransac`.
@@ -343,10 +356,14 @@ def _table() -> Iterator[list[str]]:
                 yield [f"`{prefix}kind`", kind, "the field of that name", "", ""]
                 continue
             repeated = "repeated " if _label(part) == "repeated " else ""
+            kind = _proto_type(field, part)
+            in_proto = f"`{repeated}{kind}`"
+            if field in WORDS:
+                in_proto = f"`string`, or `{kind} {WORDS[field]}`"
             yield [
                 f"`{prefix}{field}`",
                 _json_type(part),
-                f"`{repeated}{_proto_type(field, part)}`",
+                in_proto,
                 _default(field, part, schema),
                 _cell(part),
             ]
@@ -371,7 +388,8 @@ def _json_list(field: Schema) -> str:
     if "prefixItems" in field:
         parts = field["prefixItems"]
         if is_vector(field):
-            return {3: "`Vector`", 4: "`Quaternion`"}[len(parts)] + _range(parts[0])
+            kind = {2: "Pixel", 3: "Vector", 4: "Quaternion"}[len(parts)]
+            return f"`{kind}`{_range(parts[0])}"
         return f"[{', '.join(_json_type(part) for part in parts)}]"
     low, high = field.get("minItems", 0), field["maxItems"]
     size = f"{low} to {high}" if low else f"up to {high}"

@@ -35,6 +35,7 @@ from edgegrasp_client.options import HandPart as HandPart
 from edgegrasp_client.options import Indices as Indices
 from edgegrasp_client.options import Linkage as Linkage
 from edgegrasp_client.options import Mask as Mask
+from edgegrasp_client.options import ObjectChoice as ObjectChoice
 from edgegrasp_client.options import OrientedBox as OrientedBox
 from edgegrasp_client.options import RansacPlane as RansacPlane
 from edgegrasp_client.options import Region as Region

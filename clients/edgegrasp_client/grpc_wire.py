@@ -186,12 +186,15 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
 
 
 def _known(message: Message) -> str:
-    internal = ("disabled", "ransac", "auto")  # JSON writes these in another way
+    internal = ("disabled", "ransac", "auto", "object_choice")  # JSON writes these in another way
     return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
 def _options(message: Message, value: Any, path: str) -> Filled:
-    """One viewpoint may be given without a list around it."""
+    """One viewpoint may be given without a list around it, and objects as a choice of them."""
+    if isinstance(value.get("objects"), Mapping):
+        value = {**value, "object_choice": value["objects"]}
+        del value["objects"]
     viewpoint = value.get("viewpoint")
     listed = isinstance(viewpoint, list) and bool(viewpoint) and isinstance(viewpoint[0], list)
     if viewpoint is None or listed:
@@ -202,7 +205,7 @@ def _options(message: Message, value: Any, path: str) -> Filled:
 def _coordinates(message: Message, value: Any, path: str) -> Filled:
     names = [field.name for field in message.DESCRIPTOR.fields]
     if not isinstance(value, Sequence) or len(value) != len(names):
-        count = {3: "three", 4: "four"}[len(names)]
+        count = {2: "two", 3: "three", 4: "four"}[len(names)]
         raise invalid(path, repr(value)[:80], f"Give {count} numbers: {', '.join(names)}.")
     return message, dict(zip(names, value, strict=True))
 
@@ -254,6 +257,7 @@ def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
 # Messages that JSON does not write field by field: the message to fill, and its fields.
 _FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
     grasp_pb2.DetectOptions: _options,
+    grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,
     grasp_pb2.HandBox: _corners,

@@ -80,6 +80,15 @@ class AutoPlane(TypedDict):
     kind: Literal["auto"]
 
 
+class ObjectChoice(TypedDict, total=False):
+    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+
+    # numbers of objects; empty: all
+    include: Sequence[int] | NDArray[Any]
+    # numbers of objects that are left out
+    exclude: Sequence[int] | NDArray[Any]
+
+
 class Workspace(TypedDict):
     """An axis-aligned box in the cloud's frame, where grasps may be."""
 
@@ -239,9 +248,14 @@ class DetectOptions(TypedDict, total=False):
     up: Vector | None
     # plane the objects rest on; no part of the hand goes below it; a bare kind will do; None: none
     support: Literal["auto", "ransac", "none"] | SupportPlane | RansacPlane | AutoPlane | None
-    # whether grasps are for the things that stand on the support plane only, or for everything; all
-    # the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none
-    objects: Literal["auto", "off"]
+    # what grasps are for: the things that stand on the support plane, some of them by number, or
+    # everything; all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0
+    # and less none
+    objects: Literal["auto", "off"] | ObjectChoice
+    # pixel of the image; grasps are for the object that is seen there
+    at: Vector | None
+    # position, metres; grasps are for the object next to it, 0.1 m away at most
+    near: Vector | None
     # longest side of a thing, metres
     max_object_size: float
     # where grasps may be; points outside stay as obstacles; None: everywhere

@@ -43,6 +43,7 @@ from edgegrasp_model.scene.cloud import (
     check_cloud,
     check_edges,
     check_hand_poses,
+    seen_from_origin,
 )
 from edgegrasp_model.scene.scene import (
     MAX_VOXELS,
@@ -191,7 +192,7 @@ class GraspDetector:
             return prepared
         radius, counts = prepared.crop_radius, prepared.counts
         prepared.further = sample_candidates(
-            scene, options, gripper, radius, counts, self.sees_hands
+            scene, prepared.options, gripper, radius, counts, self.sees_hands
         )
         self._sample(prepared, None)
         return prepared
@@ -315,16 +316,20 @@ class GraspDetector:
         prepared = self._start(sent, options)
         with prepared.timed("cloud"):
             counts, warnings = prepared.counts, prepared.warnings
-            prepared.selected = select_points(sent, options, counts, warnings)
+            prepared.selected = select_points(sent, prepared.options, counts, warnings)
             prepared.scene = build_scene(
-                prepared.selected, options, self.metadata.voxel_size, counts, self.max_voxels
+                prepared.selected,
+                prepared.options,
+                self.metadata.voxel_size,
+                counts,
+                self.max_voxels,
             )
         if prepared.scene is None:
             prepared.warn_of_few_points()
         return prepared
 
     def _start(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
-        """Choose the gripper and the crop radius; warn of what is unknown."""
+        """Choose the gripper, the crop radius and an unknown viewpoint; warn of what is unknown."""
         gripper = choose_gripper(options, self.gripper, self.grippers)
         radius = self.metadata.network.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
@@ -336,7 +341,13 @@ class GraspDetector:
                 f"the weights were trained for the gripper {self.gripper.name!r}: for "
                 f"{gripper.name!r} their scores rank grasps, but promise less."
             )
-        if options.viewpoint is None and sent.normals is None:
+        if options.viewpoint is None and seen_from_origin(sent.points, options.up):
+            prepared.options = options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
+            prepared.warnings.append(
+                "viewpoint is not given: the camera is assumed at the origin, in front of which "
+                "the whole cloud lies; send the camera's position where it is another."
+            )
+        elif options.viewpoint is None and sent.normals is None:
             prepared.warnings.append(
                 "viewpoint is not given: normals are turned upward; send the camera's position."
             )

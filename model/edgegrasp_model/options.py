@@ -82,6 +82,13 @@ UnitVector = Annotated[Vector, AfterValidator(_of_length_one)]
 Direction = Annotated[Vector, AfterValidator(_not_zero)]
 
 
+PixelPlace = Annotated[float, Field(ge=-0.5, le=100_000.0), numeric]
+Pixel = Annotated[
+    tuple[PixelPlace, PixelPlace],
+    Field(description="column, row; the centre of the top left pixel is (0, 0)"),
+]
+
+
 Quaternion = Annotated[
     tuple[Finite, Finite, Finite, Finite],
     AfterValidator(_of_length_one),
@@ -437,6 +444,17 @@ class Collision(Strict):
     )
 
 
+class ObjectChoice(Strict):
+    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+
+    include: tuple[Row, ...] = Field(
+        default=(), max_length=4096, description="numbers of objects; empty: all"
+    )
+    exclude: tuple[Row, ...] = Field(
+        default=(), max_length=4096, description="numbers of objects that are left out"
+    )
+
+
 def _mode_as_object(value: object) -> object:
     return {"mode": value} if isinstance(value, str) else value
 
@@ -538,11 +556,19 @@ class DetectOptions(Strict):
         description="plane the objects rest on; no part of the hand goes below it; a bare kind "
         "will do; null: none",
     )
-    objects: Literal["auto", "off"] = Field(
+    objects: Literal["auto", "off"] | ObjectChoice = Field(
         default="auto",
-        description="whether grasps are for the things that stand on the support plane only, or "
-        "for everything; all the rest is an obstacle. Where segment_ids are sent, they are the "
-        "objects, 0 and less none",
+        description="what grasps are for: the things that stand on the support plane, some of "
+        "them by number, or everything; all the rest is an obstacle. Where segment_ids are sent, "
+        "they are the objects, 0 and less none",
+    )
+    at: Pixel | None = Field(
+        default=None,
+        description="pixel of the image; grasps are for the object that is seen there",
+    )
+    near: Vector | None = Field(
+        default=None,
+        description="position, metres; grasps are for the object next to it, 0.1 m away at most",
     )
     max_object_size: Number = Field(
         default=0.4, gt=0.0, le=10.0, description="longest side of a thing, metres"

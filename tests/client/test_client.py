@@ -72,7 +72,9 @@ ALL_OPTIONS: dict[str, Any] = {
     "viewpoint": np.array([0.1, 0.2, 0.7], np.float32),
     "up": (0, 0, 2),
     "support": {"normal": np.array([0.0, 0.0, 1.0]), "offset": np.float32(-0.05)},
-    "objects": "off",
+    "objects": {"include": np.array([0, 2]), "exclude": (1,)},
+    "at": (3, 4.5),
+    "near": np.array([0.1, 0.2, 0.3]),
     "max_object_size": 0.3,
     "workspace": {"min": [-1, -1, -1], "max": (1, 1, 1)},
     "approach_region": {

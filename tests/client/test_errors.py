@@ -56,7 +56,7 @@ class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
             described = detail.SerializeToString() if problem.kind else b"\xff\xff"
             context.set_trailing_metadata((("edgegrasp-error-bin", described),))
             context.abort(problem.code, "what happened")
-        return grasp_pb2.DetectGraspsResponse(model="fake")
+        return grasp_pb2.DetectGraspsResponse(model="fake", gripper={"name": "fake"})
 
     def DetectGraspsStream(self, requests: Any, context: Any) -> Iterator[Any]:  # noqa: N802
         for request in requests:

@@ -13,6 +13,7 @@ from edgegrasp_model.scene.cloud import (
     check_cloud,
     estimate_normals,
     orient_normals,
+    seen_from_origin,
     statistical_outlier_removal,
     voxelise,
 )
@@ -70,6 +71,28 @@ def test_a_bad_cloud_is_refused_by_field_value_and_fix(sent, field, value) -> No
     assert caught.value.field == field
     assert value in caught.value.value
     assert caught.value.fix
+
+
+def test_stray_readings_far_away_are_left_out_and_millimetres_are_refused() -> None:
+    near = np.random.default_rng(0).uniform(0, 0.5, (100, 3)).astype(np.float32)
+    sent = np.concatenate([near[:50], [[0, 0, 79.0], [5000.0, 0, 0]], near[50:]])
+    checked = check_cloud(CloudInput(sent, segment_ids=np.arange(102)))
+    np.testing.assert_array_equal(checked.points, near)
+    np.testing.assert_array_equal(checked.row, np.delete(np.arange(102), [50, 51]))
+    np.testing.assert_array_equal(checked.segment_ids, checked.row)
+    assert any("2 points are left out" in warning for warning in checked.warnings)
+    with pytest.raises(InvalidRequest, match="suggests millimetres"):
+        check_cloud(1000 * sent)
+
+
+def test_a_camera_at_the_origin_sees_what_lies_wholly_in_front_of_it() -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.uniform((-0.4, -0.3, 0.6), (0.4, 0.3, 1.0), (500, 3)).astype(np.float32)
+    assert seen_from_origin(seen, None)
+    assert seen_from_origin(seen, (0, -1.0, -0.5))
+    assert not seen_from_origin(seen, (0, 0, 1.0))  # it would look straight up
+    assert not seen_from_origin(seen - (0, 0, 0.8), None)
+    assert not seen_from_origin((*seen, 1.5, 0, 0), None)
 
 
 def voxel_means(points: np.ndarray, size: float) -> np.ndarray:

@@ -58,6 +58,49 @@ def test_several_depth_images_give_grasps_with_the_defaults() -> None:
     assert len(three.objects) == len(one.objects) == 4
 
 
+def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:
+    cloud = render([table(), *things(1)], camera(0.7, 0.0, 0.9)).reshape(-1, 3)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    network = ModelCatalogue.load().get("edgegrasp-plus")
+    told = network.detect(cloud, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
+    assumed = network.detect(cloud)
+    assert same(told, assumed)
+    assert len(assumed.grasps) > 0
+    assert any("the camera is assumed at the origin" in each for each in assumed.warnings)
+
+
+def test_one_of_the_objects_by_number_by_pixel_or_by_place() -> None:
+    boxes, pose = things(1), camera(0.7, 0.0, 0.9)
+    image = render([table(), *boxes], pose)
+    network = ModelCatalogue.load().get("edgegrasp-plus")
+
+    def objects(**asked: object) -> set[int]:
+        fields = {"viewpoint": (0.0, 0.0, 0.0), "seed": 3} | asked
+        found = network.detect(image, DetectOptions.model_validate(fields))
+        assert {grasp.object for grasp in found.grasps} <= {each.number for each in found.objects}
+        assert found.grasps or any(str(name) in "".join(found.warnings) for name in asked)
+        return {each.number for each in found.objects}
+
+    every = network.detect(image, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
+    numbers = {each.number for each in every.objects}
+    one = every.grasps[0].object
+    assert one is not None
+    assert objects(objects={"include": [one]}) == {one}
+    assert objects(objects={"exclude": [one]}) == numbers - {one}
+    assert objects(objects={"include": [99]}) == set()
+    place = next(each.center for each in every.objects if each.number == one)
+    assert objects(near=place.tolist()) == {one}
+    assert objects(near=(0.0, 0.0, 5.0)) == set()
+    u, v = FOCAL_LENGTH * place[:2] / place[2] + (WIDTH / 2, HEIGHT / 2)
+    assert objects(at=(u, v)) == {one}
+    assert objects(at=(0, 0)) == set()
+    with pytest.raises(InvalidRequest, match=r"options\.at"):
+        objects(at=(WIDTH, 0))
+    image = image.reshape(-1, 3)[np.isfinite(image).all(axis=2).ravel()]
+    with pytest.raises(InvalidRequest, match="no image"):
+        objects(at=(u, v))
+
+
 def test_the_order_of_the_points_does_not_matter() -> None:
     one, other = detect(), detect(np.random.default_rng(5).permutation(CLOUD))
     assert one.counts == other.counts

@@ -16,7 +16,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-MAX_EXTENT = 20.0  # metres; a wider cloud is millimetres taken for metres
+MAX_EXTENT = 20.0  # metres; where most of a cloud is wider, it is in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
@@ -25,6 +25,8 @@ UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
 BORDER = 3  # pixels
 FRAME = 0.05  # of an image's width or height without depths along its border
 CUBE = 8  # voxels along the edge of a cube whose points follow one another
+WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
+MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 
 
@@ -112,20 +114,42 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
             points = points.take(kept, axis=0)
             if len(points) == 0:
                 raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
-    valid = validate_cloud(points, num_approach_points)
+    valid = _valid_points(points)
     row = np.arange(len(valid)) if kept is None else kept
     size = len(sent.points.reshape(-1, 3)) if isinstance(sent.points, np.ndarray) else len(valid)
+    said = sent.warnings
+    near = _near_points(valid)
+    if near is not None:
+        said += (
+            f"{len(valid) - len(near)} points are left out that lie more than "
+            f"{MAX_EXTENT / 2:g} m from the middle of the cloud.",
+        )
+        valid, row = valid[near], row[near]
+    _check_place(valid, num_approach_points)
     _floats("colors", sent.colors, size, None)
     return CheckedCloud(
-        valid,
+        np.ascontiguousarray(valid, dtype=np.float32),
         row.astype(np.int64, copy=False),
         size,
         _floats("normals", sent.normals, size, row),
         _integers("segment_ids", sent.segment_ids, size, row),
         _integers("view_ids", sent.view_ids, size, row),
         size_of_image,
-        sent.warnings,
+        said,
     )
+
+
+def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
+    """Whether points (N, 3) look like what a camera at their origin sees, along +z.
+
+    Where `up` (3,) is known, such a camera does not look steeply upward.
+    """
+    x, y, z = points.T
+    if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > WIDEST_VIEW:
+        return False
+    middle = points.mean(axis=0, dtype=np.float64)
+    upward = 0.0 if up is None else np.dot(up, middle) / np.linalg.norm(up)
+    return bool(upward <= MAX_UPWARD * np.linalg.norm(middle))
 
 
 def check_edges(edges: object, rows: int) -> Int64:
@@ -222,19 +246,11 @@ class Cloud:
     normals: Float32  # (N, 3)
 
 
-def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
-    """Check a caller's array and give it back as float32.
-
-    Args:
-        cloud: (N, 3) float32 or float64, metres.
-        num_approach_points: How many of its points the caller wants as approach points.
-
-    Returns:
-        (N, 3) float32.
+def _valid_points(cloud: object) -> NDArray[np.floating]:
+    """A caller's array (N, 3) float32 or float64, metres.
 
     Raises:
-        InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity, an extent that
-            suggests millimetres, too far from the origin, or fewer points than approach points.
+        InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity.
     """
     if not isinstance(cloud, np.ndarray):
         kind = type(cloud).__name__
@@ -246,8 +262,7 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
-    low, high = (np.array([axis(column) for column in cloud.T]) for axis in (np.min, np.max))
-    if not np.isfinite([low, high]).all():
+    if not np.isfinite([(axis.min(), axis.max()) for axis in cloud.T]).all():
         finite = _finite(cloud)
         bad = int(np.argmin(finite))
         raise InvalidRequest(
@@ -255,14 +270,31 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
             f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
             "Remove points without a finite x, y, z.",
         )
-    extent = float((high.astype(np.float64) - low).max())
-    if extent > MAX_EXTENT:
+    return cloud
+
+
+def _near_points(points: NDArray[np.floating]) -> Int64 | None:
+    """Places of the points (N, 3) that are no stray readings far away; None: all of them.
+
+    Raises:
+        InvalidRequest: Most of the cloud has an extent that suggests millimetres.
+    """
+    if max(float(axis.max()) - float(axis.min()) for axis in points.T) <= MAX_EXTENT:
+        return None
+    distance = np.abs(points.astype(np.float64) - np.median(points, axis=0)).max(axis=1)
+    bulk = 2 * float(np.median(distance))
+    if bulk > MAX_EXTENT:
         raise InvalidRequest(
             "cloud",
-            f"an extent of {extent:.4g} m, which suggests millimetres",
+            f"an extent of {bulk:.4g} m, which suggests millimetres",
             "Send metres: divide by 1000.",
         )
-    furthest = float(np.abs([low, high]).max())
+    return np.flatnonzero(distance <= MAX_EXTENT / 2)
+
+
+def _check_place(points: NDArray[np.floating], num_approach_points: int) -> None:
+    """Refuse points (N, 3) too far from the origin, or fewer than approach points."""
+    furthest = max(float(np.abs(axis).max()) for axis in points.T)
     if furthest > MAX_DISTANCE:
         raise InvalidRequest(
             "cloud",
@@ -270,13 +302,12 @@ def validate_cloud(cloud: object, num_approach_points: int = 1) -> Float32:
             "Subtract an origin near the cloud from it and from every position of the request, and "
             "add it to the grasps.",
         )
-    if len(cloud) < num_approach_points:
+    if len(points) < num_approach_points:
         raise InvalidRequest(
             "cloud",
-            f"{len(cloud)} points for num_approach_points = {num_approach_points}",
+            f"{len(points)} points for num_approach_points = {num_approach_points}",
             "Send more points or lower options.num_approach_points.",
         )
-    return np.ascontiguousarray(cloud, dtype=np.float32)
 
 
 def _finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Which points of a cloud lie in the regions of a request."""
+"""Which points of a cloud lie in the regions of a request, or on the objects it asks for."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,9 +7,11 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
     Box,
+    DetectOptions,
     HalfSpace,
     Indices,
     Mask,
+    ObjectChoice,
     OrientedBox,
     Region,
     Rows,
@@ -17,11 +19,14 @@ from edgegrasp_model.options import (
     Shape,
     Sphere,
 )
-from edgegrasp_model.scene.cloud import CheckedCloud, Float32, Voxels
+from edgegrasp_model.scene.cloud import CheckedCloud, Float32, Int64, Voxels
+from edgegrasp_model.scene.things import FIXED
 
 Bools = NDArray[np.bool_]
 
 HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
+NEAR_POINT = 0.1  # metres from a position to the object that it asks for, at most
+NEAR_PIXEL = 0.02  # of the image's width, as far from a pixel
 
 
 def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
@@ -47,6 +52,58 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
             if isinstance(shape, Segments) and cloud.segment_ids is None:
                 fix = f"Send one id for each point beside the cloud: {here} asks for segments."
                 raise InvalidRequest("segment_ids", "nothing", fix)
+
+
+def check_pixel(cloud: CheckedCloud, options: DetectOptions) -> None:
+    """Raise InvalidRequest where `at` is no pixel of the cloud."""
+    if options.at is None:
+        return
+    if cloud.image_size is None:
+        fix = "Send near: x, y, z; or one depth image, or an organised cloud."
+        raise InvalidRequest("options.at", "a pixel of a cloud that is no image", fix)
+    height, width = cloud.image_size
+    if options.at[0] > width - 0.5 or options.at[1] > height - 0.5:
+        value = f"{options.at[0]:g}, {options.at[1]:g} of an image of {width} x {height} pixels"
+        raise InvalidRequest("options.at", value, "Send column, row, counted from 0.")
+
+
+def chosen_objects(
+    number: Int64, cloud: CheckedCloud, options: DetectOptions, warnings: list[str]
+) -> Int64:
+    """The object (N,) of each point of a cloud, where it is asked for; FIXED: it is not.
+
+    Args:
+        number: (N,) the object of each point; negative: of none.
+        cloud: N points.
+        options: objects, at and near.
+        warnings: Gets what is asked for and not there.
+    """
+    found = np.unique(number[number >= 0])
+    wanted, choice = found, options.objects
+    if isinstance(choice, ObjectChoice):
+        if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):
+            here = ", ".join(map(str, found[:10])) or "none"
+            warnings.append(f"objects: no object is numbered {unknown[0]}; there are: {here}.")
+        wanted = found[np.isin(found, choice.include)] if choice.include else found
+        wanted = wanted[~np.isin(wanted, choice.exclude)]
+    for name, target in (("at", options.at), ("near", options.near)):
+        if target is None:
+            continue
+        place: NDArray[np.floating] = cloud.points
+        most = NEAR_POINT
+        if name == "at" and cloud.image_size is not None:
+            width = cloud.image_size[1]
+            place = np.stack([cloud.row % width, cloud.row // width], axis=1)
+            most = max(NEAR_PIXEL * width, 1.0)
+        on = np.flatnonzero(np.isin(number, wanted))
+        distance = np.linalg.norm(place[on] - np.asarray(target), axis=1)
+        if distance.min(initial=np.inf) <= most:
+            wanted = number[on[[distance.argmin()]]]
+        else:
+            wanted = wanted[:0]
+            shown = ", ".join(f"{value:g}" for value in target)
+            warnings.append(f"{name}: no object that grasps may be for is at {shown}.")
+    return np.where((number >= 0) & ~np.isin(number, wanted), FIXED, number)
 
 
 def has_rows(region: Region | None) -> bool:

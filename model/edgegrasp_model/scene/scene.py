@@ -33,7 +33,13 @@ from edgegrasp_model.scene.cloud import (
 )
 from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.obstacles import SolidBoxes
-from edgegrasp_model.scene.regions import check_region, has_rows, inside_region
+from edgegrasp_model.scene.regions import (
+    check_pixel,
+    check_region,
+    chosen_objects,
+    has_rows,
+    inside_region,
+)
 from edgegrasp_model.scene.support import Seen, Support, find_support, measured, raised
 from edgegrasp_model.scene.things import (
     BOX_FLOOR,
@@ -106,6 +112,7 @@ def select_points(
             views do not suit the viewpoints, or there are none to correct depths from.
     """
     viewpoints = camera_positions(sent, options)
+    check_pixel(sent, options)
     for field in ("approach_region", "contact_region"):
         if (region := getattr(options, field)) is not None:
             check_region(region, sent, field)
@@ -122,7 +129,9 @@ def select_points(
     if support is None:
         counts["above_support"] = int(inside.sum())
         number = np.where(inside, _given_numbers(sent), UNKNOWN)
-        return SelectedPoints(sent, number, None, up, viewpoints, _labels(sent, number))
+        labels = _labels(sent, number)
+        number = chosen_objects(number, sent, options, warnings)
+        return SelectedPoints(sent, number, None, up, viewpoints, labels)
     said: list[str] = []
     standing = _standing_on(support, sent, seen, inside, options, said)
     floor = standing.number == BOX_FLOOR
@@ -133,10 +142,11 @@ def select_points(
         standing = _standing_on(support, sent, seen, inside, options, said, walls)
     warnings += said
     counts["above_support"] = int(standing.inside.sum())
-    kept = near_things(standing.plan, standing.number)
     labels = _labels(standing.sent, standing.number)
     labels[standing.on] = SUPPORT
-    near, number = standing.sent.take(kept), standing.number[kept]
+    number = chosen_objects(standing.number, standing.sent, options, warnings)
+    kept = near_things(standing.plan, number)
+    near, number = standing.sent.take(kept), number[kept]
     return SelectedPoints(near, number, support, up, viewpoints, labels)
 
 

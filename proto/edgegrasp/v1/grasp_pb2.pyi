@@ -578,6 +578,8 @@ class DetectOptions(_message.Message):
     UP_FIELD_NUMBER: _builtins.int
     SUPPORT_FIELD_NUMBER: _builtins.int
     OBJECTS_FIELD_NUMBER: _builtins.int
+    AT_FIELD_NUMBER: _builtins.int
+    NEAR_FIELD_NUMBER: _builtins.int
     MAX_OBJECT_SIZE_FIELD_NUMBER: _builtins.int
     WORKSPACE_FIELD_NUMBER: _builtins.int
     APPROACH_REGION_FIELD_NUMBER: _builtins.int
@@ -589,6 +591,7 @@ class DetectOptions(_message.Message):
     SUPPRESSION_FIELD_NUMBER: _builtins.int
     ORDER_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
+    OBJECT_CHOICE_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Weights to use; empty: the server's default."""
     num_approach_points: _builtins.int
@@ -600,9 +603,9 @@ class DetectOptions(_message.Message):
     seed: _builtins.int
     """Seed of every random choice."""
     objects: _builtins.str
-    """Whether grasps are for the things that stand on the support plane only, or for everything; all
-    the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none. One
-    of "auto", "off".
+    """What grasps are for: the things that stand on the support plane, some of them by number, or
+    everything; all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0
+    and less none. One of "auto", "off".
     """
     max_object_size: _builtins.float
     """Longest side of a thing, metres."""
@@ -638,6 +641,14 @@ class DetectOptions(_message.Message):
         """
 
     @_builtins.property
+    def at(self) -> Global___Pixel:
+        """Pixel of the image; grasps are for the object that is seen there."""
+
+    @_builtins.property
+    def near(self) -> Global___Vector:
+        """Position, metres; grasps are for the object next to it, 0.1 m away at most."""
+
+    @_builtins.property
     def workspace(self) -> Global___Workspace:
         """Where grasps may be; points outside stay as obstacles; absent: everywhere."""
 
@@ -661,6 +672,10 @@ class DetectOptions(_message.Message):
     def suppression(self) -> Global___Suppression:
         """Non-maximum suppression; disabled: none."""
 
+    @_builtins.property
+    def object_choice(self) -> Global___ObjectChoice:
+        """`objects` where it is an object in JSON."""
+
     def __init__(
         self,
         *,
@@ -674,6 +689,8 @@ class DetectOptions(_message.Message):
         up: Global___Vector | None = ...,
         support: Global___Support | None = ...,
         objects: _builtins.str | None = ...,
+        at: Global___Pixel | None = ...,
+        near: Global___Vector | None = ...,
         max_object_size: _builtins.float | None = ...,
         workspace: Global___Workspace | None = ...,
         approach_region: Global___Region | None = ...,
@@ -685,10 +702,11 @@ class DetectOptions(_message.Message):
         suppression: Global___Suppression | None = ...,
         order: _builtins.str | None = ...,
         debug: _builtins.bool | None = ...,
+        object_choice: Global___ObjectChoice | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
@@ -930,6 +948,36 @@ class AutoPlane(_message.Message):
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___AutoPlane: _TypeAlias = AutoPlane  # noqa: Y015
+
+@_typing.final
+class ObjectChoice(_message.Message):
+    """Some of the objects that are found, by their numbers in an answer to the same cloud."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    INCLUDE_FIELD_NUMBER: _builtins.int
+    EXCLUDE_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def include(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Numbers of objects; empty: all."""
+
+    @_builtins.property
+    def exclude(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Numbers of objects that are left out."""
+
+    def __init__(
+        self,
+        *,
+        include: _abc.Iterable[_builtins.int] | None = ...,
+        exclude: _abc.Iterable[_builtins.int] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["exclude", b"exclude", "include", b"include"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ObjectChoice: _TypeAlias = ObjectChoice  # noqa: Y015
 
 @_typing.final
 class Workspace(_message.Message):
@@ -1493,11 +1541,35 @@ class Obstacle(_message.Message):
 Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
 
 @_typing.final
-class Vector(_message.Message):
+class Pixel(_message.Message):
     """generated: end options
 
-    x, y, z in the cloud's frame; [x, y, z] in JSON.
+    A place in an image, whose top left pixel has its centre at (0, 0); [column, row] in JSON.
     """
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    COLUMN_FIELD_NUMBER: _builtins.int
+    ROW_FIELD_NUMBER: _builtins.int
+    column: _builtins.float
+    row: _builtins.float
+    def __init__(
+        self,
+        *,
+        column: _builtins.float = ...,
+        row: _builtins.float = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["column", b"column", "row", b"row"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Pixel: _TypeAlias = Pixel  # noqa: Y015
+
+@_typing.final
+class Vector(_message.Message):
+    """x, y, z in the cloud's frame; [x, y, z] in JSON."""
 
     DESCRIPTOR: _descriptor.Descriptor
 

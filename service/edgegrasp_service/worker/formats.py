@@ -21,9 +21,11 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import ValidationError
 
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, invalid_fields
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
 from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
 
 Array = NDArray[Any]
@@ -36,13 +38,15 @@ MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
 
 FIXES = {
     "npy": "Send what numpy.save(file, points) writes, points of shape (N, 3).",
-    "npz": "Send what numpy.savez(file, points=points) writes; beside points may stand "
-    "normals, colors, segment_ids and view_ids.",
+    "npz": "Send what numpy.savez(file, points=points) writes, or depth and intrinsics; beside "
+    "them may stand rgb, or normals, colors, segment_ids and view_ids.",
     "ply": "Send a whole PLY file with vertices of float x, y, z.",
     "pcd": "Send a whole PCD file with the fields x, y and z.",
     "xyz": "Send lines of three numbers: x y z in metres. Normals and colours go into a .ply file.",
 }
 FILE_FORMATS = tuple(FIXES)
+NPZ_CLOUD = {"points", "normals", "colors", "segment_ids", "view_ids"}
+NPZ_IMAGE = {"depth", "intrinsics"}  # of a camera, whose frame is that of the cloud
 
 
 def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
@@ -119,22 +123,39 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
 
 
 def _read_npz(data: bytes, max_points: int) -> CloudInput:
-    """Read points and the arrays beside them, or points alone under any name."""
+    """Read points or a depth image and the arrays beside them, or points alone under any name."""
     if data.count(b"PK\1\2") > MAX_MEMBERS:  # zipfile reads the whole directory
         raise ValueError(f"more than {MAX_MEMBERS} arrays")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         if "points" not in members and len(members) == 1:
             members = {"points": next(iter(members.values()))}
-        foreign = sorted(members.keys() - (CloudInput.__dataclass_fields__.keys() - {"warnings"}))
-        if "points" not in members or foreign:
-            raise ValueError(f"with {', '.join(foreign[:5]) or 'no array points'}")
-        contents = {name: _unzipped(archive, info, max_points) for name, info in members.items()}
+        known = {*NPZ_IMAGE, "rgb"} if members.keys() >= NPZ_IMAGE else {*NPZ_CLOUD, "rgb"}
+        if not members.keys() & {"points", *(known & NPZ_IMAGE)}:
+            raise ValueError(f"with {', '.join(sorted(members)[:5])}, and no array points")
+        contents = {
+            name: _unzipped(archive, info, max_points)
+            for name, info in members.items()
+            if name in known
+        }
     arrays: dict[str, Any] = {
         name: read_npy(content, max_points, "cloud" if name == "points" else name)
         for name, content in contents.items()
     }
-    return CloudInput(**arrays)
+    rgb, unread = arrays.pop("rgb", None), sorted(members.keys() - known)
+    said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
+    if "depth" in arrays:
+        fields = {"intrinsics": np.ravel(arrays["intrinsics"]).tolist()}
+        try:
+            view = CameraView.model_validate(fields)
+        except ValidationError as error:
+            raise invalid_fields(error, fields, "cloud") from None
+        cloud, _ = fuse_depth_images([arrays["depth"]], [view])
+    else:
+        cloud = CloudInput(**arrays)
+    if rgb is not None and cloud.colors is None and rgb.shape == np.asarray(cloud.points).shape:
+        cloud = replace(cloud, colors=rgb)
+    return replace(cloud, warnings=(*cloud.warnings, *said))
 
 
 def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:

@@ -58,8 +58,18 @@ def read_request(job: Job) -> dict[str, Any]:
 
 
 def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
-    """The options that are set."""
-    return {field.name: _field(message, field) for field, _ in message.ListFields()}
+    """The options that are set.
+
+    Raises:
+        InvalidRequest: One is set in two fields.
+    """
+    options = {field.name: _field(message, field) for field, _ in message.ListFields()}
+    if "object_choice" in options:
+        if "objects" in options:
+            value = f"{options['objects']!r} beside object_choice"
+            raise InvalidRequest("options.objects", value, "Send one of the two.")
+        options["objects"] = options.pop("object_choice")
+    return options
 
 
 def write(result: Detection | Scoring) -> bytes:
@@ -192,6 +202,7 @@ def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
 
 # What JSON writes in another way than field by field.
 _FORMS: dict[type[Message], Callable[[Any], Any]] = {
+    grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,
     grasp_pb2.HandBox: _corners,

@@ -137,7 +137,6 @@ def test_too_many_points(name: str) -> None:
     [
         (npz(a=POINTS, b=POINTS), "a, b"),
         (npz(), "no array points"),
-        (npz(points=POINTS, colours=POINTS), "colours"),
     ],
 )
 def test_an_archive_must_say_which_array(data: bytes, value: str) -> None:
@@ -223,6 +222,21 @@ def test_a_png_of_huge_size_is_not_unpacked() -> None:
         read_png(bytes(small), MANY, "depth")
     assert tracemalloc.get_traced_memory()[1] < MIB
     tracemalloc.stop()
+
+
+def test_an_archive_of_a_depth_image_and_what_is_not_read() -> None:
+    depth, rgb = np.full((4, 6), 500, np.uint16), np.zeros((4, 6, 3), np.uint8)
+    matrix = np.array([[6.0, 0, 2.5], [0, 6.0, 1.5], [0, 0, 1]])
+    for intrinsics in (matrix, np.array([6.0, 6.0, 2.5, 1.5])):
+        data = npz(depth=depth, intrinsics=intrinsics, rgb=rgb, labels=depth)
+        cloud = read_file("npz", data, MANY)
+        assert np.shape(cloud.points) == np.shape(cloud.colors) == (4, 6, 3)
+        np.testing.assert_allclose(cloud.points[1, 2], [-0.5 / 12, -0.5 / 12, 0.5], atol=1e-6)
+        assert cloud.warnings == ("arrays of the file that are not read: labels.",)
+    (told,) = read_file("npz", npz(points=POINTS, colours=POINTS), MANY).warnings
+    assert "colours" in told
+    with pytest.raises(InvalidRequest, match=r"cloud\.intrinsics"):
+        read_file("npz", npz(depth=depth, intrinsics=np.ones(3)), MANY)
 
 
 def test_what_stands_beside_points_in_an_npz_file() -> None:

@@ -37,7 +37,8 @@ def test_requests() -> None:
         body, form = (SCHEMAS[f"{kind}{what}"]["properties"] for what in ("Request", "Form"))
         assert set(body) == set(names) - {"encoded"}
         assert set(form) == set(names) - {"encoded", "points"} | {"cloud", *request_cloud.CAMERA}
-    assert list(SCHEMAS["DetectOptions"]["properties"]) == fields("DetectOptions")
+    in_grpc = [*SCHEMAS["DetectOptions"]["properties"], "object_choice"]  # `objects` as an object
+    assert in_grpc == fields("DetectOptions")
     for method, names in ((client.GraspClient.detect, detect), (client.GraspClient.score, score)):
         ours = set(inspect.signature(method).parameters) - {"self", "timeout"}
         assert ours == set(names) - {"points", "encoded", "point_cloud2"} | {"cloud"}
