@@ -23,7 +23,7 @@ help: ## list the targets
 venv: $(INSTALLED) ## make .venv with what demo and test need, and the system libraries
 
 $(INSTALLED): EXTRA := dev
-$(TO_LOOK): EXTRA := service
+$(TO_LOOK): EXTRA := service,view
 $(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.sh
 	scripts/system_packages.sh $(PYTHON)
 	$(PYTHON) -m venv $(VENV)

@@ -1,5 +1,6 @@
 """The commands that ask a detector, on a server or in this process: detect and models."""
 
+import importlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -85,6 +86,8 @@ def detect(
     """
     from rich.console import Console
 
+    if picture is not None:
+        importlib.import_module("matplotlib")  # fails before the work, not after it
     fields = _options(options_file, options)
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]

@@ -15,7 +15,7 @@ except ModuleNotFoundError:
 # Command: its module, the extra it needs, one-line help. `generate-data` is generate_data().
 COMMANDS = {
     "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
-    "detect": ("detect", "service", "Find grasps in a cloud or a depth image."),
+    "detect": ("detect", "service,view", "Find grasps in a cloud or a depth image."),
     "view": ("view", "service", "Look at a scene and its grasps in the browser."),
     "models": ("detect", "service", "List the weights that can be used."),
     "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),

@@ -64,6 +64,7 @@ def test_unknown_command() -> None:
         ("edgegrasp_client", ["models", "--server", "127.0.0.1:1"], "service"),
         ("edgegrasp_sim.replay", ["replay", "attempt", "FOLDER"], "service,sim"),
         ("edgegrasp_cli.serve", ["serve"], "service"),
+        ("matplotlib", ["detect", "absent.ply", "--picture", "grasps.png"], "service,view"),
     ],
 )
 def test_a_missing_package_names_the_extra(missing, words, extra, refused, monkeypatch) -> None:

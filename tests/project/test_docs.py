@@ -39,7 +39,7 @@ COMPILED = ("Tls(", *(f"import {name}" for name in ABSENT), *(f"from {name}" for
 ELSEWHERE = {"integrations.md"}
 # Commands of other programs, which change the machine or need what it has not.
 OTHERS = {".", "apt-get", "cd", "colcon", "docker", "git", "ln", "openssl", "pip", "ray", "rosdep"}
-OTHERS |= {"ros2", "serve"}
+OTHERS |= {"python3", "ros2", "serve"}
 DIAGRAMS = {"architecture.md"}  # pages with blocks of no language
 
 
@@ -97,6 +97,7 @@ def test_tables_that_a_script_writes_are_up_to_date() -> None:
 
 def test_the_python_of_the_pages_runs(dummy_server, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
+    write_what_commands_read(tmp_path)
     depth = np.random.default_rng(0).integers(500, 600, (24, 32)).astype(np.uint16)
     points = depth[..., None] * np.full(3, 0.001, np.float32)
     np.save("scene.npy", points.reshape(-1, 3))
@@ -158,11 +159,7 @@ def test_the_commands_of_the_pages_exist_and_have_their_flags(monkeypatch) -> No
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_the_requests_by_curl_are_answered(dummy_server, tmp_path: Path) -> None:
-    (tmp_path / "demo_output").mkdir()
-    rows = "".join(f"{x} {y} 0.5\n" for x in range(20) for y in range(20))
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex 400\n{axes}end_header\n"
-    (tmp_path / "demo_output" / "scene.ply").write_text(head + rows)
+    write_what_commands_read(tmp_path)
     Image.fromarray(np.full((480, 640), 600, np.uint16)).save(tmp_path / "depth.png")
     (tmp_path / "tokens").write_text("0123456789abcdef")
     lines = {
@@ -177,6 +174,37 @@ def test_the_requests_by_curl_are_answered(dummy_server, tmp_path: Path) -> None
         done = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True)
         answer = json.loads(done.stdout)
         assert {"grasps", "models"} & answer.keys(), line + done.stdout + done.stderr
+
+
+def write_what_commands_read(folder: Path) -> None:
+    """The files of a checkout in which `make demo` was run, as far as the pages name them."""
+    (folder / "examples").symlink_to(ROOT / "examples")
+    (folder / "demo_output").mkdir()
+    rows = "".join(f"{x} {y} 0.5\n" for x in range(20) for y in range(20))
+    axes = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 400\n{axes}end_header\n"
+    (folder / "demo_output" / "scene.ply").write_text(head + rows)
+
+
+def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> None:
+    write_what_commands_read(tmp_path)
+    detected = set()
+    for page, words in commands():
+        told = " ".join(words)
+        if page not in ("README.md", "index.md") or told in detected:
+            continue
+        assert not re.search(r"\b[A-Z_]{4,}\b|~/", told), f"{page}: {told} has a placeholder"
+        for file in re.findall(r"(?<!picture )(?<![\w/])[\w/]+\.(?:png|ply|npz|npy)", told):
+            assert (tmp_path / file).exists(), f"{page}: nobody has {file}"
+        if words[:2] == ["edgegrasp", "detect"]:
+            program = "from edgegrasp_cli.main import main; main()"
+            command = [sys.executable, "-P", "-c", program, *words[1:]]
+            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr
+            with Image.open(tmp_path / words[words.index("--picture") + 1]) as picture:
+                assert min(picture.size) > 300
+            detected.add(told)
+    assert detected
 
 
 def test_other_blocks_can_be_read() -> None:
