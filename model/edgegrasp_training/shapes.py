@@ -1,8 +1,7 @@
-"""Training objects of many shapes: those of a set stretched, and computed ones among them.
+"""Training objects of many shapes: objects of a set stretched, computed ones, household objects.
 
-A computed object is a hollow one (`HOLLOW`) or drawn at random (`drawn_shape`). The engine takes
-the convex hull of its surface, as of scanned objects: many have hollows that a camera sees into
-but nothing can enter.
+Of a computed object (`drawn_shape`) the engine takes the convex hull, as of scanned objects: many
+have hollows that a camera sees into but nothing can enter. Household objects are truly hollow.
 """
 
 from dataclasses import replace
@@ -31,7 +30,6 @@ TRAINING_BLOBS = (100, 1000)  # their numbers; the built-in object sets have low
 BLOB_SCALE = (0.6, 1.1)
 SYMMETRIC_SHARE = 0.5  # of the objects, stretched by one factor along x and y
 NUM_VARIED = 16  # objects that a scene is drawn from
-HOLLOW_SHARE = 0.25  # of the computed objects; the others are drawn at random
 
 NUM_FREE, NUM_PLAIN = 320, 160
 NUM_DRAWN = NUM_FREE + NUM_PLAIN  # different shapes, before a scene stretches them
@@ -40,10 +38,7 @@ LONGEST = 0.045, 0.12  # metres, range of the greatest extent
 THINNEST = 0.009  # metres, least extent
 PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
 
-SEGMENTS = 24  # of a surface of revolution, around its axis
-AXIS = 1e-4  # metres; profiles keep off the axis, where triangles would have no area
 Rings = NDArray[np.float64]  # (R, S, 3) corners of each ring along a part, any unit
-Profile = NDArray[np.float64]  # (P, 2) radius and height, metres; closed, counter-clockwise
 
 
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
@@ -130,8 +125,7 @@ def _is_shifted(shape: Element) -> bool:
 
 def any_made_object(folder: Path, rng: np.random.Generator) -> ObjectModel:
     """Draw a computed object and write it into a folder."""
-    names = HOLLOW_NAMES if rng.random() < HOLLOW_SHARE else DRAWN_NAMES
-    return made_object(names[int(rng.integers(len(names)))], folder)
+    return made_object(DRAWN_NAMES[int(rng.integers(NUM_DRAWN))], folder)
 
 
 def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
@@ -140,12 +134,8 @@ def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
 
 
 def made_object(name: str, folder: Path) -> ObjectModel:
-    """Write a computed object into a folder.
-
-    One of HOLLOW_NAMES or DRAWN_NAMES.
-    """
-    surface = revolved(HOLLOW[name]) if name in HOLLOW else drawn_shape(DRAWN_NAMES.index(name))
-    return ObjectModel(name, write_object(name, surface, folder))
+    """Write a computed object, one of DRAWN_NAMES, into a folder."""
+    return ObjectModel(name, write_object(name, drawn_shape(DRAWN_NAMES.index(name)), folder))
 
 
 def drawn_shape(index: int) -> str:
@@ -163,23 +153,6 @@ def drawn_shape(index: int) -> str:
     extents = np.ptp(np.concatenate([part.reshape(-1, 3) for part in parts]), axis=0)
     scale = rng.uniform(*LONGEST) / extents.max()
     return as_obj(_surface(part * np.maximum(scale, THINNEST / extents)) for part in parts)
-
-
-def revolved(profile: Profile) -> str:
-    """The surface of revolution of a closed profile about z, as an OBJ file."""
-    angle = 2.0 * np.pi / SEGMENTS * np.arange(SEGMENTS)
-    turn = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    ring = profile[:, None, :1] * turn  # (P, S, 2)
-    height = np.broadcast_to(profile[:, None, 1:], (len(profile), SEGMENTS, 1))
-    points = np.concatenate([ring, height], axis=2).reshape(-1, 3)
-    faces = []
-    for row in range(len(profile)):
-        this, following = row * SEGMENTS, (row + 1) % len(profile) * SEGMENTS
-        for k in range(SEGMENTS):
-            beside = (k + 1) % SEGMENTS
-            a, b, c, d = this + k, this + beside, following + beside, following + k
-            faces += [(a, b, c), (a, c, d)]
-    return as_obj([(points, np.array(faces))])
 
 
 def _surface(rings: Rings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -321,54 +294,4 @@ def _bent(
     return np.stack([*across, thick[:, None] * ring[:, 1]], axis=2)
 
 
-def _torus(radius: float, tube: float) -> Profile:
-    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    return np.stack([radius + tube * np.cos(angle), tube * np.sin(angle)], axis=1)
-
-
-def _tube(outer: float, inner: float, height: float) -> Profile:
-    return np.array([[inner, 0.0], [outer, 0.0], [outer, height], [inner, height]])
-
-
-def _bowl(radius: float, depth: float, wall: float) -> Profile:
-    angle = np.linspace(0.0, np.pi / 2, 8)
-    outside = np.stack([radius * np.sin(angle), depth * (1.0 - np.cos(angle))], axis=1)
-    inside = np.array([radius - wall, depth - wall]) * np.stack([np.sin(angle), -np.cos(angle)], 1)
-    inside[:, 1] += depth
-    profile: Profile = np.concatenate([outside, inside[::-1]])
-    profile[:, 0] = np.maximum(profile[:, 0], AXIS)
-    return profile
-
-
-def _cup(bottom: float, top: float, height: float, wall: float) -> Profile:
-    return np.array(
-        [
-            [AXIS, 0.0],
-            [bottom, 0.0],
-            [top, height],
-            [top - wall, height],
-            [bottom - wall, wall],
-            [AXIS, wall],
-        ]
-    )
-
-
-# Metres; a scene's own scale, and a stretch along each axis, come on top.
-HOLLOW: dict[str, Profile] = {
-    "made-torus-slim": _torus(0.030, 0.006),
-    "made-torus": _torus(0.026, 0.010),
-    "made-torus-thick": _torus(0.024, 0.014),
-    "made-torus-large": _torus(0.034, 0.011),
-    "made-ring-flat": _tube(0.035, 0.020, 0.010),
-    "made-ring": _tube(0.033, 0.022, 0.020),
-    "made-ring-narrow": _tube(0.024, 0.010, 0.016),
-    "made-tube": _tube(0.020, 0.015, 0.060),
-    "made-tube-wide": _tube(0.030, 0.025, 0.045),
-    "made-bowl": _bowl(0.038, 0.030, 0.004),
-    "made-bowl-flat": _bowl(0.042, 0.018, 0.004),
-    "made-bowl-deep": _bowl(0.030, 0.038, 0.005),
-    "made-cup": _cup(0.020, 0.028, 0.060, 0.003),
-    "made-cup-low": _cup(0.028, 0.034, 0.035, 0.004),
-}
-HOLLOW_NAMES = tuple(HOLLOW)
 DRAWN_NAMES = tuple(f"made-drawn-{index:03d}" for index in range(NUM_DRAWN))

@@ -10,7 +10,7 @@ from edgegrasp_sim.objects import SceneKind, blob
 from edgegrasp_training.examples import tried_grasps
 from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
 from edgegrasp_training.household import FAMILIES
-from edgegrasp_training.shapes import made_object
+from edgegrasp_training.shapes import DRAWN_NAMES, made_object
 from edgegrasp_training.views import find_views, load_view
 
 SMALL = GenerationOptions(scenes=4, views_per_scene=1, grasps_per_view=8, seed=5)
@@ -104,7 +104,7 @@ def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
 
 def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) -> None:
     train = tmp_path / "objects" / "pile" / "train"
-    plain = ("made-bowl", "made-ring-flat", "made-tube")
+    plain = DRAWN_NAMES[:3]
     models = {name: made_object(name, train) for name in plain}
     (tmp_path / "objects" / "packed").symlink_to(tmp_path / "objects" / "pile")
     options = GenerationOptions(2, 1, 4, seed=2, kind=SceneKind.PILE)
