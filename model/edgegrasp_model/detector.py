@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from edgegrasp_model.candidates.collision import clearances, required_openings
+from edgegrasp_model.candidates.collision import clearances
 from edgegrasp_model.candidates.sample import Sample, sample_candidates
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
@@ -81,7 +81,6 @@ class Prepared:
     scene: Scene | None = None
     further: Generator[Sample, Int64 | None, None] | None = None  # where the sample is not enough
     sample: Sample | None = None  # E candidates
-    width: Float32 | None = None  # (E,) metres
     batch: Batch | None = None  # the candidates that were sampled last; None where there are none
     counts: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -219,20 +218,18 @@ class GraspDetector:
 
     def finish(self, prepared: Prepared, logits: NDArray[np.floating]) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
-        scene, sample, width = prepared.scene, prepared.sample, prepared.width
+        scene, sample = prepared.scene, prepared.sample
         counts, options, gripper = prepared.counts, prepared.options, prepared.gripper
         grasps, debug = [], None
         with prepared.timed("ranking"):
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
             if sample is not None and len(sample.candidates) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
-            if scene is not None and sample is not None and width is not None:
+            if scene is not None and sample is not None and len(logits):
                 rows, outcome = select(scene, sample, score, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)
-                grasps = grasps_in_cloud(
-                    scene, best, gripper, score[rows], width[rows], free, clear
-                )
+                grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
             if options.debug and scene is not None and prepared.selected is not None:
                 labels = prepared.selected.labels
                 debug = debug_info(scene, sample, score, outcome, labels)
@@ -385,9 +382,6 @@ class GraspDetector:
         if len(sample.candidates):
             with prepared.timed("description"):
                 view = hand_views(scene.cloud, sample.candidates.T_cloud_hand, reach_of(gripper))
-                width = required_openings(view, gripper)
-                earlier = width[:0] if prepared.width is None else prepared.width
-                prepared.width = np.concatenate([earlier, width])
                 prepared.batch = self._batch(scene, sample, view, gripper)
         return True
 

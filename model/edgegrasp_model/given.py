@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from edgegrasp_model.candidates.collision import clearances, collides, required_openings
+from edgegrasp_model.candidates.collision import clearances, collides
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
@@ -80,7 +80,6 @@ def evaluate(
         candidates,
         gripper,
         score,
-        required_openings(view, gripper),
         ~collides(scene, given.candidates.T_cloud_hand, gripper, request),
         clearances(scene, hands, gripper),
     )

@@ -8,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.collision import clearances
+from edgegrasp_model.candidates.collision import clearances, met_first, required_openings
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.hand_view import hand_views, reach_of, seen_part
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import DebugInfo, DetectedObject, FoundSupport, Grasp, Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
 from edgegrasp_model.scene.things import smallest_rectangle
+from edgegrasp_model.unseen import DepthMap, unseen_space
 
 Int64 = NDArray[np.int64]
 Float32 = NDArray[np.float32]
@@ -26,6 +28,7 @@ Float32 = NDArray[np.float32]
 COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
 GOOD_SCORE = 0.5  # from which an object has a grasp to offer
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
+HIDDEN = 0.004  # metres of unseen space from which on an object may go on there
 OUTCOMES = list(Outcome)
 
 
@@ -120,13 +123,13 @@ def grasps_in_cloud(
     candidates: Candidates,
     gripper: Gripper,
     score: NDArray[np.floating],
-    width: Float32,
     collision_free: NDArray[np.bool_],
     clearance: Float32,
 ) -> list[Grasp]:
     """Candidates E, all arrays (E,), as grasps in the frame of the cloud."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
+    width = openings(scene, candidates.T_cloud_hand, gripper)
     number = scene.object_of_point[candidates.contact_index]
     return [
         Grasp(
@@ -143,6 +146,21 @@ def grasps_in_cloud(
         )
         for row in range(len(candidates))
     ]
+
+
+def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
+    """Opening (E,) to approach with, metres: what is seen between the fingers, and some clearance.
+
+    The gripper's maximum where the camera did not see on which side of a finger the object ends.
+    """
+    met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
+    width = required_openings(met, gripper)
+    if scene.viewpoint is None or len(T_cloud_hand) == 0:
+        return width
+    depth = DepthMap.of_cloud(scene.cloud.points, scene.viewpoint, UP)
+    beyond = unseen_space(depth, T_cloud_hand, met, seen_part(gripper)).beyond
+    hidden = np.maximum(*beyond) > HIDDEN
+    return np.where(hidden, np.float32(gripper.max_opening), width)
 
 
 def found_support(support: Support | None) -> FoundSupport | None:

@@ -45,7 +45,7 @@ class Grasp:
     score: float  # probability that the grasp holds
     T_cloud_hand: Float32  # (4, 4) hand link frame: z out of the palm, y the closing direction
     T_cloud_tcp: Float32  # (4, 4) tool centre point, same axes
-    width: float  # opening to command before closing, metres
+    width: float  # metres to open to before the approach; the maximum where an end is hidden
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand

@@ -187,18 +187,30 @@ def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -
     return hit
 
 
-def required_openings(view: HandView, gripper: Gripper) -> NDArray[np.float32]:
+def required_openings(met: Float32, gripper: Gripper) -> Float32:
     """Opening that clears what lies between the fingers, with FINGER_CLEARANCE on each side.
+
+    Args:
+        met: (E, 2) as `met_first` returns it.
+        gripper: The hand.
 
     Returns:
         (E,) metres, at most the gripper's maximum.
     """
+    widest = 2 * (np.abs(met).max(axis=1) + np.float32(FINGER_CLEARANCE))
+    width: Float32 = np.minimum(widest, np.float32(gripper.max_opening))
+    return width
+
+
+def met_first(view: HandView, gripper: Gripper) -> Float32:
+    """Greatest and least y (E, 2) of what lies between the open fingers; 0 where nothing does."""
     half = gripper.pad_half_width
     x, y, z = view.columns
     inner = gripper.max_opening / 2
     ahead = (z > gripper.palm_z) & (z < gripper.max_tip_z)
     between = (np.abs(x) < half) & (np.abs(y) < inner) & ahead
-    reach = np.zeros(view.num_candidates, dtype=np.float32)
-    np.maximum.at(reach, view.candidate[between], np.abs(y[between]))
-    width: NDArray[np.float32] = np.minimum(2 * (reach + FINGER_CLEARANCE), gripper.max_opening)
-    return width
+    hand, place = view.candidate[between], y[between]
+    met = np.full((view.num_candidates, 2), (-np.inf, np.inf), dtype=np.float32)
+    np.maximum.at(met[:, 0], hand, place)
+    np.minimum.at(met[:, 1], hand, place)
+    return np.where(np.isfinite(met), met, np.float32(0.0))
