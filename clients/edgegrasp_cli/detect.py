@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
 
 Option = typer.Option
+PICTURES = (".png", ".jpg", ".jpeg")
 DRAWN = 10  # grasps in a picture
 DRAWN_AROUND = 0.4  # metres from the grasps: what a picture of a cloud shows
 
@@ -83,11 +84,15 @@ def detect(
     """Find grasps in a point cloud file or a depth image, by a server or in this process.
 
     Options are written as in query parameters of the HTTP API: numbers, words, x,y,z, or JSON.
+
+    edgegrasp detect cloud.ply --viewpoint 0,0,0 --picture grasps.png
+
+    edgegrasp detect --depth depth.png --intrinsics 615,615,320,240 --at 310,250
     """
     from rich.console import Console
 
     if picture is not None:
-        importlib.import_module("matplotlib")  # fails before the work, not after it
+        _check_picture(picture)
     fields = _options(options_file, options)
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
@@ -117,12 +122,13 @@ def models(
     connection: dict[str, Any],
 ) -> None:
     """List the weights that can be used, here or on a server."""
+    from rich import box
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
-    table = Table(
-        "model", "architecture", "parameters", "crop radius (m)", "gripper", "device", "digest"
-    )
+    name = Column("model", no_wrap=True)
+    architecture = Column("architecture", no_wrap=True)
+    table = Table(name, architecture, "parameters", "gripper", "device", box=box.SIMPLE)
     waiting = Console(stderr=True).status("Loading weights…")
     with waiting, open_client(server, timeout, connection, weights) as client:
         found = client.models()
@@ -131,10 +137,8 @@ def models(
             f"{row.name} (default)" if row.default else row.name,
             row.architecture,
             f"{row.parameters:,}",
-            f"{row.crop_radius:g}",
             row.gripper,
             row.device,
-            row.digest[:12],
         )
     Console().print(table)
 
@@ -210,14 +214,13 @@ def draw(
 ) -> None:
     """Write a picture of a request and the best of its grasps.
 
-    A camera's one image is drawn as that camera saw it, in its colours where they are given; a
-    cloud from its viewpoint, or from above at a slant.
+    What is organised as a camera's image is drawn as that camera saw it, in its colours where they
+    are given; another cloud from its viewpoint, or from above at a slant.
 
     The request is given as for `decode`.
     """
     import numpy as np
 
-    from edgegrasp_client.clouds import depth_image_fields
     from edgegrasp_sim.picture import Picture, View
 
     sent, parsed = decode(cloud, depth_images, colors, options)
@@ -226,10 +229,8 @@ def draw(
     if shades is not None and shades.dtype.kind == "f":
         shades = 255 * shades
     shown, image = detection.grasps[:DRAWN], None
-    if depth_images is not None and len(depth_images) == 1:
-        camera = depth_image_fields(depth_images[0], 0)
-        pose = np.asarray(camera["T_cloud_camera"])
-        view = View(shape[:2], **camera["intrinsics"], T_cloud_camera=pose)
+    view = View.of_image(np.asarray(sent.points)) if len(shape) == 3 else None
+    if view is not None:
         image = None if shades is None else shades.reshape(shape).astype(np.uint8)
     else:
         seen = points[np.isfinite(points).all(axis=1)]
@@ -244,6 +245,15 @@ def draw(
     picture.regions(options)
     picture.grasps(shown, (detection.gripper.palm_z, detection.gripper.tip_z))
     picture.save(path)
+
+
+def _check_picture(path: Path) -> None:
+    """Raise ValueError, before any work, where a picture could not be written."""
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"--picture: there is no folder {path.parent}. Make it first.")
+    importlib.import_module("matplotlib")  # fails before the work, not after it
 
 
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:

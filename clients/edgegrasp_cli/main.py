@@ -4,7 +4,7 @@ import functools
 import importlib
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 try:
     import typer
@@ -85,14 +85,39 @@ def _missing(name: str, error: ModuleNotFoundError) -> str:
     return f"edgegrasp {name}: {error}. pip install 'edgegrasp[{extra}]'"
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(f"edgegrasp {version('edgegrasp')}")
+        raise typer.Exit
+
+
+def _common(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the version, and stop.",
+        ),
+    ] = False,
+) -> None:
+    """Nothing but the flags of the program itself."""
+
+
 def _program() -> typer.Typer:
+    help_text = "Grasp detection as a service: point clouds in, scored 6-DoF grasps out."
     program = typer.Typer(
         cls=LazyGroup,
-        help="Grasp detection as a service: point clouds in, scored 6-DoF grasps out.",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        epilog="edgegrasp view    edgegrasp detect cloud.ply --picture grasps.png    "
+        "edgegrasp COMMAND -h",
     )
+    program.callback(help=help_text)(_common)
     for name, (_, _, text) in COMMANDS.items():
         program.command(name, help=text, cls=TyperCommand)(lambda: None)
     return program

@@ -300,7 +300,12 @@ class _GrpcTransport:
     async def ready(self, timeout: float) -> bool:
         try:
             return bool(await self._check(b"", timeout=timeout) == grpc_wire.SERVING)
-        except grpc.RpcError:
+        except grpc.RpcError as error:
+            if error.code() != grpc.StatusCode.UNIMPLEMENTED:
+                return False
+        try:  # a server without gRPC's health service, such as Ray's, answers a request or not
+            return bool(await self.models(timeout))
+        except GraspClientError:
             return False
 
     async def close(self) -> None:

@@ -77,6 +77,22 @@ class View:
         middle = columns / 2 - focal * (left + right) / 2, rows / 2 - focal * (top + bottom) / 2
         return cls(SIZE, focal, focal, *middle, T)
 
+    @classmethod
+    def of_image(cls, points: NDArray[np.floating]) -> Self | None:
+        """The camera at the origin that saw an organised cloud (H, W, 3); None: none did."""
+        rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] != 0))
+        if len(np.unique(rows)) < 2 or len(np.unique(columns)) < 2:
+            return None
+        x, y, z = points[rows, columns].T.astype(np.float64)
+        numbers, worst = [], 0.0
+        for slope, pixel in ((x / z, columns), (y / z, rows)):
+            system = np.stack([slope, np.ones_like(slope)], axis=1)
+            (focal, middle), *_ = np.linalg.lstsq(system, pixel)
+            worst = max(worst, float(np.abs(system @ (focal, middle) - pixel).max()))
+            numbers += [float(focal), float(middle)]
+        fx, cx, fy, cy = numbers
+        return cls((points.shape[0], points.shape[1]), fx, fy, cx, cy) if worst < 1.0 else None
+
     def project(self, points: ArrayLike) -> tuple[Points, Points]:
         """Columns and rows (..., 2), and distances along the line of sight (...), metres."""
         turn, position = self.T_cloud_camera[:3, :3], self.T_cloud_camera[:3, 3]

@@ -76,7 +76,12 @@ class InvalidSettings(ServiceError):  # noqa: N818
 
 
 class AddressInUse(ServiceError):  # noqa: N818
-    """A port cannot be bound."""
+    """A port or socket cannot be bound."""
+
+    def __init__(self, transport: str, place: str, why: str) -> None:
+        fix = "Stop what listens there, or name another"
+        flag = f"--{transport.lower()}-port" if ":" in place else "--host"
+        super().__init__(f"{transport}: cannot listen on {place} ({why}). {fix}: {flag}.")
 
 
 # Names of gRPC codes, and HTTP statuses.

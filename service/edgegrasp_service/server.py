@@ -263,7 +263,7 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         listening = socket.create_server(address, family=family, backlog=BACKLOG)
     except OSError as error:
-        raise AddressInUse(f"HTTP: cannot listen on {place} ({error.strerror})") from None
+        raise AddressInUse("HTTP", place, str(error.strerror)) from None
     if family != socket.AF_UNIX:
         # Connections inherit it; asyncio sets it on its own sockets only. Answers waited for 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

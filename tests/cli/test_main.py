@@ -1,5 +1,6 @@
 """The program as a whole: its help, and what it says where something is missing."""
 
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -50,6 +51,20 @@ def test_help_of_a_command_loads_nothing_heavy(name: str) -> None:
     shown, loaded = loaded_by(name, "--help")
     assert name in shown
     assert not loaded & HEAVY
+
+
+def test_version_short_help_and_completion() -> None:
+    assert loaded_by("--version")[0] == f"edgegrasp {importlib.metadata.version('edgegrasp')}\n"
+    for words in (["-h"], ["detect", "-h"]):
+        shown = CliRunner().invoke(main.app, words)
+        assert shown.exit_code == 0
+        assert "edgegrasp detect cloud.ply" in " ".join(shown.output.split())
+    script = CliRunner().invoke(main.app, ["--show-completion", "bash"])
+    assert script.exit_code == 0, script.output
+    asked = {"COMP_WORDS": "edgegrasp detect --viewp", "COMP_CWORD": "2"}
+    asked |= {"_EDGEGRASP_COMPLETE": "complete_bash"}
+    done = CliRunner().invoke(main.app, [], prog_name="edgegrasp", env=asked)
+    assert "--viewpoint" in done.output.split()
 
 
 def test_unknown_command() -> None:

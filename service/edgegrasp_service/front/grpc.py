@@ -118,7 +118,7 @@ class GrpcServer:
             else:
                 port = self._server.add_secure_port(place, credentials)
         except RuntimeError as error:
-            raise AddressInUse(f"gRPC: cannot listen on {place} ({error})") from None
+            raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
 
     async def start(self) -> None:
