@@ -2,8 +2,8 @@
 
 Invariant under rotations, translations and reflections of the whole scene by construction: how
 many points the hand would hit, what lies between its fingers, from where it was seen, how the hand
-stands to gravity and support, how much of the space around it the camera did not see, and which
-hand it is.
+stands to gravity and support, how much of the space around it the camera did not see, which hand
+it is, and how far the object is seen to extend around it.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from edgegrasp_model.hand_view import (
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.unseen import DepthMap, unseen_space
+from edgegrasp_model.unseen import DepthMap, unseen_space, visible_extents
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -35,7 +35,7 @@ SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
 GAP = 0.007  # metres without a point in which what is between the fingers ends
-HAND_DESCRIPTION_SIZE = 76
+HAND_DESCRIPTION_SIZE = 87
 HEIGHTS = slice(58, 61)  # of them: heights over the support plane
 
 
@@ -48,6 +48,8 @@ def describe_hands(
     viewpoint: Float32 | None = None,
     at_side: NDArray[np.bool_] | None = None,
     view: HandView | None = None,
+    object_of_point: Int64 | None = None,
+    size: int = HAND_DESCRIPTION_SIZE,
 ) -> Float32:
     """The hand-frame description of each candidate.
 
@@ -64,9 +66,12 @@ def describe_hands(
         at_side: (N,) points where a side of the workspace cuts things off: what is between the
             fingers there may be wider than it seems. None: nowhere.
         view: `hand_views` of the same candidates, where the caller has it already.
+        object_of_point: (N,) the object that each point belongs to; None: all to one.
+        size: How many numbers are read. The extents, the last ones, are left out if none is.
 
     Returns:
-        (E, HAND_DESCRIPTION_SIZE) counts (logarithm of 1 + n), metres and cosines.
+        (E, HAND_DESCRIPTION_SIZE), or without the extents: counts (logarithm of 1 + n), metres
+        and cosines.
     """
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
@@ -94,6 +99,10 @@ def describe_hands(
         *seen.runs.T,
         *np.tile(_measures(gripper), (len(candidates), 1)).T,
     ]
+    if size > len(columns):
+        hands = candidates.T_cloud_hand, side
+        of_object = cloud.points, object_of_point, candidates.contact_index
+        columns += [*visible_extents(*of_object, *hands, ends, up).T]
     return np.stack(columns, axis=1).astype(np.float32)
 
 

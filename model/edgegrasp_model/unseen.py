@@ -1,4 +1,4 @@
-"""What the one camera did not see of the space in and around a hand."""
+"""What the one camera did not see around a hand, and how far what it saw of an object extends."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -13,6 +13,7 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import Corner
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
@@ -26,6 +27,9 @@ NOTHING = np.float32(np.inf)
 STEEP = 1e-3  # sine of the angle to up below which up says nothing about the map
 HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
 FARTHEST = 10 * HALF  # stands for everything farther away
+NUM_EXTENTS = 11
+EXTENT_POINTS = 256  # of an object, at most, that its extents are measured with
+FARTHEST_EXTENT = 0.25  # metres; what goes on farther is no different
 
 
 class UnseenSpace(NamedTuple):
@@ -141,6 +145,95 @@ def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:
     """All points with these coordinates.  # (X * Y * Z, 3)."""
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     return grid.astype(np.float32)
+
+
+def visible_extents(
+    points: Float32,
+    number: Int64 | None,
+    contact_index: Int64,
+    T_cloud_hand: Float32,
+    side: Float32,
+    gripper: Gripper,
+    up: Float32,
+) -> Float32:
+    """How large the object between the fingers looks, and how far it goes on beyond them.
+
+    Args:
+        points: (N, 3).
+        number: (N,) the object that each point belongs to; None: all to one.
+        contact_index: (E,) rows of `points`: the object of that point is measured.
+        T_cloud_hand: (E, 4, 4) hands.
+        side: (E,) 1 or -1, what x is multiplied by.
+        gripper: Fingers open to its maximum.
+        up: (3,) away from gravity.
+
+    Returns:
+        (E, NUM_EXTENTS) metres: beyond the inner face of each finger along the closing line,
+        first of the whole object, then of what is as wide as three pads and not behind the palm;
+        along x and along -x; ahead of the fingertips and behind the palm; the object's length,
+        width and height, the first two from the spread of its points.
+    """
+    number = np.zeros(len(points), dtype=np.int64) if number is None else number
+    labels, groups = np.unique(number[contact_index], return_inverse=True)
+    parts, sizes = [], np.zeros((len(labels), 3), dtype=np.float32)
+    for row, label in enumerate(labels):
+        part = points[number == label]
+        part = part[:: -(-len(part) // EXTENT_POINTS)]
+        parts.append(part)
+        sizes[row] = _size(part.astype(np.float64), np.asarray(up, dtype=np.float64))
+    extents = np.zeros((len(T_cloud_hand), NUM_EXTENTS), dtype=np.float32)
+    if len(labels) == 0:
+        return extents
+    bounds = np.cumsum([0, *map(len, parts)])
+    inner, half = gripper.max_opening / 2, 3 * gripper.pad_half_width
+    limits = np.array([inner, half, gripper.palm_z, gripper.tip_z], dtype=np.float32)
+    group = groups.reshape(-1).astype(np.int64)
+    _extents(np.concatenate(parts), bounds, group, T_cloud_hand, side, limits, extents)
+    extents[:, -3:] = sizes[group]
+    extents = np.clip(extents, -FARTHEST_EXTENT, FARTHEST_EXTENT)
+    return extents
+
+
+def _size(points: Float64, up: Float64) -> list[float]:
+    """Length and width of a box whose surface spreads as points (P, 3) do, and their height."""
+    up = up / np.linalg.norm(up)
+    height = points @ up
+    flat = points - points.mean(axis=0) - (height - height.mean())[:, None] * up
+    spread = np.linalg.eigvalsh(flat.T @ flat / len(points))  # ascending; the first is along up
+    return [*np.sqrt(12.0 * np.maximum(spread[:0:-1], 0.0)).tolist(), float(np.ptp(height))]
+
+
+@compiled("contract")
+def _extents(
+    points: Float32,
+    bounds: Int64,
+    group: Int64,
+    T_cloud_hand: Float32,
+    side: Float32,
+    limits: Float32,
+    extents: Float32,
+) -> None:
+    """Fill in all columns but the last three; the points of an object lie between its bounds."""
+    inner, half, palm, tip = limits
+    for e in range(len(group)):
+        T = T_cloud_hand[e]
+        low_x = low_y = low_z = np.float32(np.inf)
+        high_x = high_y = high_z = np.float32(-np.inf)
+        low, high = np.float32(0.0), np.float32(0.0)
+        for i in range(bounds[group[e]], bounds[group[e] + 1]):
+            a, b, c = points[i, 0] - T[0, 3], points[i, 1] - T[1, 3], points[i, 2] - T[2, 3]
+            x = side[e] * (a * T[0, 0] + b * T[1, 0] + c * T[2, 0])
+            y = a * T[0, 1] + b * T[1, 1] + c * T[2, 1]
+            z = a * T[0, 2] + b * T[1, 2] + c * T[2, 2]
+            low_x, high_x = min(low_x, x), max(high_x, x)
+            low_y, high_y = min(low_y, y), max(high_y, y)
+            low_z, high_z = min(low_z, z), max(high_z, z)
+            if abs(x) < half and z > palm:
+                low, high = min(low, y), max(high, y)
+        extents[e, 0], extents[e, 1] = high_y - inner, -low_y - inner
+        extents[e, 2], extents[e, 3] = high - inner, -low - inner
+        extents[e, 4], extents[e, 5] = high_x, -low_x
+        extents[e, 6], extents[e, 7] = high_z - tip, palm - low_z
 
 
 class CameraFrame(NamedTuple):

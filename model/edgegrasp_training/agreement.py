@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edgegrasp_sim.engine import ENGINES
 from edgegrasp_sim.objects import CLUTTER, ObjectSet
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_training.generation import GenerationOptions, ask, choose_grasps
+from edgegrasp_training.generation import VIEWS, GenerationOptions, ask, choose_grasps
 from edgegrasp_training.views import table
 
 HELD = "held"

@@ -132,6 +132,7 @@ def hand_batch(
         viewpoint,
         view.cut_off(),
         max_points,
+        object_of_point=view.numbered_objects(),
     )
 
 

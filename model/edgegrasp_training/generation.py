@@ -74,6 +74,8 @@ VIEWS = {
     SceneKind.BIN: ViewRange((0.5, 1.1), _ABOVE, _ANY_SIDE, _LOW_TARGET),
     SceneKind.TABLE: ViewRange((0.5, 1.2), _STEEP, _ANY_SIDE, _LOW_TARGET),
 }
+# Of household objects, more from one side: a tall or wide one hides its back there.
+SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, _LOW_TARGET)
 KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
@@ -240,11 +242,15 @@ def generate_scene(
         hand = "" if gripper is None else json.dumps(gripper)
         with ClutterSimulation(made_of, engine=options.engine, gripper=gripper) as simulation:
             sizes = HOUSEHOLD_SCALE if household else _scales(kind)
-            hard = _make_scene(simulation, kind, sizes, options, streams)
+            aside = household and kind is not SceneKind.BIN
+            seen_from = SIDE_VIEWS if aside else VIEWS[kind]
+            hard = _make_scene(simulation, kind, seen_from, sizes, options, streams)
             models = [model.origin or model for model in simulation.object_models]
             names, digests = tuple(m.name for m in models), tuple(m.digest for m in models)
             for number in range(options.views_per_scene):
-                query = hard if hard and number == 0 else ask(simulation, kind, streams)
+                query = hard
+                if query is None or number > 0:
+                    query = ask(simulation, kind, seen_from, streams)
                 choice = streams[CHOICE_STREAM]
                 view = label(simulation, query, options, choice, hard=hard is not None)
                 engine = simulation.world.name
@@ -256,6 +262,7 @@ def generate_scene(
 def _make_scene(
     simulation: ClutterSimulation,
     kind: SceneKind,
+    seen_from: ViewRange,
     scales: tuple[float, float],
     options: GenerationOptions,
     streams: list[np.random.Generator],
@@ -267,7 +274,7 @@ def _make_scene(
         guide = detector(options.weights)
     for _ in range(1 if guide is None else HARD_TRIES):
         simulation.reset(kind, rng, 1 + int(rng.poisson(FURTHER_OBJECTS[kind])), scales)
-        hard = None if guide is None else _hard_view(simulation, kind, guide, streams)
+        hard = None if guide is None else _hard_view(simulation, kind, seen_from, guide, streams)
         if hard is not None:
             return hard
     return None
@@ -282,6 +289,7 @@ def _scales(kind: SceneKind) -> tuple[float, float]:
 def _hard_view(
     simulation: ClutterSimulation,
     kind: SceneKind,
+    seen_from: ViewRange,
     guide: GraspDetector,
     streams: list[np.random.Generator],
 ) -> Query | None:
@@ -290,7 +298,7 @@ def _hard_view(
     Until then its grasps are executed, so that easy objects go. None if all are easy.
     """
     for _ in range(min(simulation.num_objects, HARD_LOOKS)):
-        query = ask(simulation, kind, streams)
+        query = ask(simulation, kind, seen_from, streams)
         if len(query.observation.cloud) == 0:
             return None
         grasps = guide.detect(query.observation.cloud, query.request).grasps
@@ -305,7 +313,10 @@ def _hard_view(
 
 
 def ask(
-    simulation: ClutterSimulation, kind: SceneKind, streams: list[np.random.Generator]
+    simulation: ClutterSimulation,
+    kind: SceneKind,
+    seen_from: ViewRange,
+    streams: list[np.random.Generator],
 ) -> Query:
     """Look at the scene, and request grasps as a benchmark does, around fewer points.
 
@@ -317,7 +328,7 @@ def ask(
     around = not open_table or noise.random() < AROUND_SHARE
     seen = _noise(noise)
     seen["table"] = "around" if around else "known"
-    observation = simulation.observe(streams[CAMERA_STREAM], noise, views=VIEWS[kind], **seen)
+    observation = simulation.observe(streams[CAMERA_STREAM], noise, views=seen_from, **seen)
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
     workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))

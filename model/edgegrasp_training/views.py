@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from edgegrasp_model.gripper import Gripper, gripper_from_fields, load_gripper
 from edgegrasp_model.options import SupportPlane, Workspace
@@ -19,6 +22,7 @@ from edgegrasp_model.scene.support import Support
 
 Float32 = NDArray[np.float32]
 UNTRIED = -1  # label of a candidate that was not tried
+TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
 CARD_FILE = "card.md"
 OPTIONAL = ("T_world_hand", "firm", "support", "at_side", "object_of_point")
 # Of views that say nothing of them: the table of the simulated scenes, and where they are cut off.
@@ -96,6 +100,15 @@ class LabelledView:
         if len(self.points) == 0:
             return np.zeros(0, dtype=bool)
         return near_workspace_side(self.points, WORKSPACE, UP, self.points)
+
+    def numbered_objects(self) -> NDArray[np.int64]:
+        """The object (N,) that each point belongs to; where unknown, what hangs together."""
+        if self.object_of_point is not None:
+            return self.object_of_point.astype(np.int64)
+        count = len(self.points)
+        pairs = cKDTree(self.points).query_pairs(TOGETHER, output_type="ndarray")
+        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+        return connected_components(graph, directed=False)[1].astype(np.int64)
 
     def tried(self) -> NDArray[np.int64]:
         """Rows of the candidates that have a label."""

@@ -298,3 +298,29 @@ def test_two_things_with_a_gap_between_them_are_not_one() -> None:
     free, longest, first, second = described[0.03][67:71]
     np.testing.assert_allclose([longest, first, second], [0.03, 0.02, 0.02], atol=1e-5)
     assert 0.01 < free < 0.03
+
+
+def test_the_description_ends_with_how_far_the_object_goes_on_around_the_hand() -> None:
+    # An upright plate 0.2 m long along y and 0.06 m high beside a small object of its own number.
+    y, z = np.meshgrid(np.linspace(-0.05, 0.15, 41), np.linspace(0.0, 0.06, 13))
+    plate = np.stack([0.0 * y, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    other = plate[:20] * 0.1 + np.array([0.1, -0.3, 0.0], dtype=np.float32)
+    points = np.concatenate([plate, other])
+    numbers = np.repeat([4, 7], [len(plate), len(other)])
+    down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)  # closes along -y, from above
+    down[2, 3] = 0.04 + PANDA.tip_z
+    rows = np.array([0, len(plate)])
+    hands = Candidates(rows, rows, rows, np.tile(UP, (2, 1)), 0.0 * rows, np.tile(down, (2, 1, 1)))
+    cloud = Cloud(points, np.zeros_like(points))
+    known = describe_hands(cloud, hands, PANDA, UP, None, object_of_point=numbers)[:, -11:]
+    inner = PANDA.max_opening / 2
+    beyond = 0.05 - inner, 0.15 - inner
+    np.testing.assert_allclose(known[0, :4], [*beyond, *beyond], atol=1e-3)
+    np.testing.assert_allclose(known[0, 4:6], 0.0, atol=1e-3)
+    np.testing.assert_allclose(known[0, 6], 0.04, atol=1e-3)  # the plate reaches below the tips
+    np.testing.assert_allclose(known[0, 8:], [0.2, 0.0, 0.06], atol=0.02)
+    assert (known[1, 8:] < 0.05).all()  # the other object's own size
+    together = describe_hands(cloud, hands, PANDA, UP, None)[:, -11:]
+    assert (together[:, 8] > 0.2).all()
+    short = describe_hands(cloud, hands, PANDA, UP, None, size=HAND_DESCRIPTION_SIZE - 11)
+    assert short.shape == (2, HAND_DESCRIPTION_SIZE - 11)  # what an older network reads

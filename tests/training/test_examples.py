@@ -78,6 +78,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
         view.camera_position,
         near_workspace_side(view.points, WORKSPACE, UP, view.points),
         hands.hand_points,
+        object_of_point=view.numbered_objects(),
     )
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(batch.point_count, exact.point_count)

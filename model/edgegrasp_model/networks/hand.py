@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
 from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
@@ -62,6 +62,8 @@ class HandBatch:
         at_side: NDArray[np.bool_] | None,  # (N,) cut off by a side of the workspace
         num_points: int,
         view: HandView | None = None,
+        object_of_point: NDArray[np.int64] | None = None,  # (N,) None: all points are of one
+        description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
         """Look at a cloud from the hands of some candidates.
 
@@ -70,7 +72,16 @@ class HandBatch:
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
         description = describe_hands(
-            cloud, candidates, gripper, up, support, viewpoint, at_side, view
+            cloud,
+            candidates,
+            gripper,
+            up,
+            support,
+            viewpoint,
+            at_side,
+            view,
+            object_of_point,
+            description_size,
         )
         points, count = points_around_fingers(
             cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
@@ -115,6 +126,8 @@ def hand_batch(
         scene.at_side,
         network.hand_points,
         view,
+        scene.object_of_point,
+        network.description_size,
     )
 
 
