@@ -53,7 +53,8 @@ def compare_engines(objects: Path | None, options: GenerationOptions) -> Iterato
             made.reset(kind, streams[0], 5)
             copy.reset_from_poses(made.placements)
             for _ in range(options.views_per_scene):
-                chosen = choose_grasps(ask(made, kind, streams), options, streams[3], hard=True)
+                query = ask(made, kind, VIEWS[kind], streams)
+                chosen = choose_grasps(query, options, streams[3], hard=True)
                 for pose in () if chosen is None else chosen.T_world_hand:
                     tries = [each.try_grasp(pose, to_the_end=True) for each in (first, second)]
                     one, other = (HELD if t.cause is None else t.cause.value for t in tries)
