@@ -6,13 +6,10 @@
 ARG BASE=python:3.11-slim-bookworm
 
 FROM ${BASE} AS base
-# What Open3D loads; of GL without the Mesa behind it, whose compiler is as large as Python.
 # hadolint ignore=DL3008
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends libgomp1 libidn2-0 libusb-1.0-0 libx11-6 \
-    && apt-get download libegl1 libgl1 libglvnd0 libglx0 \
-    && for package in ./*.deb; do dpkg -x "$package" /; done \
-    && rm -rf ./*.deb /var/lib/apt/lists/* /var/cache/apt/* \
+    && apt-get install -y --no-install-recommends libgomp1 \
+    && rm -rf /var/lib/apt/lists/* /var/cache/apt/* \
     && useradd --system --uid 10001 --no-create-home edgegrasp
 
 
@@ -32,24 +29,19 @@ RUN python3 -m venv /tools && /tools/bin/pip install cyclonedx-bom pip-licenses 
 ENV PIP_PYTHON=/venv/bin/python
 # hadolint ignore=SC2086
 RUN /tools/bin/pip install ${TORCH}
-# Open3D comes without what it requires: notebooks, and a web server for its viewers.
 RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
     extras = [p["optional-dependencies"][name] for name in ("cli", "files", "model", "service")]; \
     named = p["dependencies"] + [one for extra in extras for one in extra]; \
     print(*(a for a in named if not a.startswith(("edgegrasp", "torch"))), sep="\n")' \
     > requirements.txt \
     && /tools/bin/pip install -r requirements.txt \
-    && /tools/bin/pip install --no-deps open3d-cpu \
-    && find /venv -name draw_plotly.py -exec sh -c \
-        'echo "get_plotly_fig = draw_plotly = draw_plotly_server = None" > "$0"' {} \; \
     && find /venv -regextype posix-extended -type d -regex ".*/(tests|numba/cuda|numpy/distutils|torchgen/packaged\
-|open3d/(_ml3d|agent_skills|examples|labextension|nbextension|resources)\
 |scipy/(cluster|datasets|differentiate|fft|fftpack|integrate|interpolate|io|odr|optimize|signal|stats)\
 |torch/(_dynamo|_inductor|include|onnx|share|test|testing/_internal/[a-z]+))" -prune -exec rm -r {} + \
     && find /venv -regextype posix-extended -type f -regex ".*(\.(a|c|cmake|cpp|h|hpp|pxd|pyi|pyx)\
 |/torch/bin/.*([tT]est|protoc).*|/torch/lib/.*(test|custom_ops|with_compiler)\.so\
 |/torch/testing/_internal/common_[^d]*\.py\
-|/open3d_t.*_ops\.so|/(_avif|libavif).*\.so.*)" -delete \
+|/(_avif|libavif).*\.so.*)" -delete \
     && find /venv -path '*/pygments/lexers/[!_]*' -not -name python.py -delete \
     && find /venv -name '*.so' -not -path '*.libs/*' -exec strip --strip-unneeded {} +
 
@@ -63,7 +55,7 @@ RUN /tools/bin/pip install --no-deps .
 # processors have had since 2013, and for AVX-512 where this one has it.
 RUN for kind in x86-64-v3 $(grep -q avx512vl /proc/cpuinfo && echo x86-64-v4); do \
         NUMBA_CACHE_DIR=/venv/loops/$kind NUMBA_CPU_NAME=$kind NUMBA_CPU_FEATURES='' \
-            /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server, open3d; \
+            /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server; \
             from edgegrasp_service.worker.answer import Settings, load_catalogue; \
             load_catalogue(Settings())' || exit 1; \
     done \

@@ -24,6 +24,7 @@ from edgegrasp_client.errors import ProtocolError as ProtocolError
 from edgegrasp_client.errors import ServerFailedError as ServerFailedError
 from edgegrasp_client.errors import ServerUnavailableError as ServerUnavailableError
 from edgegrasp_client.errors import UnknownModelError as UnknownModelError
+from edgegrasp_client.errors import WorkerLostError as WorkerLostError
 from edgegrasp_client.options import ApproachDirection as ApproachDirection
 from edgegrasp_client.options import Box as Box
 from edgegrasp_client.options import Collision as Collision

@@ -26,6 +26,7 @@ from edgegrasp_client.connection import (
     CHANNEL_OPTIONS,
     DEFAULT_ADDRESS,
     HTTP_OVER_UNIX,
+    RETRIES,
     Tls,
     channel_credentials,
     is_rest,
@@ -33,7 +34,12 @@ from edgegrasp_client.connection import (
     ssl_context,
     token_metadata,
 )
-from edgegrasp_client.errors import DeadlineError, GraspClientError, ServerUnavailableError
+from edgegrasp_client.errors import (
+    DeadlineError,
+    GraspClientError,
+    ServerUnavailableError,
+    WorkerLostError,
+)
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.requests import (
     Request,
@@ -235,9 +241,10 @@ class AsyncGraspClient:
                 delay = retry_delay(error, attempt)
                 if not self._retry or delay is None or time.monotonic() + delay >= end:
                     raise
+                # A request that a worker died of may be why: one more try.
+                attempt += RETRIES if isinstance(error, WorkerLostError) else 1
             await asyncio.sleep(delay)
             left = max(end - time.monotonic(), 0.0)
-            attempt += 1
 
 
 class _GrpcTransport:

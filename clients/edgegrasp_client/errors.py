@@ -8,6 +8,7 @@ GraspClientError
   + ServerUnavailableError      no connection, weights still loading, the server is stopping, or
                                 its worker or a proxy lost the request
       + OverloadedError         the server is full: retry_after
+      + WorkerLostError         the worker process of the request died; tried again once
   + DeadlineError               no answer within the timeout
   + ServerFailedError           the server failed on a good request
   + ProtocolError               the answer is not from a grasp service: is the address right?
@@ -59,6 +60,10 @@ class OverloadedError(ServerUnavailableError):
         self.retry_after = retry_after  # seconds until another try is worth it
 
 
+class WorkerLostError(ServerUnavailableError):
+    """The process that worked on the request died or was killed."""
+
+
 class DeadlineError(GraspClientError):
     """There was no answer within the timeout."""
 
@@ -83,7 +88,8 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "detector-failed": ServerFailedError,
     "not-ready": ServerUnavailableError,
     "overloaded": OverloadedError,
-    "worker-lost": ServerUnavailableError,
+    "worker-lost": WorkerLostError,
+    "harmful-request": InvalidRequestError,
     "cancelled": ServerUnavailableError,
     "request-timeout": DeadlineError,
     "deadline-exceeded": DeadlineError,

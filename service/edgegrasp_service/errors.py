@@ -67,6 +67,10 @@ class WorkerLost(ServiceError):  # noqa: N818
     """The process that worked on the request died or ran out of memory, and is replaced."""
 
 
+class HarmfulRequest(InvalidRequest):
+    """A request that ended the process that worked on it is not tried again for a while."""
+
+
 class DetectorFailed(ServiceError):  # noqa: N818
     """The detector failed on a good request."""
 
@@ -96,6 +100,7 @@ STATUS: dict[type[Exception], tuple[str, int]] = {
     ReloadFailed: ("FAILED_PRECONDITION", 409),
     NotReady: ("UNAVAILABLE", 503),
     Overloaded: ("RESOURCE_EXHAUSTED", 429),
+    HarmfulRequest: ("INVALID_ARGUMENT", 422),
     RequestTimeout: ("DEADLINE_EXCEEDED", 408),
     DeadlineExceeded: ("DEADLINE_EXCEEDED", 504),
     Cancelled: ("CANCELLED", 499),  # 499: as nginx logs it

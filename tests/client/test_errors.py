@@ -25,6 +25,7 @@ from edgegrasp_client import (
     ServerUnavailableError,
     StreamRequest,
     UnknownModelError,
+    WorkerLostError,
     connection,
 )
 
@@ -115,7 +116,8 @@ DESCRIBED = [
     (Problem("detector-failed", Code.INTERNAL, 500), ServerFailedError),
     (AWAY, ServerUnavailableError),
     (BUSY, OverloadedError),
-    (LOST, ServerUnavailableError),
+    (LOST, WorkerLostError),
+    (Problem("harmful-request", Code.INVALID_ARGUMENT, 422), InvalidRequestError),
     (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), DeadlineError),
     (Problem("teapot", Code.UNKNOWN, 418), ProtocolError),
 ]
@@ -203,6 +205,7 @@ def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cl
         (BUSY, {"retry": False}, 1),
         (BUSY._replace(retry_after=1000.0), {"timeout": 30}, 1),
         (INVALID, {}, 1),
+        (LOST, {}, 2),
         (Problem("deadline-exceeded", Code.DEADLINE_EXCEEDED, 504), {}, 1),
         (Problem("detector-failed", Code.INTERNAL, 500), {}, 1),
     ],

@@ -39,12 +39,6 @@ from .conftest import (
 MAX_POINTS = 5000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def open3d_is_loaded() -> None:
-    """Its import is no memory of a request."""
-    pytest.importorskip("open3d", exc_type=ImportError)
-
-
 def decode(size: int, **fields: Any) -> None:
     def work() -> None:
         cloud, _ = decode_cloud(fields, DetectOptions(), MAX_POINTS)

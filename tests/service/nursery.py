@@ -75,6 +75,8 @@ def fail(kind: str) -> None:
     match kind:
         case "kill":
             os.kill(os.getpid(), signal.SIGKILL)
+        case "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
         case "spin":
             while True:
                 pass

@@ -27,6 +27,47 @@ async def test_a_worker_that_dies_fails_its_own_request_only(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
+async def test_a_request_that_workers_die_of_is_not_tried_again(
+    serve, connect, is_error, cloud
+) -> None:
+    """A crash is enough; a worker that was killed may have been killed for something else."""
+    running = await serve()
+    client = connect(running)
+    running.stages.fail("evaluate", "crash")
+    for _ in range(3):
+        assert is_error(await client.detect(cloud), "harmful-request")
+    for seed in (1, 1, 1):
+        running.stages.fail("evaluate", "kill")
+        assert is_error(await client.detect(cloud, seed=seed), "worker-lost")
+    assert is_error(await client.detect(cloud, seed=1), "harmful-request")
+    assert (await client.detect(cloud, seed=2)).fine
+    assert "edgegrasp_workers_replaced_total 4.0" in running.metrics()
+
+
+async def test_a_nursery_that_is_stopped_is_replaced(serve, cloud, monkeypatch) -> None:
+    monkeypatch.setattr("edgegrasp_service.worker.pool.START_SECONDS", 1.0)
+    running = await serve()
+    pool, client = running.server.pool, running.connect("rest")
+    nursery = pool._nursery.pid
+    os.kill(nursery, signal.SIGSTOP)
+    os.kill(pool.pids[0], signal.SIGKILL)
+    await running.until(lambda: not running.server.service.ready)
+    await running.until(lambda: running.server.service.ready)
+    assert pool._nursery.pid != nursery
+    assert (await client.detect(cloud)).fine
+    await client.close()
+
+
+async def test_a_worker_that_is_stopped_is_replaced(serve, monkeypatch) -> None:
+    for name, seconds in (("BEAT", 0.2), ("PULSE", 1.0)):
+        monkeypatch.setattr(f"edgegrasp_service.worker.pool.{name}_SECONDS", seconds)
+    running = await serve()
+    (before,) = running.server.pool.pids
+    os.kill(before, signal.SIGSTOP)
+    await running.until(lambda: running.server.pool.pids not in ([], [before]))
+    assert running.server.service.ready
+
+
 async def test_workers_killed_under_load(serve, cloud) -> None:
     """Whatever is killed, each answer is of its own cloud, and nothing is lost."""
     running = await serve(workers=2)

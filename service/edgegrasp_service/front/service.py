@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import hashlib
 import logging
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
@@ -13,12 +14,14 @@ from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
     STOPPING,
     Cancelled,
+    HarmfulRequest,
     HeadersTooLarge,
     NotReady,
     PayloadTooLarge,
     PermissionDenied,
     ReloadFailed,
     RequestTimeout,
+    WorkerLost,
     report,
 )
 from edgegrasp_service.front.admission import Admission
@@ -26,11 +29,14 @@ from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Job
-from edgegrasp_service.worker.pool import WorkerPool
+from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, WorkerPool
 
 logger = logging.getLogger(__name__)
 
 MAX_HEADERS = 64
+MOST_DEATHS = 3  # of workers for one request; a crash counts as so many
+HARMFUL_SECONDS = 600.0  # for which such a request is refused
+MOST_HARMFUL = 1000  # of which this is known
 
 T = TypeVar("T")
 
@@ -63,11 +69,12 @@ class GraspService:
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
         self._record = record
+        self._harmful = HarmfulRequests()
 
     @property
     def ready(self) -> bool:
         """Whether requests are answered."""
-        return bool(self.pool.models) and not self.stopping.is_set()
+        return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
 
     def models(self) -> list[dict[str, Any]]:
         """The weights a request can name, keyed as edgegrasp.v1.Model; raises NotReady."""
@@ -131,7 +138,8 @@ class GraspService:
             Overloaded: There is no place, or its turn would come too late.
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
-            WorkerLost: The worker died.
+            HarmfulRequest: Workers died of this request.
+            WorkerLost: The worker died of something else.
             Cancelled: The client does not take its answer.
         """
         self.check_ready()
@@ -144,6 +152,7 @@ class GraspService:
             call.end_stage("read")
             call.bytes_in = len(job.body)
             self.admission.resize(ticket, call.bytes_in)
+            await self._harmful.check(job)
             began = 0.0
 
             def begun() -> None:
@@ -155,6 +164,13 @@ class GraspService:
             try:
                 work = self.pool.run(job, call.deadline, begun)
                 answer = await (wait(work) if wait else work)
+                if answer.error is None:
+                    await self._harmful.forget(job)
+                elif answer.error.kind == WORKER_LOST:
+                    await self._harmful.note(job, 1)
+            except (HarmfulRequest, WorkerLost) as error:
+                await self._harmful.note(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
+                raise
             finally:
                 if began:
                     self.admission.worked(time.monotonic() - began)
@@ -216,6 +232,47 @@ class GraspService:
         if size > most:
             fix = f"Send at most {most} bytes, e.g. float32 points or a downsampled cloud."
             raise PayloadTooLarge("body", f"{size} bytes", fix)
+
+
+class HarmfulRequests:
+    """Requests that workers died of: by digest, until when and how many workers."""
+
+    def __init__(self) -> None:
+        self._deaths: dict[bytes, tuple[float, int]] = {}
+
+    async def check(self, job: Job) -> None:
+        """Raise HarmfulRequest for a request that is not to be tried again."""
+        if self._deaths and (await self._of(job))[1] >= MOST_DEATHS:
+            raise HarmfulRequest("request", CRASHED, CRASH_FIX)
+
+    async def note(self, job: Job, deaths: int) -> None:
+        """A request ended a worker; one that was killed counts less than one that crashed."""
+        _, before = await self._of(job)
+        until = time.monotonic() + HARMFUL_SECONDS
+        self._deaths[await _digest(job)] = until, before + deaths
+        while len(self._deaths) > MOST_HARMFUL:
+            del self._deaths[next(iter(self._deaths))]
+
+    async def forget(self, job: Job) -> None:
+        """A request was answered: what killed its worker before was something else."""
+        if self._deaths:
+            self._deaths.pop(await _digest(job), None)
+
+    async def _of(self, job: Job) -> tuple[float, int]:
+        until, deaths = self._deaths.get(await _digest(job), (0.0, 0))
+        return (until, deaths) if time.monotonic() < until else (0.0, 0)
+
+
+async def _digest(job: Job) -> bytes:
+    """Of all that a worker would see of a request; in a thread, for a body may be large."""
+    kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
+
+    def compute() -> bytes:
+        digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
+        digest.update(job.body)
+        return digest.digest()
+
+    return await asyncio.to_thread(compute)
 
 
 class Reloader:

@@ -17,14 +17,18 @@ from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.errors import DeadlineExceeded, report
+from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages, outcomes
 from edgegrasp_service.worker.job import Answer, Facts, Job
+from edgegrasp_service.worker.process import limited_memory
 from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
+
+# Memory to read a request in: numbers take some 12 times as much in Python as in JSON.
+DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -82,6 +86,8 @@ class _Work:
 
     def answer(self) -> bytes:
         """The body of the answer; raises any error that there may be."""
+        if self._job.method == "Beat":
+            return b"{}"
         if self._job.method == "RecordOutcome":
             return outcomes.append(self._job, self._catalogue, self._settings.outcomes_file)
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
@@ -114,6 +120,17 @@ class _Work:
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
+        size = len(self._job.body)
+        try:
+            with limited_memory(DECODE_BYTES + DECODE_FACTOR * size):
+                return self._decode_within_memory()
+        except MemoryError:
+            value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
+            raise PayloadTooLarge("body", value, fix) from None
+
+    def _decode_within_memory(
+        self,
+    ) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         fields = self._encoding.read_request(self._job)
         self.options = options = parse_options(fields["options"])
         detector, most = self._catalogue.get(options.model), self._settings.max_points

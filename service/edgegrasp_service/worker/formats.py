@@ -8,13 +8,11 @@ import io
 import math
 import re
 import struct
-import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,9 +30,13 @@ Array = NDArray[Any]
 Records = NDArray[np.void]
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
+MAX_NPY_HEADER = 1024  # bytes; Python's parser runs out of memory where brackets or signs nest
+MAX_CHUNKS = 4096  # of a PNG file, however small they are
 MAX_LINE = 65536  # bytes of a line of numbers, which takes 15 times its size to read
 MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own
 MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
+UNZIPPED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others let the file say how much memory
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # of an object, in the message of a library
 
 FIXES = {
     "npy": "Send what numpy.save(file, points) writes, points of shape (N, 3).",
@@ -82,7 +84,7 @@ def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None
     except (EdgeGraspError, MemoryError):
         raise
     except Exception as error:
-        fault = str(error).partition(";")[0][:100] or type(error).__name__
+        fault = ADDRESS.sub("", str(error).partition(";")[0])[:100] or type(error).__name__
         value = f"{size} bytes that are no whole .{file_format} file ({fault})"
         raise InvalidRequest(field, value, fix) from None
 
@@ -105,10 +107,11 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
     fix = FIXES["npy"] if field == "cloud" else f"Send what numpy.save(file, {field}) writes."
     with _reading(field, "npy", len(data), fix):
         stream = io.BytesIO(data)
-        if np.lib.format.read_magic(stream) == (1, 0):
-            shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
-        else:
-            shape, fortran_order, dtype = np.lib.format.read_array_header_2_0(stream)
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0
+        if version != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read(stream, max_header_size=MAX_NPY_HEADER)
         if not all(type(size) is int and size >= 0 for size in shape):
             raise ValueError(f"shape {shape}")
         found, expected = len(data) - stream.tell(), math.prod(shape) * dtype.itemsize
@@ -159,6 +162,8 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
 
 
 def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:
+    if info.compress_type not in UNZIPPED:
+        raise ValueError("compressed in another way than numpy does")
     # Six doubles a point and a header: more than any cloud of max_points needs.
     if info.file_size > 48 * max_points + 65536:
         value = f"an array of {info.file_size} bytes once unpacked"
@@ -184,6 +189,11 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
     fix = "Send a whole PNG file, of 16-bit greyscale for depths."
     with _reading(field, "png", len(data), fix), warnings.catch_warnings():
         warnings.simplefilter("error")  # that the image is huge
+        start = 8
+        for _ in range(MAX_CHUNKS):
+            start += 12 + int.from_bytes(data[start : start + 4])
+        if start < len(data):
+            raise ValueError(f"more than {MAX_CHUNKS} chunks")
         image = Image.open(io.BytesIO(data), formats=["PNG"])
         if image.width * image.height > max_points:
             raise too_many(image.width * image.height, max_points, field)
@@ -225,7 +235,7 @@ def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]],
     end = last.search(data[:MAX_HEADER])
     if end is None:
         raise ValueError("no header")
-    return [line.split() for line in data[: end.start()].decode("latin-1").splitlines()], end
+    return [line.split() for line in data[: end.start()].decode("latin-1").split("\n")], end
 
 
 def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]:
@@ -270,8 +280,6 @@ def _read_text(data: bytes, **options: Any) -> NDArray[np.float64]:
 
 
 # .ply
-# Open3D reads PLY files too, but gives back uninitialised memory for the missing rows of a
-# truncated one and merely prints a warning.
 
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -327,20 +335,20 @@ def _read_pcd(data: bytes, max_points: int) -> CloudInput:
     ]
     record, count, body = _record(fields, "<"), int(header["POINTS"][0]), data[end.end() :]
     if end[1] == b"binary_compressed":
-        cloud = _read_compressed_pcd(data, body, count, record, max_points)
+        rows = _read_compressed_records(body, record, count, max_points)
     else:
-        text = end[1] == b"ascii"
-        cloud = cloud_of_records(_read_records(body, record, count, max_points, text))
+        rows = _read_records(body, record, count, max_points, end[1] == b"ascii")
+    cloud = cloud_of_records(rows)
     height, width = (int(header.get(name, ["1"])[0]) for name in ("HEIGHT", "WIDTH"))
     if height < 2 or height * width != count:
         return cloud
     return replace(cloud, points=np.asarray(cloud.points).reshape(height, width, 3))
 
 
-def _read_compressed_pcd(
-    data: bytes, body: bytes, count: int, record: np.dtype[Any], max_points: int
-) -> CloudInput:
-    """Have Open3D unpack a file, once its sizes are known to be true and small enough."""
+def _read_compressed_records(
+    body: bytes, record: np.dtype[Any], count: int, max_points: int
+) -> Records:
+    """Read `count` records that are compressed field by field: all x, then all y, and so on."""
     if count > max_points:
         raise too_many(count, max_points)
     packed, unpacked = struct.unpack_from("<II", body)
@@ -349,23 +357,41 @@ def _read_compressed_pcd(
     if unpacked > MAX_UNPACKED:
         fix = f"Send at most {MAX_UNPACKED} bytes, or fields x, y and z alone."
         raise PayloadTooLarge("cloud", f"a PCD file of {unpacked} bytes once unpacked", fix)
-    try:
-        import open3d  # it takes a second, and is needed for nothing else
-    except ImportError:
-        fix = "Send DATA binary or ascii, or have edgegrasp[open3d] installed at the server."
-        raise UnsupportedMediaType("cloud", "DATA binary_compressed, without Open3D", fix) from None
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "cloud.pcd"
-        path.write_bytes(data)
-        with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-            cloud = open3d.io.read_point_cloud(path)
-    if len(cloud.points) != count:
-        raise ValueError(f"{len(cloud.points)} points where the header promises {count}")
-    return CloudInput(
-        points=np.asarray(cloud.points),
-        normals=np.asarray(cloud.normals) if cloud.has_normals() else None,
-        colors=np.asarray(cloud.colors) if cloud.has_colors() else None,
-    )
+    columns, start = _unpack_lzf(body[8 : 8 + packed], unpacked), 0
+    rows = np.empty(count, record.newbyteorder("="))
+    for name in record.names or ():
+        one, shape = record[name].base, (count, *record[name].shape)
+        rows[name] = np.frombuffer(columns, one, math.prod(shape), start).reshape(shape)
+        start += count * record[name].itemsize
+    return rows
+
+
+def _unpack_lzf(packed: bytes, size: int) -> bytearray:
+    """Undo LZF: runs of bytes, and references to what came before; raises ValueError or IndexError.
+
+    A byte n below 32 begins n + 1 bytes to copy. Others have 3 bits of a length, 7 of which say
+    that a byte more adds to it, and 13 bits of a distance, the lowest 8 in the last byte.
+    """
+    plain, place = bytearray(), 0
+    while place < len(packed) and len(plain) <= size:
+        control, place = packed[place], place + 1
+        if control < 32:
+            plain += packed[place : place + control + 1]
+            place += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length, place = length + packed[place], place + 1
+        length, distance = length + 2, ((control & 31) << 8 | packed[place]) + 1
+        place += 1
+        start = len(plain) - distance
+        if start < 0:
+            raise ValueError("compressed data that refers to what is before its start")
+        copied = plain[start : start + length]
+        plain += (copied * (length // distance + 1))[:length]  # it may repeat itself
+    if len(plain) != size or place != len(packed):
+        raise ValueError(f"{len(plain)} bytes of compressed data where {size} are promised")
+    return plain
 
 
 # .xyz

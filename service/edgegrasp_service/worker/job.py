@@ -9,7 +9,7 @@ from edgegrasp_service.errors import Problem
 
 HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
 
-Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome"]
+Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: nothing
 Transport = Literal["http", "grpc"]
 
 

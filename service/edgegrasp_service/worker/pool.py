@@ -8,15 +8,16 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import InvalidSettings, WorkerLost, kind_of
+from edgegrasp_service.errors import HarmfulRequest, InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
-from edgegrasp_service.worker.process import LOST
+from edgegrasp_service.worker.process import ENDED, LOST
 
 MAIN = "import sys; from edgegrasp_service.worker.process import main; main(sys.argv[1])"
 # -P: nothing is imported from the folder the server was started in.
@@ -24,6 +25,14 @@ NURSERY = (sys.executable, "-P", "-c", MAIN)
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 WORKER_LOST = kind_of(WorkerLost)
+CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
+CRASHED = "one that ended the process that worked on it"
+CRASH_FIX = "Send another cloud or other options; this request is refused for 10 minutes."
+STATUS_SECONDS = 1.0  # to hear how a worker ended
+START_SECONDS = 20.0  # for a worker to fork, where it need not load
+BEAT_SECONDS = 3.0  # between two questions whether a worker is alive
+PULSE_SECONDS = 10.0  # for it to answer
+ALIVE_SECONDS = 15.0  # since the latest answer of any worker
 KILL_SECONDS = 0.5  # a worker whose answer nobody waits for may finish for so long
 RETRY_SECONDS = 1.0  # after a worker, or the nursery, failed to start
 
@@ -53,6 +62,13 @@ class WorkerPool:
         # The last one in is the first one out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._answered = 0.0  # when a worker last said anything
+
+    @property
+    def alive(self) -> bool:
+        """Whether a worker has answered lately, or has a job, which ends with its deadline."""
+        recent = time.monotonic() - self._answered < ALIVE_SECONDS
+        return bool(self._workers) and (self.busy > 0 or recent)
 
     @property
     def pids(self) -> list[int]:
@@ -62,7 +78,7 @@ class WorkerPool:
     @property
     def busy(self) -> int:
         """Workers that have a job."""
-        return sum(worker.answer is not None for worker in self._workers)
+        return sum(worker.at_work for worker in self._workers)
 
     async def start(self) -> None:
         """Load, and start the workers; those of a start before end when they have answered.
@@ -87,6 +103,9 @@ class WorkerPool:
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._spawn(self._tend(worker))
+        self._answered = time.monotonic()
+        if old_nursery is None:
+            self._spawn(self._beat())
         if old_nursery is not None:
             old_nursery.close()
         for worker in old_workers:
@@ -106,7 +125,8 @@ class WorkerPool:
             begun: Called when a worker has the job.
 
         Raises:
-            WorkerLost: The worker died.
+            HarmfulRequest: The worker died of the job.
+            WorkerLost: It died of something else.
         """
         worker = await self._take()
         begun()
@@ -134,6 +154,15 @@ class WorkerPool:
             if worker in self._workers:  # and not dead
                 return worker
 
+    async def _beat(self) -> None:
+        """Ask a worker that has nothing to do, now and then, whether it is there."""
+        while True:
+            await asyncio.sleep(BEAT_SECONDS)
+            with contextlib.suppress(TimeoutError, EdgeGraspError):
+                async with asyncio.timeout(PULSE_SECONDS):  # or it is killed
+                    beat = Job("Beat", "http", b"", 0.0)
+                    await self.run(beat, time.monotonic() + PULSE_SECONDS)
+
     async def _tend(self, worker: "_Worker") -> None:
         """Give a worker jobs until it dies, and start another in its place then."""
         try:
@@ -144,14 +173,17 @@ class WorkerPool:
                 elif usable:
                     self._idle.put_nowait(worker)
                 answer = await worker.receive()
-                worker.finish(answer)
                 if answer is None:
+                    if await worker.nursery.crashed(worker.pid):
+                        worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
                     break
+                self._answered = time.monotonic()
+                worker.finish(answer)
                 usable = answer.error is None or answer.error.kind != WORKER_LOST
                 if not usable:
                     worker.kill()  # it ran out of memory: what is left of it cannot be trusted
         finally:
-            worker.finish(None)
+            worker.finish(WorkerLost(LOST))
             worker.close()
         if worker in self._workers:
             logger.warning("worker %d died and is replaced", worker.pid)
@@ -162,7 +194,12 @@ class WorkerPool:
     async def _replace(self, nursery: "_Nursery") -> None:
         worker = _Worker(nursery)
         try:
-            await worker.start()
+            async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
+                await worker.start()
+        except TimeoutError:  # it is stopped, or hangs: its death is noted as any other
+            worker.close()
+            nursery.kill()
+            raise InvalidSettings("the process that workers fork from does not answer") from None
         except BaseException:
             worker.close()
             raise
@@ -195,7 +232,9 @@ class _Nursery:
 
     def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
         self._process = process
+        self.pid = process.pid
         self._control = control
+        self._crashed: dict[int, asyncio.Future[bool]] = {}  # by process, while one asks
 
     @classmethod
     async def start(cls, command: Sequence[str], settings: Settings) -> "_Nursery":
@@ -215,6 +254,7 @@ class _Nursery:
         except BaseException:
             nursery.close()
             raise
+        nursery.pid = ready.pid
         control.setblocking(False)
         return nursery
 
@@ -223,10 +263,31 @@ class _Nursery:
         loop = asyncio.get_running_loop()
 
         def readable() -> None:
-            loop.remove_reader(self._control)
-            lost()
+            told = b""
+            with contextlib.suppress(OSError):
+                told = self._control.recv(ENDED.size * 64)
+            for pid, status in ENDED.iter_unpack(told[: len(told) // ENDED.size * ENDED.size]):
+                crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
+                ended = self._ended(pid)
+                if not ended.done():
+                    ended.set_result(crashed or os.WIFEXITED(status))
+            if not told:
+                loop.remove_reader(self._control)
+                lost()
 
         loop.add_reader(self._control, readable)
+
+    async def crashed(self, pid: int) -> bool:
+        """Whether a worker that has ended did so by itself, and was not killed."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STATUS_SECONDS):
+                return await self._ended(pid)
+        return False
+
+    def _ended(self, pid: int) -> "asyncio.Future[bool]":
+        if pid not in self._crashed:
+            self._crashed[pid] = asyncio.get_running_loop().create_future()
+        return self._crashed[pid]
 
     def fork(self) -> socket.socket:
         """A socket to a new worker."""
@@ -238,6 +299,11 @@ class _Nursery:
                 ours.close()
                 raise
         return ours
+
+    def kill(self) -> None:
+        """End it, also where it is stopped; `watch` tells."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
         """End it; the workers that it forked go on."""
@@ -258,6 +324,7 @@ class _Worker:
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
+        self.at_work = False  # on a request
 
     async def start(self) -> None:
         """Fork it, and wait until it is ready; raises InvalidSettings where it cannot load."""
@@ -282,20 +349,22 @@ class _Worker:
         self.answer = asyncio.get_running_loop().create_future()
         self.answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
         assert self._writer is not None
+        self.at_work = job.method != "Beat"
         for part in pack(job):
             self._writer.write(part)
         return self.answer
 
-    def finish(self, answer: Answer | None) -> None:
-        """Hand on the answer of its job, if it has one; None: it died."""
+    def finish(self, answer: Answer | EdgeGraspError) -> None:
+        """Hand on the answer of its job, or why there is none, if it has a job."""
+        self.at_work = False
         if self._killing is not None:
             self._killing.cancel()
             self._killing = None
         waiting, self.answer = self.answer, None
-        if waiting is not None and answer is not None:
-            waiting.set_result(answer)
+        if waiting is not None and isinstance(answer, EdgeGraspError):
+            waiting.set_exception(answer)
         elif waiting is not None:
-            waiting.set_exception(WorkerLost(LOST))
+            waiting.set_result(answer)
 
     def abandon(self) -> None:
         """Nobody waits for its answer: kill it unless it is done soon."""

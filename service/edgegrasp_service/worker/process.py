@@ -12,8 +12,9 @@ import os
 import resource
 import signal
 import socket
+import struct
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Facts, Ready, pack, receive
 
 ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
+ENDED = struct.Struct("=ii")  # what the nursery tells of a worker: its process and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 
 
@@ -34,7 +36,6 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(told))
     try:
         start = _prepare(settings, load)
@@ -42,6 +43,7 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
     _send(pool, Ready(os.getpid(), []))
+    signal.signal(signal.SIGCHLD, lambda *_: _tell_of_ended(pool))
     gc.collect()
     gc.freeze()  # collecting would write to pages that are shared
     gc.disable()  # it would look through millions of lists of points again and again
@@ -51,6 +53,7 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
             return
         if os.fork() == 0:
             try:
+                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                 pool.close()
                 _work(socket.socket(fileno=descriptors[0]), settings, start)
             except Exception:
@@ -58,6 +61,12 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
             finally:
                 os._exit(0)
         os.close(descriptors[0])
+
+
+def _tell_of_ended(pool: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # there are no more
+        while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+            pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
 
 
 def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
@@ -84,8 +93,12 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
     except EdgeGraspError as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
-    _limit_memory(settings.max_worker_bytes)
-    _send(pool, Ready(os.getpid(), models))
+    with limited_memory(settings.max_worker_bytes):
+        _send(pool, Ready(os.getpid(), models))
+        _answer_jobs(pool, work)
+
+
+def _answer_jobs(pool: socket.socket, work: Callable[[Any], Answer]) -> None:
     jobs = pool.makefile("rb")
     while (job := receive(jobs)) is not None:
         signal.setitimer(signal.ITIMER_REAL, max(job.remaining, 0.0) + ORPHAN_SECONDS)
@@ -101,12 +114,19 @@ def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> 
         gc.collect()
 
 
-def _limit_memory(most: int) -> None:
+@contextlib.contextmanager
+def limited_memory(most: int) -> Iterator[None]:
     """Let this process take so many bytes more than it has; an allocation beyond that fails."""
-    with contextlib.suppress(OSError):  # no /proc: no limit
-        data_pages = int(Path("/proc/self/statm").read_text().split()[5])
-        limit = data_pages * resource.getpagesize() + most
-        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    data_pages = int(Path("/proc/self/statm").read_text().split()[5])
+    limit = data_pages * resource.getpagesize() + most
+    if before[0] != resource.RLIM_INFINITY:
+        limit = min(limit, before[0])
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def _send(to: socket.socket, message: object) -> None:

@@ -287,13 +287,18 @@ def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
 
 def _record(layout: PointCloud2) -> np.dtype[Any]:
     """The layout of a point, with the fields that are read."""
+    fix = f"Send each field once, within point_step = {layout.point_step}."
     order = ">" if layout.is_bigendian else "<"
     found = [field for field in layout.fields if field.name in PCL_FIELDS and field.count <= 1]
     kinds = {field.name: field.datatype for field in found}
     if missing := [axis for axis in "xyz" if kinds.get(axis) not in (7, 8)]:
         value = ", ".join(f"{field.name} of type {field.datatype}" for field in layout.fields)
-        fix = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
-        raise InvalidRequest("point_cloud2.fields", value[:80], fix)
+        wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
+        raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
+    for field in found:  # NumPy adds them up in 32 bits
+        end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
+        if end > layout.point_step:
+            raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)
     try:
         return np.dtype(
             {
@@ -303,8 +308,7 @@ def _record(layout: PointCloud2) -> np.dtype[Any]:
                 "itemsize": layout.point_step,
             }
         )
-    except ValueError as error:  # a name that is there twice, a field beyond point_step
-        fix = f"Send each field once, within point_step = {layout.point_step}."
+    except ValueError as error:  # a name that is there twice
         raise InvalidRequest("point_cloud2.fields", str(error), fix) from None
 
 

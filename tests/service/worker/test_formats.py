@@ -1,6 +1,5 @@
 import io
 import struct
-import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.errors import PayloadTooLarge
 from edgegrasp_service.worker.formats import read_file, read_png
 from edgegrasp_service.worker.request_cloud import decode_points
 
@@ -170,14 +169,84 @@ def test_compressed_pcd_with_sizes_that_lie() -> None:
             read_file("pcd", head + mark + struct.pack("<II", *sizes) + bytes(4), MANY)
 
 
-def test_compressed_pcd_where_there_is_no_open3d(monkeypatch) -> None:
-    """As where its wheel is too new for the system's C library: the rest is read without it."""
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    head, mark, _ = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
-    with pytest.raises(UnsupportedMediaType) as caught:
-        read_file("pcd", head + mark + struct.pack("<II", 4, 840) + bytes(4), MANY)
-    assert "binary or ascii" in caught.value.fix
-    assert len(read_file("pcd", pcd(POINTS, "binary"), MANY).points) == 40
+def compressed_pcd(header: str, columns: bytes, packed: bytes | None = None) -> bytes:
+    packed = b"".join(
+        bytes([len(columns[start : start + 32]) - 1]) + columns[start : start + 32]
+        for start in range(0, len(columns), 32)
+    ) if packed is None else packed  # fmt: skip
+    sizes = struct.pack("<II", len(packed), len(columns))
+    return header.encode("latin-1") + b"DATA binary_compressed\n" + sizes + packed
+
+
+def test_a_compressed_pcd_with_a_second_header_in_its_comments() -> None:
+    """A reader that took `\x85` as the end of a line returned the memory behind the buffer."""
+    count = 853
+    header = (
+        "FIELDS x y z normal_x normal_y normal_z\nSIZE 4 4 4 1 1 1\nTYPE F F F U U U\n"
+        "#\x85FIELDS x y z\n#\x85SIZE 4 4 4\n#\x85TYPE F F F\n#\x85COUNT 1 1 1\n"
+        f"WIDTH {count}\nHEIGHT 1\nPOINTS {count}\n"
+    )
+    points = np.random.default_rng(0).normal(size=(3, count)).astype("<f4")
+    data = compressed_pcd(header, points.tobytes() + b"\7" * (3 * count))
+    cloud = read_file("pcd", data, MANY)
+    np.testing.assert_array_equal(cloud.points, points.T)
+    np.testing.assert_array_equal(cloud.normals, np.full((count, 3), 7))
+    short = compressed_pcd(header, points.tobytes())
+    with pytest.raises(InvalidRequest):
+        read_file("pcd", short, MANY)
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        b"",
+        b"\x1f" + bytes(32),  # ends early
+        b"\x0b" + bytes(12) + b"\x20\x0c",  # a reference before the start
+        b"\x0b" + bytes(12) + b"\xe0\xff",  # a reference cut off
+        b"\x0b" + bytes(12) + b"\xe0\xff\x00",  # more than is promised
+        b"\x0b" + bytes(11),  # a run cut off
+    ],
+)
+def test_lzf_that_does_not_give_what_it_promises(packed: bytes) -> None:
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
+    with pytest.raises(InvalidRequest):
+        read_file("pcd", compressed_pcd(header, bytes(24), packed), MANY)
+
+
+# Small files that took their worker with them.
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_npz_members_are_stored_or_deflated(method: int) -> None:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as archive:
+        archive.writestr("points.npy", npy(POINTS))
+    data = stream.getvalue().replace(b"\x5d\0\0\x80\0", b"\x5d\xff\xff\xff\xff")
+    with pytest.raises(InvalidRequest, match="savez"):
+        read_file("npz", data, MANY)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_npy_headers_that_nest_deeply(version: int) -> None:
+    text = b"-" * 9900 + b"1"
+    size = struct.pack("<H" if version == 1 else "<I", len(text))
+    with pytest.raises(InvalidRequest, match="writes"):
+        read_file("npy", b"\x93NUMPY" + bytes([version, 0]) + size + text, MANY)
+
+
+def test_a_png_of_very_many_chunks() -> None:
+    whole = png(IMAGES["depths"])
+    empty = struct.pack(">I", 0) + b"tEXt" + struct.pack(">I", zlib.crc32(b"tEXt"))
+    with pytest.raises(InvalidRequest, match="chunks") as caught:
+        read_png(whole[:33] + empty * 200_000 + whole[33:], MANY, "depth")
+    assert caught.value.field == "depth"
+    assert read_png(whole[:33] + empty * 20 + whole[33:], MANY, "depth").shape == (6, 10)
+
+
+def test_errors_of_images_tell_no_addresses() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_png(b"no image", MANY, "depth")
+    assert " at 0x" not in str(caught.value)
 
 
 NORMALS = np.random.default_rng(2).normal(size=(40, 3)).astype(np.float32)

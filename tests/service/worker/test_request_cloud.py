@@ -275,6 +275,13 @@ def test_normals_and_colours(kind: str) -> None:
         np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
 
 
+# NumPy adds the size to this offset in 32 bits: it read 2 GB behind the data.
+FAR_FIELDS = [
+    field | ({"offset": 2**31 - 4} if field["name"] == "z" else {})
+    for field in layout(cloud_of((1, 4)))["fields"]
+]
+
+
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
@@ -288,6 +295,7 @@ def test_normals_and_colours(kind: str) -> None:
         ({"row_step": 1}, "point_cloud2.row_step"),
         ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields"),
         ({"height": -1}, "point_cloud2.height"),
+        ({"fields": FAR_FIELDS}, "point_cloud2.fields"),
     ],
 )
 def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
