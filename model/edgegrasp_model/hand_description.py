@@ -37,6 +37,7 @@ UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are 
 GAP = 0.007  # metres without a point in which what is between the fingers ends
 HAND_DESCRIPTION_SIZE = 87
 HEIGHTS = slice(58, 61)  # of them: heights over the support plane
+BEYOND = slice(65, 67)  # of them: unseen metres from what each finger meets first outward
 
 
 def describe_hands(
