@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from edgegrasp_client.conversions import read_isaac_grasps
 from edgegrasp_service import server
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -79,6 +80,9 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
     page = open_page(real_server.http_url)
     assert len(shown(page)) == 12
     assert "grasps on" in page.inner_text("#summary")
+    scores = [float(line.inner_text().split()[1]) for line in shown(page)]
+    assert scores == sorted(scores, reverse=True)
+    assert page.inner_text("#rank") == "1"
     with_hands = bright(page)
     page.locator("#min_score").fill("1")
     assert page.locator("#grasps li:visible").count() == 0
@@ -105,6 +109,8 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
         page.get_by_text("Find grasps").click()
     answer = answered.value.json()
     page.locator("#reasons button").first.click()
+    reasons = page.locator("#reasons").bounding_box()
+    assert reasons["y"] + reasons["height"] < 900
     region = np.array([float(part) for part in center.input_value().split(",")])
     contacts = np.array([grasp["contact_point"] for grasp in answer["grasps"]])
     assert 0 < len(contacts) <= 50
@@ -118,6 +124,64 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
             assert json.loads(done.stdout)["grasps"] == answer["grasps"]
         else:
             assert done.stdout.count("[[") == len(contacts)
+
+
+def test_objects_and_points_are_asked_for_and_answers_saved(
+    real_server, open_page, tmp_path
+) -> None:
+    page = open_page(real_server.http_url)
+    shown(page)
+    page.get_by_text("detecting, by").wait_for()
+    save_screenshot(page)
+    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
+        page.locator("#objects button").nth(1).click()
+    number = int(page.locator("#objects button").nth(1).inner_text())
+    assert {grasp["object"] for grasp in answered.value.json()["grasps"]} == {number}
+    page.locator("#pick").click()
+    stage = page.locator("#stage").bounding_box()
+    with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
+        page.mouse.click(stage["x"] + stage["width"] / 2, stage["y"] + stage["height"] / 2)
+    assert answered.value.ok
+    assert '"at":[' in page.locator("#curl").text_content()
+
+    with page.expect_response(f"{real_server.http_url}/v1/grasps"):
+        page.locator("#all").click()
+    page.get_by_text("detecting, by").wait_for()
+    saved = {}
+    for kind in ("json", "isaac", "picture"):
+        with page.expect_download() as download:
+            page.locator(f"[data-save={kind}]").click()
+        saved[kind] = Path(download.value.path())
+    grasps = json.loads(saved["json"].read_text())["grasps"]
+    exported = read_isaac_grasps(saved["isaac"].read_text())
+    for grasp, each in zip(grasps, exported, strict=True):
+        np.testing.assert_allclose(each.T_object_gripper, grasp["T_cloud_hand"], atol=1e-5)
+    with Image.open(saved["picture"]) as picture:
+        assert min(picture.size) > 300
+
+    seen = [page.locator("#stage").screenshot()]
+    for change in ("top", "side", "camera"):
+        page.locator(f"[data-look={change}]").click()
+        seen.append(page.locator("#stage").screenshot())
+    page.locator("#point_size").fill("6")
+    seen.append(page.locator("#stage").screenshot())
+    assert len({*seen}) == len(seen)
+
+
+def save_screenshot(page: Any) -> None:
+    """Keep what a person would see: build/playground-WIDTH.png."""
+    folder = Path(__file__).parents[2] / "build"
+    folder.mkdir(exist_ok=True)
+    page.screenshot(path=folder / f"playground-{page.viewport_size['width']}.png", full_page=True)
+
+
+def test_the_button_covers_no_field(dummy_server, open_page) -> None:
+    page = open_page(dummy_server.http_url, 1600, 500)  # lower than the form
+    shown(page)
+    for field in page.locator("#ask input:visible, #ask select:visible").all():
+        field.scroll_into_view_if_needed()
+        box, button = field.bounding_box(), page.locator("button.go").bounding_box()
+        assert box["y"] + box["height"] <= button["y"] or box["y"] >= button["y"] + button["height"]
 
 
 def scenes(folder: Path) -> Iterator[tuple[int, list[Path]]]:
@@ -156,7 +220,8 @@ def test_files_of_every_kind_are_shown_and_sent(dummy_server, open_page, tmp_pat
             page.get_by_text("give the camera's fx, fy, cx, cy").wait_for()
             page.locator("#intrinsics").fill("30,30,15,10")
             page.get_by_text("Find grasps").click()
-        page.locator("#counts td").get_by_text(str(points), exact=True).first.wait_for()
+        counted = page.locator("#counts td").get_by_text(str(points), exact=True).first
+        counted.wait_for(state="attached")  # the table is folded
         assert len(shown(page)) == 10
     page.set_input_files("#files", [tmp_path / "color.png"])
     page.get_by_text("add the depth image").wait_for()
@@ -195,6 +260,7 @@ def test_a_server_with_tokens_is_asked_with_one(start_dummy, open_page, tmp_path
 def test_a_narrow_page_has_all_and_the_keyboard_reaches_it(dummy_server, open_page) -> None:
     page = open_page(dummy_server.http_url, 400, 800)
     shown(page)
+    save_screenshot(page)
     controls = page.locator(
         "button:visible, input:visible, select:visible, textarea:visible, pre:visible"
     )

@@ -1,7 +1,7 @@
 // The page: what is asked, of the same API as anyone's, and what is shown of the answer.
 
 import { NeedsCamera, readScene } from "./files.js";
-import { View, colorOf } from "./view.js";
+import { View, colorOf, partsOf } from "./view.js";
 
 const API = new URL("..", import.meta.url).href.replace(/\/$/, ""); // the server's own address
 const MOST_REJECTED = 300; // shown; more would hide the cloud
@@ -11,14 +11,18 @@ const REASONS = {
   suppressed: "near a better one", "beyond-top-k": "beyond top_k",
 };
 const $ = (id) => document.getElementById(id);
-const state = { files: [], scene: null, answer: null, fresh: true, shapes: {}, grippers: {}, chosen: null, busy: null };
+const state = {
+  files: [], scene: null, answer: null, fresh: true, // answer: its grasps by score; fresh: the first of its scene
+  shapes: {}, target: {}, objects: [], // of the request; target: options; objects: what it may be
+  grippers: {}, gripper: null, chosen: null, busy: null,
+};
 const view = picture();
 
 start();
 
 function picture() {
   try {
-    return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn });
+    return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn, aimed: takePoint, object: takeObject });
   } catch (error) {
     say("The picture needs WebGL, which this browser does not have or has switched off.", true);
     throw error;
@@ -58,7 +62,7 @@ async function openSample() {
 /** Read files and show them; whether that went well. */
 async function open(files) {
   state.files = files;
-  [state.answer, state.scene, state.fresh] = [null, null, true];
+  [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
   try {
@@ -102,13 +106,14 @@ function options() {
     const corner = (sign) => workspace.center.map((value, axis) => value + sign * workspace.half_extents[axis]);
     found.workspace = rounded({ min: corner(-1), max: corner(1) });
   }
+  Object.assign(found, state.target);
   if ($("debug").checked) found.debug = true;
   const more = $("more").value.trim();
   return more ? { ...found, ...JSON.parse(more) } : found;
 }
 
-function rounded(shape) {
-  return JSON.parse(JSON.stringify(shape, (_, value) => (typeof value === "number" ? +value.toFixed(5) : value)));
+function rounded(shape, digits = 5) {
+  return JSON.parse(JSON.stringify(shape, (_, value) => (typeof value === "number" ? +value.toFixed(digits) : value)));
 }
 
 /** A request, as `fetch` takes it. */
@@ -151,8 +156,9 @@ async function ask() {
     const start = performance.now();
     const { path, ...rest } = request(asked);
     const answer = await call(path, { method: "POST", signal: stop.signal, ...rest });
-    state.answer = answer;
-    view.showAnswer(answer, gripperOf(asked, answer.model), state.fresh);
+    answer.grasps.sort((one, other) => other.score - one.score);
+    [state.answer, state.gripper] = [answer, gripperOf(asked, answer.model)];
+    view.showAnswer(answer, state.gripper, state.fresh);
     state.fresh = false;
     showAnswer();
     say(`${((performance.now() - start) / 1000).toFixed(2)} s, of which ${answer.seconds.total.toFixed(2)} s detecting, by ${answer.model}.`);
@@ -223,9 +229,11 @@ function showAnswer() {
     row.append(element("td", name.replaceAll("_", " ")), element("td", count.toLocaleString("en")));
     return row;
   }));
+  $("merged").hidden = !answer?.objects.length;
+  if (!Object.keys(state.target).length) state.objects = answer?.objects ?? [];
   showReasons();
+  showTargets();
   filter();
-  choose(null);
 }
 
 function line(grasp, row) {
@@ -235,7 +243,7 @@ function line(grasp, row) {
   meter.style.setProperty("--tint", `#${colorOf(grasp.score).getHexString()}`);
   const where = grasp.object === null ? "" : `object ${grasp.object}`;
   button.append(element("span", row + 1), element("span", grasp.score.toFixed(3)), meter, element("small", where));
-  button.addEventListener("click", () => choose(row === state.chosen ? null : row));
+  button.addEventListener("click", () => choose(row));
   const item = element("li", "");
   item.append(button);
   return item;
@@ -249,7 +257,8 @@ function filter() {
   const grasps = state.answer?.grasps ?? [];
   const rows = grasps.map((_, row) => row).filter((row) => grasps[row].score >= least).slice(0, most);
   [...$("grasps").children].forEach((item, row) => (item.hidden = !rows.includes(row)));
-  if (state.answer) view.showHands(rows, grasps, $("whole").checked);
+  if (state.answer) view.showHands(rows);
+  choose(rows.includes(state.chosen) ? state.chosen : rows[0] ?? null);
 }
 
 function choose(row) {
@@ -259,7 +268,8 @@ function choose(row) {
   [...$("grasps").children].forEach((item, each) => item.firstChild.setAttribute("aria-pressed", each === row));
   $("chosen").hidden = !grasp;
   if (!grasp) return;
-  $("grasps").children[row].scrollIntoView({ block: "nearest" });
+  const [list, { offsetTop, offsetHeight }] = [$("grasps"), $("grasps").children[row]];
+  list.scrollTop = Math.min(Math.max(list.scrollTop, offsetTop + offsetHeight - list.clientHeight), offsetTop);
   $("rank").textContent = row + 1;
   const metres = (values) => `${values.map((value) => value.toFixed(3)).join(", ")} m`;
   const facts = {
@@ -278,7 +288,7 @@ function choose(row) {
 
 function showReasons() {
   const debug = state.answer?.debug;
-  $("reasons_hint").hidden = Boolean(debug);
+  $("keep").hidden = !state.answer || Boolean(debug);
   const found = {};
   debug?.outcome.forEach((outcome, row) => outcome === "returned" || (found[outcome] ??= []).push(debug.T_cloud_hand[row]));
   $("reasons").replaceChildren(...Object.entries(found).map(([outcome, poses]) => {
@@ -334,6 +344,64 @@ function inPython(value) {
   return `{${Object.entries(value).map(([name, each]) => `"${name}": ${inPython(each)}`).join(", ")}}`;
 }
 
+/** Save the picture, the answer, or its grasps as an `isaac_grasp` file. */
+async function save(kind) {
+  if (!state.answer) return say("There are no grasps yet.", true);
+  const text = { json: () => JSON.stringify(state.answer, null, 1), isaac: isaacGrasps }[kind]?.();
+  const blob = text ? new Blob([text]) : await view.picture();
+  const name = { json: "grasps.json", isaac: "grasps.yaml", picture: "grasps.png" }[kind];
+  const href = URL.createObjectURL(blob);
+  Object.assign(document.createElement("a"), { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), 10_000);
+}
+
+/** An `isaac_grasp` file, in the frame of the cloud; JSON is YAML too. */
+function isaacGrasps() {
+  const joints = (opening) => {
+    const panda = state.gripper === state.grippers.panda;
+    return panda ? { panda_finger_joint1: opening / 2, panda_finger_joint2: opening / 2 } : {};
+  };
+  const grasps = state.answer.grasps.map((grasp, row) => {
+    const { position, quaternion: [x, y, z, w] } = partsOf(grasp.T_cloud_hand);
+    const postures = { cspace_position: joints(0), pregrasp_cspace_position: joints(grasp.width) };
+    return [`grasp_${row}`, { confidence: grasp.score, position, orientation: { w, xyz: [x, y, z] }, ...postures }];
+  });
+  const frames = { object_frame_link: "cloud", gripper_frame_link: "hand" };
+  const file = { format: "isaac_grasp", format_version: 1.0, ...frames, grasps: Object.fromEntries(grasps) };
+  return JSON.stringify(rounded(file, 6), null, 1).replace('"format_version": 1,', '"format_version": 1.0,');
+}
+
+// The target: one object, or what is seen at a point
+
+function showTargets() {
+  const asked = state.target.objects?.include[0];
+  $("all").setAttribute("aria-pressed", String(!Object.keys(state.target).length));
+  const all = state.objects.map(({ number }) => number).sort((one, other) => one - other);
+  $("objects").replaceChildren(...all.map((number) => {
+    const button = Object.assign(element("button", number), { type: "button", title: `object ${number} only` });
+    button.setAttribute("aria-pressed", String(number === asked));
+    button.addEventListener("click", () => takeObject(number));
+    return button;
+  }));
+}
+
+/** Ask for the grasps of one object. */
+function takeObject(number) {
+  state.target = { objects: { include: [number] } };
+  return ask();
+}
+
+/** Ask for the grasps of the object that is seen at a point, cloud frame. */
+function takePoint(point) {
+  press(null);
+  if (!point) return say("No point there; click one of the cloud.", true);
+  const [x, y, z] = point;
+  const { camera, image } = state.scene;
+  if (image) state.target = { at: [Math.round((camera.fx * x) / z + camera.cx), Math.round((camera.fy * y) / z + camera.cy)] };
+  else state.target = { near: rounded(point) };
+  return ask();
+}
+
 // Shapes: region and workspace are boxes, the cone is one of directions
 
 function setShape(name, shape) {
@@ -385,9 +453,10 @@ function takeDrawn(points) {
 
 /** Show which of the drawing and editing buttons is at work. */
 function press(button) {
-  for (const each of document.querySelectorAll("[data-draw], [data-edit]")) {
+  for (const each of document.querySelectorAll("[data-draw], [data-edit], #pick")) {
     each.setAttribute("aria-pressed", String(each === button));
   }
+  view.startAiming(button === $("pick"));
   if (!button?.dataset.edit) view.edit(null);
 }
 
@@ -407,7 +476,22 @@ $("at_origin").addEventListener("click", async () => {
   $("viewpoint").value = "0,0,0";
   if (state.files.length && (await open(state.files))) await ask();
 });
-for (const name of ["min_score", "count", "whole"]) $(name).addEventListener("input", filter);
+for (const name of ["min_score", "count"]) $(name).addEventListener("input", filter);
+$("point_size").addEventListener("input", ({ target }) => view.setPointSize(Number(target.value)));
+$("all").addEventListener("click", () => {
+  state.target = {};
+  ask();
+});
+$("pick").addEventListener("click", ({ target }) => {
+  if (!state.scene) return;
+  const on = target.getAttribute("aria-pressed") !== "true";
+  press(on ? target : null);
+  if (on) say("Click a point of the object that is meant.");
+});
+$("keep").addEventListener("click", () => {
+  $("debug").checked = true;
+  ask();
+});
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
   setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: Math.PI / 6 } : null);
@@ -416,7 +500,7 @@ for (const name of ["region", "workspace", "cone"]) {
   $(`${name}_row`).addEventListener("change", ({ target }) => target.tagName === "INPUT" && typeShape(name));
 }
 document.addEventListener("click", ({ target, detail }) => {
-  const { draw, edit, mode, clear, copy } = target.dataset ?? {};
+  const { draw, edit, mode, clear, copy, look, save: kind } = target.dataset ?? {};
   if (draw && state.scene && !detail) { // by the keyboard
     const around = view.boxAround([view.target ?? view.middle], draw === "region");
     setShape(draw, { ...around, half_extents: [0.05, 0.05, 0.05] });
@@ -433,6 +517,8 @@ document.addEventListener("click", ({ target, detail }) => {
     if (on) view.edit(edit, mode);
   } else if (clear) setShape(clear, null);
   else if (copy) copyText(target, $(copy).textContent);
+  else if (look && state.scene) view.look(look);
+  else if (kind) save(kind);
 });
 document.addEventListener("change", ({ target }) => target.dataset.show && view.show(target.dataset.show, target.checked));
 for (const kind of ["dragover", "dragleave", "drop"]) {

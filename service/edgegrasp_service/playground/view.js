@@ -10,8 +10,10 @@ const UP = new THREE.Vector3(0, 0, 1);
 const MOST_POINTS = 500_000; // drawn; more would only hide each other
 const BAR = 0.004; // metres, thickness of a hand's outline
 const STEM = 0.04; // metres drawn behind the palm
-const NEAR = 14; // pixels from a hand within which a click means it
+const NEAR = 10; // pixels from a hand or a point within which a click means it
 const CONE = 0.12; // metres, length of the approach cone
+const FRUSTUM = 0.06; // metres, length of the camera's pyramid
+const AXES = 0.1; // metres, length of the cloud's axes
 const RIM = 0.0009; // metres of dark rim around a bar: hands stand out from things of any colour
 const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
 const BOX = new THREE.BoxGeometry(1, 1, 1);
@@ -24,10 +26,18 @@ export function colorOf(score) {
   return new THREE.Color().setRGB(share, 1 - share, 1, THREE.SRGBColorSpace);
 }
 
+/** Position and quaternion x, y, z, w of a pose (4, 4). */
+export function partsOf(pose) {
+  const [position, quaternion] = [new THREE.Vector3(), new THREE.Quaternion()];
+  new THREE.Matrix4().set(...pose.flat()).decompose(position, quaternion, new THREE.Vector3());
+  return { position: position.toArray(), quaternion: quaternion.toArray() };
+}
+
 /** The picture.
  * @param {HTMLElement} stage - it fills this
  * @param {{picked: (index: number | null) => void, edited: (name: string) => void,
- *   drawn: (points: number[]) => void}} tell
+ *   drawn: (points: number[]) => void, aimed: (place: number[] | null) => void,
+ *   object: (number: number) => void}} tell
  */
 export class View {
   constructor(stage, tell) {
@@ -48,10 +58,11 @@ export class View {
     sun.position.set(0.5, -1, 2);
     this.world.add(this.root, new THREE.HemisphereLight("white", "#556", 2.2), sun);
     this.groups = {};
-    for (const name of ["cloud", "plane", "objects", "hands", "points", "chosen", "rejected"]) {
+    for (const name of ["cloud", "frame", "plane", "objects", "hands", "chosen", "rejected"]) {
       this.root.add((this.groups[name] = new THREE.Group()));
     }
     this.shapes = {};
+    this.pointSize = 2;
     this.orbit = new OrbitControls(this.camera, this.canvas);
     this.orbit.listenToKeyEvents(this.canvas);
     this.orbit.addEventListener("change", () => this.draw());
@@ -69,11 +80,19 @@ export class View {
 
   /** Draw soon; many calls are one picture. */
   draw() {
-    this._due ??= requestAnimationFrame(() => {
-      this._due = null;
-      this.renderer.render(this.world, this.camera);
-      this._placeLabels();
-    });
+    this._due ??= requestAnimationFrame(() => this._render());
+  }
+
+  _render() {
+    this._due = null;
+    this.renderer.render(this.world, this.camera);
+    this._placeLabels();
+  }
+
+  /** What is seen, as a PNG file. */
+  picture() {
+    this._render(); // a canvas can be read only in the task that drew it
+    return new Promise((done) => this.canvas.toBlob(done));
   }
 
   _resize() {
@@ -91,7 +110,8 @@ export class View {
   showScene(scene) {
     this.groups.cloud.children[0]?.geometry.dispose();
     for (const group of Object.values(this.groups)) group.clear();
-    [this.labels, this.hands, this.target] = [[], [], null];
+    [this.hands, this.target] = [[], null];
+    this._showObjects([]);
     const count = scene.points.length / 3;
     const step = Math.ceil(count / MOST_POINTS);
     const [places, shades] = [[], []];
@@ -108,38 +128,62 @@ export class View {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(this.places, 3));
     geometry.setAttribute("color", new THREE.Float32BufferAttribute(shades, 3));
-    const look = { vertexColors: true, size: 2.2 * this.renderer.getPixelRatio(), sizeAttenuation: false };
+    const look = { vertexColors: true, sizeAttenuation: false };
     this.groups.cloud.add(new THREE.Points(geometry, new THREE.PointsMaterial(look)));
+    this.setPointSize(this.pointSize);
     this.middle = [0, 1, 2].map((axis) => median(this.places.filter((_, i) => i % 3 === axis)));
     this.root.quaternion.setFromUnitVectors(
       scene.camera ? new THREE.Vector3(0, -1, 0) : UP, UP);
     this.root.updateMatrixWorld();
-    this._lookFrom(scene);
+    this.eye = scene.camera ? [0, 0, 0] : scene.viewpoint;
+    const { height, fy } = scene.camera ?? {};
+    this.camera.fov = scene.camera ? (2 * Math.atan(height / 2 / fy) * 180) / Math.PI : 45;
+    this.camera.updateProjectionMatrix();
+    this._showFrame(scene);
+    this.look("camera");
   }
 
-  _lookFrom({ camera, viewpoint }) {
-    this.eyeKnown = Boolean(camera || viewpoint);
-    this.camera.fov = 45;
-    if (camera) {
-      this.camera.fov = (2 * Math.atan(camera.height / 2 / camera.fy) * 180) / Math.PI;
-      this.camera.position.set(0, 0, 0);
-    } else if (viewpoint) {
-      this.camera.position.copy(this._outside(viewpoint));
-    } else {
-      this._lookAt(this.middle);
-    }
-    this.camera.updateProjectionMatrix();
-    this.orbit.target.copy(this._outside(this.middle));
-    this.orbit.update();
+  /** Draw points so large.
+   * @param {number} size - pixels
+   */
+  setPointSize(size) {
+    this.pointSize = size;
+    const [points] = this.groups.cloud.children;
+    if (points) points.material.size = size * this.renderer.getPixelRatio();
     this.draw();
   }
 
-  /** Look aslant from the side of the cloud's origin, where cameras and robots mostly are. */
-  _lookAt(place) {
-    const target = this._outside(place);
-    const aside = this._outside([0, 0, 0]).sub(target).setZ(0);
+  /** The axes of the cloud's frame, x red, y green and z blue, and the camera. */
+  _showFrame({ camera }) {
+    this.groups.frame.add(new THREE.AxesHelper(AXES));
+    if (!this.eye) return;
+    const { fx, fy, cx, cy, width, height } = camera ?? { fx: 1, fy: 1, cx: 0.5, cy: 0.4, width: 1, height: 0.8 };
+    const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([column, row]) =>
+      new THREE.Vector3((column - cx) / fx, (row - cy) / fy, 1).multiplyScalar(FRUSTUM));
+    const ends = corners.flatMap((corner, row) => [new THREE.Vector3(), corner, corner, corners[(row + 1) % 4]]);
+    const geometry = new THREE.BufferGeometry().setFromPoints(ends);
+    const frustum = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: "#f4f4f5" }));
+    frustum.position.set(...this.eye);
+    const forward = new THREE.Vector3(...this.middle).sub(frustum.position).normalize();
+    if (!camera) frustum.quaternion.setFromUnitVectors(UP, forward);
+    this.groups.frame.add(frustum);
+  }
+
+  /** Look at the objects.
+   * @param {"camera" | "top" | "side"} from - where the camera is not known, "camera" is aslant
+   */
+  look(from) {
+    const target = this._outside(this.target ?? this.middle);
+    const eye = this._outside(this.eye ?? [0, 0, 0]);
+    const aside = eye.clone().sub(target).setZ(0); // cameras and robots are mostly there
     if (aside.length() < 0.1) aside.set(0.25, -0.7, 0);
-    this.camera.position.copy(target).add(aside.setLength(0.75)).setZ(target.z + 0.6);
+    const far = Math.min(Math.max(1.9 * eye.distanceTo(target), 0.9), 1.5); // with the camera in view
+    const [away, above] = { top: [0.001, far], side: [far, 0.02], camera: [0.75, 0.6] }[from];
+    this.camera.position.copy(target).add(aside.setLength(away)).addScaledVector(UP, above);
+    if (from === "camera" && this.eye) this.camera.position.copy(eye);
+    this.orbit.target.copy(target);
+    this.orbit.update();
+    this.draw();
   }
 
   /** From the cloud's frame to the picture's. */
@@ -147,15 +191,11 @@ export class View {
     return this.root.localToWorld(new THREE.Vector3(...place));
   }
 
-  /** Turn the picture upright, and look at the objects, from where the camera stood if it is known. */
-  _turn(up, target) {
-    const eye = this.root.worldToLocal(this.camera.position.clone());
-    this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...up), UP);
-    this.root.updateMatrixWorld();
-    if (this.eyeKnown) this.camera.position.copy(this.root.localToWorld(eye));
-    else this._lookAt(target);
-    this.orbit.target.copy(this._outside(target));
-    this.orbit.update();
+  /** Where a place of the cloud's frame is seen: pixels of the stage; z is over 1 behind the camera. */
+  _pixel(place) {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    const { x, y, z } = this.root.localToWorld(place.clone()).project(this.camera);
+    return { x: ((x + 1) / 2) * width, y: ((1 - y) / 2) * height, z };
   }
 
   // The answer
@@ -167,16 +207,18 @@ export class View {
    */
   showAnswer(answer, gripper, first) {
     this.gripper = gripper;
-    this.hands = answer.grasps.map((grasp) => this._outline(grasp, colorOf(grasp.score)));
+    this.hands = answer.grasps.map((grasp) =>
+      this._lines([grasp.T_cloud_hand], grasp.width, { color: colorOf(grasp.score) }));
     fill(this.groups.hands, this.hands);
-    fill(this.groups.points, answer.grasps.flatMap(ends));
     this.groups.rejected.clear();
     this._showObjects(answer.objects);
     const middles = answer.objects.map((object) => object.center);
     const target = middles.length ? [0, 1, 2].map((axis) => mean(middles.map((m) => m[axis]))) : this.middle;
     this._showPlane(answer.support, target);
     this.target = target;
-    if (first) this._turn(answer.up, target);
+    this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...answer.up), UP);
+    this.root.updateMatrixWorld();
+    if (first) this.look("camera");
     this.choose(null);
   }
 
@@ -188,20 +230,21 @@ export class View {
       box.quaternion.set(...object.quaternion);
       box.scale.set(...object.half_extents).multiplyScalar(2);
       this.groups.objects.add(box);
-      return { place: object.center, text: `${object.number}` };
+      return box.position;
     });
-    this.stage.querySelector(".labels").replaceChildren(
-      ...this.labels.map(({ text }) => Object.assign(document.createElement("span"), { textContent: text })),
-    );
+    this.stage.querySelector(".labels").replaceChildren(...objects.map(({ number }) => {
+      const label = Object.assign(document.createElement("button"), { type: "button", textContent: number, tabIndex: -1 });
+      label.addEventListener("click", () => this.tell.object(number));
+      return label;
+    }));
   }
 
   _placeLabels() {
-    const { clientWidth: width, clientHeight: height } = this.stage;
-    const spans = this.stage.querySelectorAll(".labels span");
-    (this.labels ?? []).forEach(({ place }, row) => {
-      const { x, y, z } = this._outside(place).project(this.camera);
-      spans[row].hidden = z > 1 || !this.groups.objects.visible;
-      spans[row].style.transform = `translate(${((x + 1) / 2) * width}px, ${((1 - y) / 2) * height}px)`;
+    const labels = this.stage.querySelectorAll(".labels button");
+    (this.labels ?? []).forEach((place, row) => {
+      const { x, y, z } = this._pixel(place);
+      labels[row].hidden = z > 1 || !this.groups.objects.visible;
+      labels[row].style.transform = `translate(${x}px, ${y}px)`;
     });
   }
 
@@ -217,7 +260,20 @@ export class View {
     this.groups.plane.add(grid);
   }
 
-  /** A slim hand: stem, palm and the fingers at their opening. */
+  /** Hands as thin lines, of poses `T_cloud_hand`: stem, palm and the fingers at their opening. */
+  _lines(poses, width, look) {
+    const [half, palm, tip] = this._reach(width);
+    const ends = [[0, palm - STEM], [0, palm], [-half, palm], [half, palm], [-half, palm], [-half, tip],
+      [half, palm], [half, tip]];
+    const places = poses.flatMap((pose) =>
+      ends.flatMap(([y, z]) => [0, 1, 2].map((row) => pose[row][1] * y + pose[row][2] * z + pose[row][3])),
+    );
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(places, 3));
+    return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look));
+  }
+
+  /** The chosen hand: stem, palm and the fingers at their opening. */
   _outline(grasp, color) {
     const look = new THREE.MeshStandardMaterial({ color, roughness: 0.55, emissive: color, emissiveIntensity: 0.45 });
     const [half, palm, tip] = this._reach(grasp.width);
@@ -253,8 +309,8 @@ export class View {
 
   /** The gripper's own boxes at a grasp, as collisions are checked with. */
   _body(grasp, color) {
-    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.2, depthWrite: false });
-    const line = new THREE.LineBasicMaterial({ color });
+    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.08, depthWrite: false });
+    const line = new THREE.LineBasicMaterial({ color, transparent: true, opacity: 0.5 });
     const hand = new THREE.Group();
     const add = ([low, high], y, z) => {
       for (const part of [new THREE.Mesh(BOX, look), new THREE.LineSegments(EDGES, line)]) {
@@ -272,49 +328,31 @@ export class View {
     return placed(hand, grasp.T_cloud_hand);
   }
 
-  /** Show the hands of these rows; their own boxes where `whole`. */
-  showHands(rows, grasps, whole) {
+  /** Show the hands of these rows. */
+  showHands(rows) {
     const shown = new Set(rows);
     this.hands.forEach((hand, row) => (hand.visible = shown.has(row)));
-    this.groups.points.children.forEach((each, row) => (each.visible = shown.has(row >> 1)));
-    this.groups.hands.children.slice(this.hands.length).forEach((body) => body.removeFromParent());
-    for (const row of whole ? rows : []) {
-      this.groups.hands.add(this._body(grasps[row], colorOf(grasps[row].score)));
-    }
     this.draw();
   }
 
-  /** Mark a grasp: its hand, both its points and the way in, the others pale; null: none. */
+  /** Draw one grasp's hand, both its points and the way in; null: none. */
   choose(grasp) {
     const group = this.groups.chosen.clear();
-    for (const bar of this.hands.flatMap((hand) => hand.children)) {
-      Object.assign(bar.material, { transparent: Boolean(grasp), opacity: grasp ? 0.3 : 1, needsUpdate: true });
-      bar.children[0].visible = !grasp; // its rim
-    }
     if (grasp) {
-      const outline = this._outline(grasp, new THREE.Color("white"));
-      outline.children.forEach((bar) => bar.scale.multiplyScalar(1.02));
-      const palm = new THREE.Vector3(0, 0, this.gripper.palm_z - STEM);
-      const tail = palm.clone().applyMatrix4(outline.matrix);
+      const color = colorOf(grasp.score);
+      const outline = this._outline(grasp, color);
+      const tail = new THREE.Vector3(0, 0, this.gripper.palm_z - STEM).applyMatrix4(outline.matrix);
       const way = new THREE.Vector3(...grasp.approach_direction);
-      const arrow = new THREE.ArrowHelper(way, tail.clone().addScaledVector(way, -0.08), 0.075, "white", 0.02, 0.012);
-      group.add(this._body(grasp, colorOf(grasp.score)), outline, arrow, ...ends(grasp, 0.004));
+      const arrow = new THREE.ArrowHelper(way, tail.addScaledVector(way, -0.08), 0.075, "white", 0.02, 0.012);
+      group.add(this._body(grasp, color), outline, arrow, ...ends(grasp));
     }
     this.draw();
   }
 
-  /** Show outlines of candidates as lines: `T_cloud_hand` of each. */
+  /** Show outlines of candidates: `T_cloud_hand` of each. */
   showRejected(poses) {
-    const [half, palm, tip] = this._reach(this.gripper.max_opening);
-    const ends = [[0, palm - STEM], [0, palm], [-half, palm], [half, palm], [-half, palm], [-half, tip],
-      [half, palm], [half, tip]];
-    const places = poses.flatMap((pose) =>
-      ends.flatMap(([y, z]) => [0, 1, 2].map((row) => pose[row][1] * y + pose[row][2] * z + pose[row][3])),
-    );
-    const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.Float32BufferAttribute(places, 3));
     const look = { color: "#ff6b6b", transparent: true, opacity: 0.45 };
-    this.groups.rejected.clear().add(new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look)));
+    this.groups.rejected.clear().add(this._lines(poses, this.gripper.max_opening, look));
     this.draw();
   }
 
@@ -403,6 +441,12 @@ export class View {
     this.stage.classList.add("drawing");
   }
 
+  /** Let the next click mean a point of the cloud, which `tell.aimed` gets. */
+  startAiming(on) {
+    this.aiming = on;
+    this.stage.classList.toggle("drawing", on);
+  }
+
   _listen() {
     const band = this.stage.querySelector(".band");
     let from = null;
@@ -431,31 +475,45 @@ export class View {
         this.stage.classList.remove("drawing");
         this.tell.drawn(this._within(start, end));
       } else if (Math.hypot(end[0] - start[0], end[1] - start[1]) < 4 && !this.gizmo.dragging) {
-        this._pick(end);
+        if (this.aiming) this.tell.aimed(this._pointAt(end));
+        else this.tell.picked(this._handAt(end));
       }
     });
   }
 
-  /** The hand nearest to the mouse, if it is near. */
-  _pick([x, y]) {
-    const { clientWidth: width, clientHeight: height } = this.stage;
+  /** The row of the hand nearest to the mouse, if it is near. */
+  _handAt([x, y]) {
     let [found, nearest] = [null, NEAR];
+    const [from, to] = [new THREE.Vector3(), new THREE.Vector3()];
     (this.hands ?? []).forEach((hand, row) => {
-      for (const bar of hand.visible ? hand.children : []) {
-        for (const along of [-0.5, -0.25, 0, 0.25, 0.5]) {
-          const place = new THREE.Vector3(0, 0, 0).setComponent(bar.scale.y > bar.scale.z ? 1 : 2, along);
-          const { x: right, y: up } = bar.localToWorld(place).project(this.camera);
-          const away = Math.hypot(((right + 1) / 2) * width - x, ((1 - up) / 2) * height - y);
+      const places = hand.geometry.attributes.position;
+      for (let end = 0; hand.visible && end < places.count; end += 2) {
+        for (const along of [0, 0.25, 0.5, 0.75, 1]) {
+          from.fromBufferAttribute(places, end).lerp(to.fromBufferAttribute(places, end + 1), along);
+          const pixel = this._pixel(from);
+          const away = Math.hypot(pixel.x - x, pixel.y - y);
           if (away < nearest) [found, nearest] = [row, away];
         }
       }
     });
-    this.tell.picked(found);
+    return found;
+  }
+
+  /** The point of the cloud that is seen at the mouse, cloud frame. */
+  _pointAt([x, y]) {
+    let [found, nearest] = [null, 1];
+    const place = new THREE.Vector3();
+    for (let at = 0; at < this.places.length; at += 3) {
+      const pixel = this._pixel(place.fromArray(this.places, at));
+      if (pixel.z < nearest && Math.hypot(pixel.x - x, pixel.y - y) < NEAR / 2) {
+        [found, nearest] = [place.toArray(), pixel.z];
+      }
+    }
+    return found;
   }
 
   /** The points in a rectangle, pixels: of what is in front, and not of the plane. */
   _within(start, end) {
-    const { clientWidth: width, clientHeight: height } = this.stage;
     const [left, right] = [start[0], end[0]].sort((a, b) => a - b);
     const [top, bottom] = [start[1], end[1]].sort((a, b) => a - b);
     const found = [];
@@ -466,9 +524,8 @@ export class View {
       place.fromArray(this.places, at);
       if (grid && place.clone().sub(grid.position).dot(normal) < 0.006) continue;
       const distance = this.root.localToWorld(place.clone()).distanceTo(this.camera.position);
-      const { x, y, z } = this.root.localToWorld(place).project(this.camera);
-      const [column, row] = [((x + 1) / 2) * width, ((1 - y) / 2) * height];
-      if (z < 1 && column >= left && column <= right && row >= top && row <= bottom) {
+      const { x, y, z } = this._pixel(place);
+      if (z < 1 && x >= left && x <= right && y >= top && y <= bottom) {
         found.push({ distance, point: [...this.places.subarray(at, at + 3)] });
       }
     }
@@ -510,10 +567,10 @@ function fill(group, children) {
 }
 
 /** The approach point and the contact point of a grasp. */
-function ends({ approach_point, contact_point }, radius = 0.0025) {
+function ends({ approach_point, contact_point }) {
   return [[approach_point, "#4cc9f0"], [contact_point, "#ff9f1c"]].map(([place, color]) => {
     const look = new THREE.MeshBasicMaterial({ color });
-    const made = new THREE.Mesh(new THREE.SphereGeometry(radius, 12, 8), look);
+    const made = new THREE.Mesh(new THREE.SphereGeometry(0.004, 12, 8), look);
     made.position.set(...place);
     return made;
   });
