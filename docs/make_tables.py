@@ -123,9 +123,10 @@ def blocks(kept: Path) -> dict[str, str]:
     others = [r for r in records if "/" not in r["objects"]["name"]]
     with_panda = [r for r in records if r not in others and r["hand"] == "panda"]
     written = {
-        scene: _benchmark_table([r for r in with_panda if r["scene"] == scene], scene)
+        scene: _benchmark_table([r for r in with_panda if r["scene"] == scene])
         for scene in SCENES + CAMERA_SCENES
     }
+    written["published"] = _papers_table()
     written["commands"] = _commands(with_panda)
     written["adversarial"] = _scores_table(others) + "\n" + _commands(others)
     written["hands"] = _scores_table(_hands(records)) + "\n![Hands](results/hands.png)\n"
@@ -171,7 +172,7 @@ def command_of(record: dict[str, Any]) -> str:
     return shlex.join(words)
 
 
-def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
+def _benchmark_table(records: Sequence[dict[str, Any]]) -> str:
     head = ("weights or planner", "protocol", "samples", "rounds", "GSR", "DR", "planning")
     lines: list[tuple[str, ...]] = []
     for record in records:
@@ -190,10 +191,6 @@ def _benchmark_table(records: Sequence[dict[str, Any]], scene: str) -> str:
                 f"{seconds:.2f} s" if seconds is not None else "",
             )
         )
-    for protocol in ("edgegrasp", "giga-cropped"):
-        for row in published(protocol, scene):
-            title, samples = f"*{row['method']}* ({row['source']})", row.get("samples", "")
-            lines.append((title, protocol, samples, "", *published_rates(row), ""))
     return table(head, lines)
 
 
@@ -286,6 +283,18 @@ def curves_figure(curves: Curves) -> Figure:
         axes.grid(alpha=0.25)
         axes.legend(fontsize=8)
     return figure
+
+
+def _papers_table() -> str:
+    """Every published figure with its paper, scenes side by side."""
+    lines = []
+    for protocol, view in (("edgegrasp", "random"), ("giga", "fixed, from the side")):
+        scenes = [{row["method"]: row for row in published(protocol, scene)} for scene in SCENES]
+        for method, row in scenes[0].items():
+            rates = [cell for scene in scenes for cell in published_rates(scene[method])]
+            lines.append((f"[{method}]({row['paper']})", view, row["source"], *rates))
+    head = ("method", "view", "source or cost", "packed: GSR", "DR", "pile: GSR", "DR")
+    return table(head, lines)
 
 
 def _published_table(methods: Sequence[str]) -> Iterator[str]:

@@ -13,6 +13,7 @@ table { border-collapse: collapse; margin: .8em 0; }
 th, td { padding: .28em .9em .28em 0; text-align: left; border-bottom: 1px solid #e6e9ed;
          vertical-align: top; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
 img { max-width: 100%; margin: 1.2em 0; }
+@media (max-width: 700px) { body { margin-top: 1em; } table { display: block; overflow-x: auto; } }
 """
 Row = Sequence[object]
 
@@ -21,6 +22,7 @@ def page(title: str, parts: Iterable[str]) -> str:
     """A page of parts that are HTML already, below a title that is not."""
     title = escape(title)
     head = "<!doctype html><html lang=en><head><meta charset=utf-8>"
+    head += "<meta name=viewport content='width=device-width, initial-scale=1'>"
     start = f"{head}<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>"
     return "\n".join([start, *parts, "</body></html>\n"])
 
