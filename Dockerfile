@@ -51,9 +51,13 @@ COPY model model
 COPY proto proto
 COPY service service
 RUN /tools/bin/pip install --no-deps .
-# Loads as a server does: modules and loops are compiled that it needs, and no others; loops for what
-# processors have had since 2013, and for AVX-512 where this one has it.
-RUN for kind in x86-64-v3 $(grep -q avx512vl /proc/cpuinfo && echo x86-64-v4); do \
+# Loads as a server does: modules and loops are compiled that it needs, and no others. Loops of x86-64 are
+# for what processors have had since 2013, and for AVX-512 where this one has it; of others for every one.
+RUN kinds=generic \
+    && if [ "$(uname -m)" = x86_64 ]; then \
+        kinds="x86-64-v3 $(grep -q avx512vl /proc/cpuinfo && echo x86-64-v4)"; \
+    fi \
+    && for kind in $kinds; do \
         NUMBA_CACHE_DIR=/venv/loops/$kind NUMBA_CPU_NAME=$kind NUMBA_CPU_FEATURES='' \
             /venv/bin/python -c 'import edgegrasp_cli.serve, edgegrasp_service.server; \
             from edgegrasp_service.worker.answer import Settings, load_catalogue; \

@@ -29,7 +29,8 @@ $(INSTALLED) $(TO_LOOK): pyproject.toml constraints.txt scripts/system_packages.
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python scripts/install.py constraints.txt $(TORCH)
 	$(BIN)/python scripts/install.py constraints.txt --editable '.[$(EXTRA)]'
-	-$(BIN)/python scripts/install.py constraints.txt --editable '.[open3d]' # not for glibc < 2.35
+	-[ $(EXTRA) != dev ] || \
+		$(BIN)/python scripts/install.py constraints.txt --editable '.[open3d]' # not for glibc < 2.35
 	@touch $@
 
 $(TOOLS): $(INSTALLED)

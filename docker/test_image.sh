@@ -5,6 +5,7 @@
 # usage: docker/test_image.sh [python]    of an environment with the service, to compare with
 #
 # TORCH: what pip is to install as torch, see the Dockerfile.
+# PLATFORM: linux/arm64 or linux/amd64 in the place of this machine's own; another's needs qemu-user and binfmt.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/bare_debian.sh
@@ -20,6 +21,14 @@ for program in apt-get podman buildah runc debootstrap; do
     command -v $program >/dev/null ||
         skip "no $program here; on Debian: apt-get install --no-install-recommends $packages"
 done
+
+platform=${PLATFORM:-linux/$(dpkg --print-architecture)}
+architecture=${platform#linux/}
+if [ "$architecture" != "$(dpkg --print-architecture)" ]; then
+    case $architecture in arm64) emulator=qemu-aarch64 ;; *) emulator=qemu-x86_64 ;; esac
+    [ -e /proc/sys/fs/binfmt_misc/$emulator ] ||
+        skip "the kernel runs no $architecture programs here; on Debian: apt-get install qemu-user-static"
+fi
 
 work=$(mktemp -d)
 name=edgegrasp-test-$$
@@ -38,12 +47,12 @@ runtime = "runc"
 cgroup_manager = "cgroupfs"
 CONF
 
-base=localhost/edgegrasp-base
-if ! podman image exists $base; then
+base=localhost/edgegrasp-base-$architecture
+if ! podman image exists "$base"; then
     bare_debian "$work/base" python3,python3-venv,ca-certificates
     # As the slim images do.
     rm -rf "$work"/base/usr/share/{doc,info,locale,man}/* "$work"/base/var/{cache/apt,lib/apt/lists}/*
-    tar -C "$work/base" -c . | podman import --quiet - $base
+    tar -C "$work/base" -c . | podman import --quiet --arch "$architecture" - "$base"
     rm -rf "$work/base"
 fi
 
@@ -58,7 +67,7 @@ if [ -z "$torch" ] && grep -q '^find-links' "$work/pip.conf"; then
     torch="--no-deps torch" # a build of this machine's own
 fi
 buildah bud --quiet --format docker --isolation chroot --layers --tag localhost/edgegrasp \
-    --build-arg BASE=$base --build-arg VERSION="$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)" \
+    --platform "$platform" --build-arg "BASE=$base" --build-arg VERSION="$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)" \
     ${torch:+--build-arg "TORCH=$torch"} \
     --volume "$work/pip.conf:/etc/pip.conf:ro" "${mounts[@]}" . >"$work/log" 2>&1 ||
     { tail -n 40 "$work/log" && exit 1; }

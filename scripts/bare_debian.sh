@@ -2,13 +2,13 @@
 # shellcheck shell=bash
 
 # bare_debian FOLDER PACKAGES [SUITE]: Debian from the mirror that apt-get uses here, this machine's
-# own release unless another is named.
+# own release unless another is named, for $architecture where that is set.
 bare_debian() {
     local mirror suite
     read -r mirror suite < <(
         apt-get indextargets --format '$(REPO_URI) $(CODENAME)' 'Created-By: Packages' | head -n 1
     )
-    debootstrap --variant=minbase --include="$2" "${3:-$suite}" "$1" "$mirror" >"$1.log" ||
+    debootstrap ${architecture:+--arch="$architecture"} --variant=minbase --include="$2" "${3:-$suite}" "$1" "$mirror" >"$1.log" ||
         { cat "$1.log" && return 1; }
 }
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Make sure the system has what pip cannot install: Python's venv module, and the shared libraries
-# that Open3D and MuJoCo load. Installs them where it may (root, with apt-get), and otherwise names
+# that MuJoCo and Open3D load. Installs them where it may (root, with apt-get), and otherwise names
 # the command to run.
 #
 # usage: scripts/system_packages.sh [python]
@@ -50,8 +50,7 @@ echo "missing system packages (names as on Debian): ${missing[*]}"
 
 if ! command -v apt-get >/dev/null; then
     echo "warning: no apt-get here; install them with this system's own tool. Without the" \
-        "libraries, Open3D (reading .ply and .pcd files) does not import, and MuJoCo draws no" \
-        "images." >&2
+        "libraries, MuJoCo draws no images, and Open3D (benchmarks and tests) does not import." >&2
     exit 0
 fi
 
