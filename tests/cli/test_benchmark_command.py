@@ -85,6 +85,7 @@ def test_a_result_below_the_gate_fails(edge_sample: Path, oracle: Path, refused,
 
 def test_the_report_shows_tables_plots_and_pictures(edge_sample: Path) -> None:
     page = (edge_sample / "report.html").read_text()
+    assert "name=viewport" in page  # a phone shows it as wide as itself
     failed = sum(bool(row["cause"]) for row in attempts(edge_sample))
     assert "data:image/png" in page  # plots
     assert page.count("data:image/jpeg") == min(failed, 6) > 0
