@@ -26,7 +26,7 @@ FLAGS = (
     *("--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
 )
-PATIENCE = 60_000  # milliseconds; longer than anything takes
+PATIENCE = 180_000  # milliseconds; longer than anything takes
 
 
 @pytest.fixture(scope="module")
