@@ -51,7 +51,7 @@ DECIDED = (
 
 @takes_flags(connection=CONNECTION, options=option_flags(*DECIDED, defaults=False))
 def benchmark(
-    scene: Annotated[str, Option(help="packed, pile, bin or table.")] = "pile",
+    scene: Annotated[str, Option(help="packed, pile, bin, bin-full, table or shelf.")] = "pile",
     protocol: Annotated[
         str, Option(help="edgegrasp, giga, vgn, robot, or a .toml file of the same kind.")
     ] = "edgegrasp",

@@ -42,7 +42,9 @@ def experiment(
     seeds: Seeds = None,
     scene: Annotated[
         list[str] | None,
-        Option(help="packed, pile, bin, table; may be repeated. Else the first two."),
+        Option(
+            help="packed, pile, bin, bin-full, table, shelf; may be repeated. Else the first two."
+        ),
     ] = None,
     protocol: Annotated[str, Option(help="The protocol that is varied.")] = "edgegrasp",
     model: Annotated[

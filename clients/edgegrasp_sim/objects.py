@@ -42,19 +42,26 @@ logger = logging.getLogger(__name__)
 class SceneKind(StrEnum):
     """How a scene is made.
 
-    Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, or put on a
-    table among larger things.
+    Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, some or until
+    it is full, put on a table among larger things, or into a compartment of a shelf.
     """
 
     PACKED = "packed"
     PILE = "pile"
     BIN = "bin"
     TABLE = "table"
+    FULL_BIN = "bin-full"
+    SHELF = "shelf"
 
     @property
     def objects(self) -> "SceneKind":
         """The kind whose objects it is made of where it has none of its own."""
-        return {SceneKind.BIN: SceneKind.PILE, SceneKind.TABLE: SceneKind.PACKED}.get(self, self)
+        match self:
+            case SceneKind.BIN | SceneKind.FULL_BIN:
+                return SceneKind.PILE
+            case SceneKind.TABLE | SceneKind.SHELF:
+                return SceneKind.PACKED
+        return self
 
     @classmethod
     def _missing_(cls, value: object) -> Never:
@@ -136,9 +143,9 @@ class ObjectSet:
     def from_folder(cls, root: Path, scene: SceneKind, split: str = "test") -> "ObjectSet":
         """The objects of a folder, sorted by name.
 
-        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins and tables
-        those of piles and packed scenes where they have no such folder, or in `root` itself where
-        there is none at all. Where there are none, they are the meshes there, `.obj` or
+        These are the URDF files in `<root>/<scene>/<split>` (VGN's layout), for bins, tables and
+        shelves those of piles and packed scenes where they have no such folder, or in `root` itself
+        where there is none at all. Where there are none, they are the meshes there, `.obj` or
         `.stl`: see `prepare_mesh`.
 
         Raises:

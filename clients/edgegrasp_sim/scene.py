@@ -1,4 +1,4 @@
-"""Making packed and pile scenes, full bins and crowded tables, and bringing them to rest."""
+"""Making packed and pile scenes, bins, crowded tables and shelves, and bringing them to rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,6 @@ from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
     SIZE,
     TABLE_HEIGHT,
-    TABLE_REACH,
     Box,
     Surroundings,
 )
@@ -32,7 +31,12 @@ PILE_BOX_WALL = 0.0039  # metres
 
 BIN_DROP_HEIGHT = 0.08  # metres above the walls
 BIN_DROP_SHARE = 0.25  # of a bin's length and width, beside which nothing is dropped: as poured in
+FULL_DROP_SHARE = 0.12  # the same of a bin that gets full
 BIN_DROP_SECONDS = 0.5
+
+POUR = 4  # objects at a time into a bin that gets full
+COVERED = 0.85  # of a bin's floor that objects hide from above, where it is full
+RAYS = 24  # along each side of it, that tell
 
 TABLE_ATTEMPTS = 4  # for each object
 LYING_SHARE = 0.4  # of the objects on a table, which are dropped in any pose
@@ -107,7 +111,7 @@ def make_table(
     num_objects: int,
     scales: tuple[float, float] = PACKED_SCALE,
 ) -> list[SceneObject]:
-    """Put objects on a table beside larger things: most upright, some lying as they fall.
+    """Put objects on a table or a shelf beside what is there: most upright, some as they fall.
 
     Up to `TABLE_ATTEMPTS` objects are drawn for each, so that there may be fewer than asked for.
     """
@@ -116,7 +120,8 @@ def make_table(
         if len(placed) >= num_objects:
             break
         model = objects.sample(rng)
-        x, y = MIDDLE + rng.uniform(-TABLE_REACH, TABLE_REACH, size=2)
+        reach = np.array(surroundings.reach)
+        x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
         lying = rng.random() < LYING_SHARE
         quaternion = Rotation.random(rng=rng).as_quat().tolist() if lying else _upright(rng)
         scale = float(rng.uniform(*scales))
@@ -133,13 +138,53 @@ def make_bin(
     scales: tuple[float, float] = PILE_SCALE,
 ) -> list[SceneObject]:
     """Drop objects into a bin one after another; those that do not fit in it are taken away."""
+    dropped = _pour(world, surroundings, objects, rng, num_objects, scales, BIN_DROP_SHARE)
+    return settle(world, dropped, surroundings)
+
+
+def make_full_bin(
+    world: World,
+    surroundings: Surroundings,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float] = PILE_SCALE,
+) -> list[SceneObject]:
+    """Pour objects into a bin, all over it, until they hide its floor, or are as many as asked."""
+    placed: list[SceneObject] = []
+    while len(placed) < num_objects and _covered(world, surroundings, placed) < COVERED:
+        number = min(POUR, num_objects - len(placed))
+        new = _pour(world, surroundings, objects, rng, number, scales, FULL_DROP_SHARE)
+        placed = settle(world, [*placed, *new], surroundings)
+    return placed
+
+
+def _pour(
+    world: World,
+    surroundings: Surroundings,
+    objects: ObjectSet,
+    rng: np.random.Generator,
+    num_objects: int,
+    scales: tuple[float, float],
+    share: float,
+) -> list[SceneObject]:
+    """Drop objects into a bin, but for a share of its length and width along each side."""
     low, high = np.asarray(surroundings.bounds)[:, :2]
-    margin = BIN_DROP_SHARE * (high - low)
+    margin = share * (high - low)
     walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
     where = low + margin, high - margin
     height = walls + BIN_DROP_HEIGHT
-    dropped = _drop(world, objects, rng, num_objects, scales, where, height, BIN_DROP_SECONDS)
-    return settle(world, dropped, surroundings)
+    return _drop(world, objects, rng, num_objects, scales, where, height, BIN_DROP_SECONDS)
+
+
+def _covered(world: World, surroundings: Surroundings, placed: Sequence[SceneObject]) -> float:
+    """The share of a bin's floor that objects hide from above."""
+    low, high = np.asarray(surroundings.bounds)[:, :2]
+    steps = (np.arange(RAYS) + 0.5) / RAYS
+    place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
+    starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
+    hits = world.first_hits(starts, ends)
+    return float(np.isin(hits, [item.body.uid for item in placed]).mean())
 
 
 def make_pile(

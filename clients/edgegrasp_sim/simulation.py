@@ -33,6 +33,7 @@ from edgegrasp_sim.scene import (
     SceneObject,
     load_object,
     make_bin,
+    make_full_bin,
     make_packed,
     make_pile,
     make_table,
@@ -42,10 +43,12 @@ from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
     OPEN_THICKNESS,
+    SMALL_BIN,
     TABLE_HEIGHT,
     Surroundings,
     open_table,
     random_bin,
+    random_shelf,
     random_table,
 )
 
@@ -204,7 +207,7 @@ class ClutterSimulation:
         """Make a new scene at rest.
 
         Args:
-            scene: `packed`, `pile`, `bin` or `table`.
+            scene: `packed`, `pile`, `bin`, `table`, `bin-full` or `shelf`.
             rng: the scene's own stream.
             num_objects: how many to try to place.
             scales: range of the factor on the objects' size; by default the scene's own.
@@ -235,6 +238,14 @@ class ClutterSimulation:
                 made = make_bin(self.world, around, objects, rng, num_objects, given)
             case SceneKind.TABLE:
                 around = self._clear(random_table(rng))
+                given = scales or PACKED_SCALE
+                made = make_table(self.world, around, objects, rng, num_objects, given)
+            case SceneKind.FULL_BIN:
+                around = self._clear(random_bin(rng, SMALL_BIN))
+                given = scales or PILE_SCALE
+                made = make_full_bin(self.world, around, objects, rng, num_objects, given)
+            case SceneKind.SHELF:
+                around = self._clear(random_shelf(rng))
                 given = scales or PACKED_SCALE
                 made = make_table(self.world, around, objects, rng, num_objects, given)
         self._objects = made

@@ -1,4 +1,4 @@
-"""What a scene's objects stand in: a table, an open bin, or a table with larger things on it.
+"""What a scene's objects stand in: a table, an open bin, a crowded table, or a shelf.
 
 Nothing of it ever moves. The plane that the objects rest on lies at `TABLE_HEIGHT` in every scene.
 """
@@ -26,7 +26,8 @@ MIDDLE = SIZE / 2  # metres, x and y of the middle of every scene
 
 # Metres, inside. The palm of the Panda's hand is 20 cm wide and 5 cm above its fingertips: along
 # a higher wall it holds little.
-BIN_LENGTH, BIN_WIDTH, BIN_HEIGHT = (0.40, 0.60), (0.30, 0.42), (0.03, 0.08)
+BIN = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))  # length, width and height
+SMALL_BIN = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))  # two dozen objects hide its floor
 BIN_WALL = (0.008, 0.015)  # metres; its floor is as thick. Objects are pressed through thin ones.
 GROUND = 0.2  # metres that a bin's floor reaches down into what it stands on, for the same reason
 BIN_STAND_SHARE = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
@@ -40,6 +41,11 @@ LARGE_THINGS = (1, 3)  # on a table
 LARGE_DISTANCE = (0.05, 0.30)  # metres from the middle to the nearest side of a large thing
 CARTON = ((0.42, 0.60), (0.10, 0.35), (0.05, 0.40))  # metres; no hand would grasp a longer thing
 PANEL = ((0.42, 0.60), (0.02, 0.05), (0.42, 0.55))  # metres: monitors, walls, partitions
+# Metres, inside: width, depth and height of a shelf's compartment, in which a hand has room.
+SHELF = ((0.45, 0.90), (0.26, 0.40), (0.34, 0.48))
+BOARD = (0.015, 0.030)  # metres
+SHELF_MARGIN = 0.06  # metres from its sides and edges where no object is put
+SHELF_OVER_FLOOR = (0.4, 1.2)  # metres
 KERB = ((0.42, 0.60), (0.04, 0.12), (0.02, 0.06))  # metres: books, trays, keyboards
 
 
@@ -74,11 +80,13 @@ class Surroundings:
         boxes: all that never moves.
         workspace: lowest and highest corner of where grasps are looked for, metres.
         bounds: the same of where an object's centre may be; one that leaves it is taken away.
+        reach: metres from the middle, along x and y, where objects are put down.
     """
 
     boxes: tuple[Box, ...]
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]]
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
+    reach: tuple[float, float] = (TABLE_REACH, TABLE_REACH)
 
     def add_to(self, world: World) -> frozenset[int]:
         """Put everything there; returns the ids of the obstacles' bodies."""
@@ -109,10 +117,17 @@ def open_table(thickness: float = OPEN_THICKNESS) -> Surroundings:
 OPEN_TABLE = open_table()
 
 
-def random_bin(rng: np.random.Generator) -> Surroundings:
-    """An open box on a table or over it, its floor at `TABLE_HEIGHT`."""
-    length, width = rng.uniform(*BIN_LENGTH), rng.uniform(*BIN_WIDTH)
-    height, wall = rng.uniform(*BIN_HEIGHT), rng.uniform(*BIN_WALL)
+def random_bin(
+    rng: np.random.Generator, extents: tuple[tuple[float, float], ...] = BIN
+) -> Surroundings:
+    """An open box on a table or over it, its floor at `TABLE_HEIGHT`.
+
+    Args:
+        rng: Source of the draws.
+        extents: ranges of its length, width and height inside, metres.
+    """
+    length, width, height = (rng.uniform(*extent) for extent in extents)
+    wall = rng.uniform(*BIN_WALL)
     stand = rng.uniform(*BIN_STAND) if rng.random() < BIN_STAND_SHARE else 0.0
     half = np.array([length, width]) / 2
     outer = half + wall
@@ -157,6 +172,30 @@ def random_table(rng: np.random.Generator) -> Surroundings:
         tuple(boxes),
         _corners(low - 0.05, high + 0.05, bottom, TABLE_HEIGHT + 0.30),
         _corners(low - 0.05, high + 0.05, 0.0, np.inf),
+    )
+
+
+def random_shelf(rng: np.random.Generator) -> Surroundings:
+    """A compartment of a shelf, open toward -y, its floor at `TABLE_HEIGHT`, another one above."""
+    width, depth, height = (float(rng.uniform(*extent)) for extent in SHELF)
+    board, over = float(rng.uniform(*BOARD)), float(rng.uniform(*SHELF_OVER_FLOOR))
+    floor = _slab(np.array([6.0, 6.0, 0.2]), TABLE_HEIGHT - over)
+    bottom = _slab(np.array([width, depth, GROUND]), TABLE_HEIGHT)
+    tall = GROUND + 2 * height
+    middle = TABLE_HEIGHT - GROUND + tall / 2
+    boxes = [floor, bottom]
+    for side in (-1.0, 1.0):
+        x = MIDDLE + side * (width + board) / 2
+        boxes.append(Box((board, depth, tall), (x, MIDDLE, middle)))
+    back = Box((width + 2 * board, board, tall), (MIDDLE, MIDDLE + (depth + board) / 2, middle))
+    ceiling = Box((width, depth, board), (MIDDLE, MIDDLE, TABLE_HEIGHT + height + board / 2))
+    half = np.array([width, depth]) / 2
+    low, high, top = MIDDLE - half, MIDDLE + half, TABLE_HEIGHT + height
+    return Surroundings(
+        (*boxes, back, ceiling),
+        _corners(low, high, TABLE_HEIGHT + SUPPORT_CLEARANCE, top),
+        _corners(low, high, TABLE_HEIGHT, top),
+        (width / 2 - SHELF_MARGIN, depth / 2 - SHELF_MARGIN),
     )
 
 

@@ -169,7 +169,7 @@ class RoundDriver:
 
     Args:
         simulation: is reset first.
-        scene: `packed`, `pile`, `bin` or `table`.
+        scene: how scenes are made.
         protocol: objects, camera, noise and what ends the round.
         seed: not negative.
         index: number of the round, not negative.

@@ -54,7 +54,7 @@ from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
 # Four in ten scenes are those of the benchmark of the paper.
-_P, _H, _B, _T = SceneKind
+_P, _H, _B, _T = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
 FURTHER_OBJECTS = {  # a scene holds one object and Poisson(this) more
     SceneKind.PACKED: 4,
@@ -123,6 +123,11 @@ class GenerationOptions:
     engine: str | None = None  # see `choose_engine`
     gripper: str = PANDA  # see `hand_of_scene`
     household: float = 0.0  # share of the scenes made of household objects
+
+    def __post_init__(self) -> None:
+        if self.kind is not None and self.kind not in MIXTURE:
+            kinds = ", ".join(dict.fromkeys(MIXTURE))
+            raise ValueError(f"scene is {self.kind.value!r}; views are generated of {kinds}")
 
     def kind_of(self, index: int) -> SceneKind:
         """How a scene is made."""

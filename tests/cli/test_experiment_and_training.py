@@ -75,8 +75,8 @@ def test_an_experiment_writes_figures_and_goes_on_where_it_was(run, tmp_path, mo
 
 
 PROTOCOLS = (
-    "bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, giga-cropped, "
-    "robot, table, vgn"
+    "bin, bin-full, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, "
+    "giga-cropped, robot, shelf, table, vgn"
 )
 
 
@@ -84,13 +84,13 @@ PROTOCOLS = (
     ("words", "message"),
     [
         (("experiment", "guess"), "robustness, samples, labels, families, baselines"),
-        (("experiment", "samples", "--scene", "shelf"), "shelf"),
+        (("experiment", "samples", "--scene", "attic"), "attic"),
         (("experiment", "samples", "--model", "none.safetensors"), "no such file"),
         (("experiment", "samples", "--protocol", "paper"), PROTOCOLS),
         (("train", "FOLDER"), "no .npz views"),
         (("train", "DATA", "--model", "huge"), "edgegrasp-plus"),
         (("import-checkpoint", "FOLDER"), "local_emd_model"),
-        (("benchmark", "--scene", "shelf"), "shelf"),
+        (("benchmark", "--scene", "attic"), "attic"),
         (("benchmark", "--objects", "FOLDER"), "urdf"),
         (("benchmark", "--rounds", "0"), "rounds is 0"),
         (("benchmark", "--protocol", "paper"), PROTOCOLS),

@@ -66,7 +66,7 @@ def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: st
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         FileNotFoundError,
-        match="bin, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, "
-        "giga-cropped, robot, table, vgn",
+        match="bin, bin-full, edgegrasp, edgegrasp-fused, edgegrasp-memory, edgegrasp-thin, giga, "
+        "giga-cropped, robot, shelf, table, vgn",
     ):
         load_protocol("paper")

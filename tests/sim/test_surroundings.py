@@ -6,6 +6,7 @@ import pytest
 from edgegrasp_sim.camera import ViewRange, look_at
 from edgegrasp_sim.hand import FINGERTIP, FailureCause
 from edgegrasp_sim.objects import SceneKind
+from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.surroundings import (
     MIDDLE,
@@ -14,6 +15,7 @@ from edgegrasp_sim.surroundings import (
     Box,
     Surroundings,
     random_bin,
+    random_shelf,
     random_table,
 )
 
@@ -25,7 +27,7 @@ def seen_from_above(simulation: ClutterSimulation) -> np.ndarray:
     return simulation.observe_from([ABOVE], rng, noise_std=0.0, table="around").cloud
 
 
-@pytest.mark.parametrize("kind", [SceneKind.BIN, SceneKind.TABLE])
+@pytest.mark.parametrize("kind", [SceneKind.BIN, SceneKind.TABLE, SceneKind.SHELF])
 def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: SceneKind) -> None:
     assert simulation.reset(kind, np.random.default_rng(3), 6) >= 3
     low, high = np.asarray(simulation.surroundings.workspace)
@@ -91,6 +93,34 @@ def test_a_table_has_an_edge_a_floor_below_and_larger_things(simulation) -> None
         assert (np.abs(height - TABLE_HEIGHT) < 0.002).mean() > 0.1
         edges += bool((height < TABLE_HEIGHT - 0.3).any())
     assert edges > 0
+
+
+def test_a_full_bin_hides_its_floor(simulation: ClutterSimulation) -> None:
+    most = 40
+    number = simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), most, (1.6, 1.6))
+    low, high = np.asarray(simulation.surroundings.workspace)
+    cloud = seen_from_above(simulation)
+    inside = cloud[((cloud[:, :2] > low[:2]) & (cloud[:, :2] < high[:2])).all(axis=1)]
+    assert (inside[:, 2] > TABLE_HEIGHT + 0.003).mean() > 0.75
+    assert number < most  # no more than that takes
+    assert simulation.reset(SceneKind.FULL_BIN, np.random.default_rng(2), 3) <= 3
+
+
+def test_a_shelf_is_open_to_the_front_alone(simulation: ClutterSimulation) -> None:
+    for seed in range(3):
+        around = random_shelf(np.random.default_rng(seed))
+        simulation.reset_from_poses([], around)
+        low, high = np.asarray(around.workspace)
+        middle = (low + high) / 2
+        ways = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1], [0, -1, 0]])
+        ends = middle + ways * (high - low)
+        hits = simulation.world.first_hits(np.repeat(middle[None], 6, axis=0), ends)
+        assert min(hits[:5]) >= 0
+        assert len(set(hits[:5])) == 5
+        assert hits[5] == -1
+        (eye,) = load_protocol("shelf").camera.view_range().sample(np.random.default_rng(seed))
+        assert eye[1, 3] < low[1]  # before it
+        assert eye[2, 3] > TABLE_HEIGHT
 
 
 def test_a_planner_is_told_the_inside_of_a_bin_and_sees_more(simulation) -> None:

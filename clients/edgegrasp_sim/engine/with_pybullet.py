@@ -159,7 +159,7 @@ class PybulletWorld(World):
             camera.width,
             camera.height,
             viewMatrix=view.flatten(order="F").tolist(),
-            projectionMatrix=_projection(camera).flatten(order="F").tolist(),
+            projectionMatrix=projection(camera).flatten(order="F").tolist(),
             renderer=pybullet.ER_TINY_RENDERER,
             flags=pybullet.ER_NO_SEGMENTATION_MASK,
             physicsClientId=self.client,
@@ -364,7 +364,7 @@ def _boxes(client: int, parts: Parts) -> int:
     return int(shape)
 
 
-def _projection(camera: Intrinsics) -> Matrix:
+def projection(camera: Intrinsics) -> Matrix:
     """OpenGL's projection matrix of a pinhole camera (row-major)."""
     matrix = np.zeros((4, 4))
     matrix[0, 0] = 2.0 * camera.focal_length / camera.width

@@ -1,0 +1,271 @@
+"""Simulated scenes with labels that no training generator makes, for `edgegrasp benchmark-real`.
+
+    python benchmarks/heldout_scenes.py --objects OBJECTS --output SCENES --seed 0
+    edgegrasp benchmark-real --scenes SCENES --output RESULTS
+
+Tables, heaps, trays, bins and shelves in rooms, made of the test objects of `OBJECTS`, which are
+for evaluation only, and seen by depth cameras with their faults. Files are named by kind.
+"""
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine.with_pybullet import PybulletWorld, projection
+from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
+from edgegrasp_sim.sensor import random_sensor
+
+Array = NDArray[np.float64]
+
+KINDS = ("table", "heap", "tray", "bin", "shelf")
+FIRST, SUPPORT = 2, 0.01  # the first object's label; least share of the support in an image
+SIZES = ((320, 240), (424, 240), (512, 424), (640, 480))
+TOUCHED = 0.015  # metres that a faulty reading may lie off the surface whose label it keeps
+WINDOW = 4  # pixels around one in which the surface is looked for that a reading lies on
+LEAST = 0.001  # of an image's pixels, below which what is seen of an object is not labelled
+FLAT = 0.004  # metres from the plane within which what carries the objects is the support
+FAR = 12.0  # metres
+
+
+class Made(NamedTuple):
+    """A scene at rest; the objects stand on z = 0."""
+
+    support: list[int]  # bodies that carry the objects
+    polar: tuple[float, float]  # degrees from above that the camera looks from
+    azimuth: tuple[float, float]  # degrees
+    distance: tuple[float, float]  # metres
+    reach: float  # metres around the middle within which objects are
+
+
+class Maker:
+    """A world, and what scenes are built of in it."""
+
+    def __init__(self, objects: Path, rng: np.random.Generator) -> None:
+        self.world, self.rng = PybulletWorld(), rng
+        kinds = (SceneKind.PACKED, SceneKind.PILE)
+        self.sets = [ObjectSet.from_folder(objects, kind, "test") for kind in kinds]
+        self.objects: list[SceneObject] = []
+
+    def box(self, size: object, centre: object, turn: Rotation | None = None) -> int:
+        """A box that never moves, its full extent and its middle in metres."""
+        body = self.world.add_box(np.asarray(size), np.asarray(centre), friction=0.6)
+        if turn is not None:
+            body.set_pose(np.asarray(centre, dtype=float), turn.as_quat().tolist())
+        return body.uid
+
+    def room(self, below: float) -> None:
+        """A floor, two walls in a corner, and perhaps a cupboard, a beam and a monitor."""
+        rng, turn = self.rng, Rotation.from_euler("z", self.rng.uniform(-30, 30), degrees=True)
+        self.box((12, 12, 0.1), (0, 0, -below - 0.05))
+        behind, beside = rng.uniform(0.7, 4.0), rng.choice([-1, 1]) * rng.uniform(0.8, 4.0)
+        for size, place in (((8, 0.1, 5), (0, behind, 1)), ((0.1, 8, 5), (beside, 0, 1))):
+            self.box(size, turn.apply(place), turn)
+        if rng.random() < 0.5:
+            self.box((0.8, 0.4, 1.8), turn.apply((rng.uniform(-1, 1), behind - 0.25, 0.9 - below)))
+        if rng.random() < 0.3:
+            lean = Rotation.from_euler("xyz", [*rng.uniform(-20, 20, 2), 0], degrees=True)
+            self.box((0.06, 0.06, 2.4), (rng.uniform(-0.9, 0.9), behind * 0.7, 0), lean)
+
+    def background(self, count: int, around: float) -> None:
+        """Cartons, monitors on a foot and low boards on z = 0, all too large for a hand."""
+        for _ in range(count):
+            angle, rng = self.rng.uniform(0, np.pi), self.rng
+            turn = Rotation.from_euler("z", rng.uniform(0, 360), degrees=True)
+            kind = rng.integers(3)
+            size = [(0.5, 0.3, 0.32), (0.55, 0.03, 0.34), (0.46, 0.2, 0.035)][kind]
+            size = np.asarray(size) * rng.uniform(0.9, 1.3, size=3)
+            away = around + rng.uniform(0.02, 0.2) + 0.5 * float(np.hypot(*size[:2]))
+            x, y = away * np.cos(angle), away * np.sin(angle)
+            lift = 0.12 if kind == 1 else 0.0
+            self.box(size, (x, y, lift + size[2] / 2), turn)
+            if lift:
+                self.box((0.04, 0.03, lift), (x, y, lift / 2), turn)
+                self.box((0.26, 0.2, 0.012), (x, y, 0.006), turn)
+
+    def drop(self, count: int, half: tuple[float, float], height: float, upright: float) -> None:
+        """Let objects fall or stand them up, within half extents (2,) around the middle."""
+        for _ in range(count):
+            models = self.sets[int(self.rng.random() < 0.5)]
+            standing = self.rng.random() < upright
+            yaw = Rotation.from_euler("z", self.rng.uniform(0, 360), degrees=True)
+            turn = yaw if standing else Rotation.random(rng=self.rng)
+            scale, model = float(self.rng.uniform(0.65, 1.05)), models.sample(self.rng)
+            x, y = self.rng.uniform(-1, 1, size=2) * half
+            state = self.world.save_state()
+            new = load_object(self.world, model, (x, y, 2.0), turn.as_quat().tolist(), scale)
+            lift = float(new.body.position[2] - new.body.bounds[0, 2]) + height
+            new.body.set_pose((x, y, lift), turn.as_quat().tolist())
+            self.world.detect_collisions()
+            if any(contact.distance < -0.002 for contact in new.body.contacts()):
+                new.body.remove()
+            else:
+                self.objects.append(new)
+                wait_for_rest(self.world, self.objects, 1.5)
+            self.world.remove_state(state)
+
+    def table(self) -> Made:
+        """Objects apart on a table that ends near them."""
+        size = self.rng.uniform(0.6, 1.4, size=2)
+        top = self.box((*size, 0.04), (*self.rng.uniform(-0.15, 0.15, size=2), -0.02))
+        self.room(self.rng.uniform(0.5, 0.9))
+        self.background(int(self.rng.integers(1, 4)), 0.2)
+        self.drop(int(self.rng.integers(3, 10)), (0.2, 0.18), 0.004, 0.6)
+        return Made([top], (15, 75), (190, 350), (0.5, 1.4), 0.3)
+
+    def heap(self) -> Made:
+        """Objects in a heap on a table, or on a floor."""
+        top = self.box((1.6, 1.2, 0.05), (0, 0, -0.025))
+        self.room(self.rng.choice([0.05, self.rng.uniform(0.5, 0.9)]))
+        self.background(int(self.rng.integers(0, 3)), 0.25)
+        self.drop(int(self.rng.integers(7, 14)), (0.05, 0.05), 0.16, 0.0)
+        return Made([top], (0, 65), (190, 350), (0.45, 1.2), 0.3)
+
+    def tray(self) -> Made:
+        """Objects on a tray with a low rim that stands on a table."""
+        x, y = self.rng.uniform((0.32, 0.24), (0.5, 0.36)) / 2
+        floor, rim = self.box((2 * x, 2 * y, 0.008), (0, 0, -0.004)), self.rng.uniform(0.01, 0.04)
+        self.walls(x, y, rim, self.rng.uniform(0, 35), 0.004)
+        self.box((1.4, 1.0, 0.04), (0, 0, -0.028))
+        self.room(self.rng.uniform(0.5, 0.9))
+        self.background(int(self.rng.integers(0, 3)), 0.3)
+        self.drop(int(self.rng.integers(3, 9)), (x - 0.05, y - 0.05), 0.01, 0.5)
+        return Made([floor], (0, 65), (190, 350), (0.45, 1.1), max(x, y))
+
+    def bin(self) -> Made:
+        """Objects poured into a bin, with or without a rim, its walls upright or sloped."""
+        x, y = self.rng.uniform((0.28, 0.22), (0.6, 0.42)) / 2
+        floor, deep = self.box((2 * x, 2 * y, 0.3), (0, 0, -0.15)), self.rng.uniform(0.06, 0.25)
+        self.walls(x, y, deep, self.rng.uniform(0, 30), self.rng.choice([0.003, 0.008, 0.02]))
+        self.room(0.3)
+        self.drop(int(self.rng.integers(4, 22)), (x / 2, y / 2), deep * 0.6, 0.0)
+        near = max(0.45, 1.1 * deep + 0.3)
+        return Made([floor], (0, 35), (0, 360), (near, near + 0.6), max(x, y))
+
+    def shelf(self) -> Made:
+        """Objects in a compartment seen from the front, with others around it."""
+        wide, deep, high = self.rng.uniform((0.45, 0.25, 0.26), (0.9, 0.45, 0.45))
+        board = self.rng.uniform(0.012, 0.03)
+        low = self.box((wide, deep, board), (0, 0, -board / 2))
+        self.box((wide, deep, board), (0, 0, high + board / 2))
+        for height in (-high - 2 * board, 2 * high + 2 * board):
+            self.box((wide, deep, board), (0, 0, height))
+        for side in (-1, 1):
+            centre = (side * (wide + board) / 2, 0, high / 2)
+            self.box((board, deep, 3 * high + 6 * board), centre)
+        if self.rng.random() < 0.8:
+            self.box((wide, 0.01, 3 * high), (0, deep / 2, high / 2))
+        self.room(1.0)
+        half = (wide / 2 - 0.06, deep / 2 - 0.05)
+        self.drop(int(self.rng.integers(2, 7)), half, 0.004, 0.6)
+        return Made([low], (55, 88), (245, 295), (0.5, 1.1), wide / 2)
+
+    def walls(self, x: float, y: float, high: float, slope: float, thick: float) -> None:
+        """Four walls around half extents x and y, which lean outward by degrees."""
+        length = high / np.cos(np.radians(slope))
+        for turn in range(4):
+            half, along = (x, y) if turn % 2 == 0 else (y, x)
+            yaw = Rotation.from_euler("z", 90 * turn, degrees=True)
+            lean = yaw * Rotation.from_euler("y", slope, degrees=True)
+            foot = yaw.apply((half + thick / 2, 0, 0))
+            size = (thick, 2 * along + 2 * thick + high * np.tan(np.radians(slope)), length)
+            self.box(size, foot + lean.apply((0, 0, length / 2)), lean)
+
+
+def picture(maker: Maker, made: Made) -> dict[str, Array]:
+    """What a random depth camera sees of a scene, and what it is."""
+    rng = maker.rng
+    width, height = SIZES[int(rng.integers(len(SIZES)))]
+    focal = width / 2 / np.tan(np.radians(rng.uniform(40, 75)) / 2)
+    camera = Intrinsics(width, height, float(focal), width / 2, height / 2, 0.1, FAR)
+    polar, azimuth = np.radians(rng.uniform(*made.polar)), np.radians(rng.uniform(*made.azimuth))
+    level = np.sin(polar) * np.array([np.cos(azimuth), np.sin(azimuth)])
+    target = np.array([*rng.uniform(-0.05, 0.05, size=2), 0.05])
+    away = max(rng.uniform(*made.distance), 0.8 * made.reach * focal / width * 2)
+    T_world_camera = look_at(target + away * np.array([*level, np.cos(polar)]), target)
+    roll = Rotation.from_euler("z", rng.normal(0, 12), degrees=True).as_matrix()
+    T_world_camera[:3, :3] = T_world_camera[:3, :3] @ roll
+    true, body = seen(maker.world, T_world_camera, camera)
+    depth = random_sensor(rng).apply(true, camera, rng)
+    rows, columns = np.indices(true.shape)
+    # The renderer samples a pixel at its lower left corner.
+    rays = np.stack([columns - width / 2, rows + 1 - height / 2, 0 * rows + focal], axis=-1) / focal
+    up = T_world_camera[2, :3]  # world z, camera frame
+    heights = (rays * true[..., None]) @ up + T_world_camera[2, 3]
+    label = (np.isin(body, made.support) & (np.abs(heights) < FLAT)).astype(np.uint8)
+    for number, item in enumerate(maker.objects):
+        label[body == item.body.uid] = 2 + number
+    label = on_the_surface(label, true, depth)
+    for number in np.unique(label[label > 1]):
+        if (label == number).sum() < LEAST * label.size:
+            label[label == number] = 0
+    millimetres = np.rint(1000 * np.nan_to_num(depth)).clip(0, 65535).astype(np.uint16)
+    return {
+        "depth": millimetres,
+        "intrinsics": np.array([focal, focal, width / 2, height / 2 - 1], dtype=np.float32),
+        "labels": np.where(millimetres > 0, label, 0).astype(np.uint8),
+        "support_normal": up.astype(np.float32),
+        "support_offset": np.float32(-T_world_camera[2, 3]),
+    }
+
+
+def seen(
+    world: PybulletWorld, T_world_camera: Array, camera: Intrinsics
+) -> tuple[Array, NDArray[np.int64]]:
+    """Depth (H, W), metres, and the body (H, W) at each pixel; -1: none."""
+    view = np.linalg.inv(T_world_camera)
+    view[1:3] *= -1.0
+    mask = pybullet.getCameraImage(
+        camera.width,
+        camera.height,
+        view.flatten(order="F").tolist(),
+        projection(camera).flatten(order="F").tolist(),
+        renderer=pybullet.ER_TINY_RENDERER,
+        physicsClientId=world.client,
+    )[4]
+    depth = world.render_depth(T_world_camera, camera)
+    return depth, np.asarray(mask, dtype=np.int64).reshape(camera.height, camera.width)
+
+
+def on_the_surface(label: NDArray[np.uint8], true: Array, depth: Array) -> NDArray[np.uint8]:
+    """Labels (H, W) of readings: of the surface nearby that each lies on; 0: it lies on none."""
+    off = np.abs(depth - true)
+    best, found = off.copy(), label.copy()
+    for down in range(-WINDOW, WINDOW + 1):
+        for right in range(-WINDOW, WINDOW + 1):
+            there = np.abs(depth - np.roll(true, (down, right), axis=(0, 1)))
+            nearer = (off > TOUCHED) & (there < best)
+            best[nearer] = there[nearer]
+            found[nearer] = np.roll(label, (down, right), axis=(0, 1))[nearer]
+    return np.where(best <= TOUCHED, found, 0).astype(np.uint8)
+
+
+def main() -> None:
+    """Make the scenes."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--objects", type=Path, required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--each", type=int, default=12, help="scenes of each kind")
+    asked = parser.parse_args()
+    asked.output.mkdir(parents=True, exist_ok=True)
+    for number, index in np.ndindex(len(KINDS), asked.each):
+        rng = np.random.default_rng([asked.seed, number, index])
+        labels = np.zeros((1, 1))
+        while labels.max() < FIRST or (labels == 1).mean() < SUPPORT:
+            maker = Maker(asked.objects, rng)
+            arrays = picture(maker, getattr(maker, KINDS[number])())
+            labels = arrays["labels"]
+            maker.world.close()
+        np.savez_compressed(asked.output / f"{KINDS[number]}_{index:02d}.npz", **arrays)
+
+
+if __name__ == "__main__":
+    main()

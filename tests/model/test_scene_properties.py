@@ -1,0 +1,140 @@
+"""What holds for every scene, however its objects are told from what is around them."""
+
+import numpy as np
+import pytest
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.results import SUPPORT, Detection
+from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_sim.segmentation import Segmentation, compare
+
+from .rendered import FURNITURE, SolidBox, box, camera, render, table, things
+from .scenes import detector
+
+ORIGIN = (0.0, 0.0, 0.0)
+CARTON = box((0.02, 0.36, 0.12), (0.28, 0.11, 0.12), 0.2)
+PANEL = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))  # too long for an object, thin enough for a hand
+ADDED = {"wall": FURNITURE["wall"], "floor": FURNITURE["floor"], "carton": [CARTON]}
+
+
+def ask(cloud: object, **fields: object) -> Detection:
+    fields = {"viewpoint": ORIGIN, "debug": True, "num_candidates": 200, **fields}
+    return detector().detect(cloud, DetectOptions.model_validate(fields))
+
+
+def seen_box(boxes: list[SolidBox], pose: np.ndarray) -> np.ndarray:
+    """The row in `boxes` (H * W,) of the one that each pixel shows; -1: none."""
+    depth = np.stack([np.nan_to_num(render([one], pose)[..., 2], nan=np.inf) for one in boxes])
+    return np.where(np.isfinite(depth.min(axis=0)), depth.argmin(axis=0), -1).ravel()
+
+
+def told_apart(
+    found: Detection, objects: list[SolidBox], others: list[SolidBox], pose
+) -> Segmentation:
+    assert found.debug is not None
+    number = seen_box([*objects, *others], pose)
+    truth = np.where((number >= 0) & (number < len(objects)), number + 1, 0)
+    return compare(truth, np.maximum(found.debug.labels + 1, 0))
+
+
+@pytest.mark.parametrize("added", sorted(ADDED))
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_wall_a_floor_or_a_carton_changes_no_object(seed: int, added: str) -> None:
+    objects, pose = things(seed), camera(0.75, -1.4 + 0.2 * seed, 0.85)
+    for others in ([table()], [table(), *ADDED[added]]):
+        found = ask(render([*objects, *others], pose))
+        seen = told_apart(found, objects, others, pose)
+        assert (seen.found, seen.called) == (len(objects), len(objects)), others
+
+
+@pytest.mark.parametrize("roll", [0.5, np.pi])
+def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> None:
+    scene, pose = [table(), *things(4)], camera(0.6, -1.2, 0.9)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+    places, planes = [], []
+    for T_world_camera in (pose, pose @ turn):
+        found = ask(render(scene, T_world_camera))
+        centers = np.array([one.center for one in found.objects])
+        places.append(centers @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+        assert found.support is not None
+        planes.append(T_world_camera[:3, :3] @ found.support.normal)
+    assert len(places[0]) == len(places[1]) == 4
+    apart = np.linalg.norm(places[0][:, None] - places[1], axis=2).min(axis=1)
+    assert apart.max() < 0.01
+    np.testing.assert_allclose(planes[0], planes[1], atol=0.02)
+
+
+def test_new_noise_leaves_the_number_of_objects() -> None:
+    scene, pose = [table(), *FURNITURE["wall"], *things(5)], camera(0.7, -1.3, 0.9)
+    assert {len(ask(render(scene, pose, seed)).objects) for seed in range(4)} == {4}
+
+
+def test_stray_readings_are_left_out_and_never_a_reason_to_refuse() -> None:
+    scene, pose = [table(), *things(6)], camera(0.6, -1.2, 0.9)
+    cloud = render(scene, pose)
+    rng = np.random.default_rng(0)
+    rows, columns = rng.integers(0, 240, 60), rng.integers(0, 320, 60)
+    cloud[rows, columns] *= rng.uniform(10, 90, (60, 1)).astype(np.float32)
+    assert len(ask(cloud).objects) == 4
+
+
+def test_a_mask_of_the_caller_wins() -> None:
+    objects, pose = things(2), camera(0.75, -1.5, 0.9)
+    boxes = [PANEL, table(), *objects]
+    cloud = render(boxes, pose)
+    mask = seen_box(boxes, pose) == 0
+    assert ask(cloud).objects
+    segments = mask.astype(np.int32)
+    (panel,) = ask(CloudInput(cloud, segment_ids=segments)).objects
+    assert panel.number == 1
+    region = {"include": [{"kind": "mask", "mask": mask}]}
+    held = ask(cloud, approach_region=region, contact_region=region, min_score=0.0)
+    on_panel = cloud.reshape(-1, 3)[mask]
+    for grasp in held.grasps:
+        for point in (grasp.approach_point, grasp.contact_point):
+            assert np.linalg.norm(on_panel - point, axis=1).min() < 0.006
+
+
+def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:
+    objects, pose = things(7), camera(0.7, -1.2, 0.85)
+    boxes = [table(), *objects]
+    found = ask(render(boxes, pose))
+    assert found.debug is not None
+    labels, number = found.debug.labels, seen_box(boxes, pose)
+    assert set(labels[labels >= 0].tolist()) == {one.number for one in found.objects}
+    assert (labels[number == 0] == SUPPORT).mean() > 0.95
+    assert (labels[number == -1] < 0).all()
+
+
+def answer(cloud: object) -> Detection | InvalidRequest:
+    try:
+        return ask(cloud)
+    except InvalidRequest as error:
+        return error
+
+
+def flat(distance: float) -> np.ndarray:
+    """An uneven wall (240, 320, 3) before the camera."""
+    row, column = np.indices((240, 320))
+    depth = distance * (1 + 0.05 * np.sin(column / 9) * np.cos(row / 11))
+    rays = np.stack([(column - 160) / 270, (row - 120) / 270, np.ones((240, 320))], axis=-1)
+    return (rays * depth[..., None]).astype(np.float32)
+
+
+SCENE = render([table(), *things(3)], camera(0.7, -1.2, 0.85))
+NO_SCENES = {
+    "one pixel": SCENE[120:121, 160:161],
+    "holes": np.full_like(SCENE, np.nan),
+    "too far": flat(12.0),
+}
+
+
+@pytest.mark.parametrize("name", sorted(NO_SCENES))
+def test_what_is_no_scene_gets_no_grasps_and_a_reason(name: str) -> None:
+    found = answer(NO_SCENES[name])
+    if isinstance(found, InvalidRequest):
+        assert all((found.field, found.value, found.fix))
+    else:
+        assert (found.grasps, bool(found.warnings)) == ([], True)
