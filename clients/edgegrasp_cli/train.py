@@ -59,17 +59,8 @@ def generate_data(
     print(chosen)
     # Paths as other machines have them.
     weights, objects = weights and weights.resolve(), objects and objects.resolve()
-    options = GenerationOptions(
-        scenes,
-        views_per_scene,
-        grasps_per_view,
-        seed,
-        weights,
-        kind,
-        chosen.name,
-        gripper,
-        household,
-    )
+    amounts = scenes, views_per_scene, grasps_per_view, seed
+    options = GenerationOptions(*amounts, weights, kind, chosen.name, gripper, household)
     missing = len(missing_scenes(output, options))
     tried = held = 0
     with interruptible("generate-data", resumes=True):

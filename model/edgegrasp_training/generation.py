@@ -42,15 +42,8 @@ from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import LabelledView, engine_of, support_as_array
 
-(
-    SCENE_STREAM,
-    CAMERA_STREAM,
-    NOISE_STREAM,
-    CHOICE_STREAM,
-    SHAPE_STREAM,
-    HAND_STREAM,
-    HOUSEHOLD_STREAM,
-) = range(7)
+SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
+HOUSEHOLD_STREAM = 6
 APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
 BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
 # Four in ten scenes are those of the benchmark of the paper.

@@ -82,8 +82,7 @@ def _bowl(rng: Random) -> list[Part]:
         length, thick = rng.uniform(0.08, 0.2), rng.uniform(0.006, 0.012)
         start = np.array([radius - wall, 0.0, depth - thick])
         end = start + np.array([length, 0.0, rng.uniform(0.0, 0.04)])
-        parts.append(_rod(start, end, thick, thick))
-        return parts
+        return [*parts, _rod(start, end, thick, thick)]
     return _placed(parts, np.diag([1.0, rng.uniform(0.7, 1.0), 1.0]))
 
 
@@ -112,11 +111,8 @@ def _plate(rng: Random) -> list[Part]:
 
 def _glass(rng: Random) -> list[Part]:
     """A tumbler, or a bowl on a stem."""
-    radius, height, wall = (
-        rng.uniform(0.025, 0.045),
-        rng.uniform(0.07, 0.17),
-        rng.uniform(2e-3, 4e-3),
-    )
+    radius, height = rng.uniform(0.025, 0.045), rng.uniform(0.07, 0.17)
+    wall = rng.uniform(0.002, 0.004)
     if rng.random() < 0.65:
         return _shell([radius * rng.uniform(0.6, 1.0), radius], [0.0, height], wall, 2 * wall)
     stem, thick = height * rng.uniform(0.3, 0.55), rng.uniform(0.003, 0.006)
@@ -137,11 +133,7 @@ def _tray(rng: Random) -> list[Part]:
     """A box without a lid."""
     x, y = rng.uniform(0.06, 0.28, size=2)
     z, wall = rng.uniform(0.025, 0.12), rng.uniform(0.002, 0.006)
-    parts = [_box((x, y, wall), (0.0, 0.0, wall / 2))]
-    for side in (-1.0, 1.0):
-        parts.append(_box((wall, y, z), (side * (x - wall) / 2, 0.0, z / 2)))
-        parts.append(_box((x, wall, z), (0.0, side * (y - wall) / 2, z / 2)))
-    return parts
+    return [_box((x, y, wall), (0.0, 0.0, wall / 2)), *_walls(x, y, z, wall)]
 
 
 def _book(rng: Random) -> list[Part]:
@@ -295,8 +287,7 @@ def _frame(rng: Random) -> list[Part]:
     """Four bars around an opening, lying."""
     x, y = rng.uniform(0.06, 0.28, size=2)
     bar, thick = min(rng.uniform(0.006, 0.03), 0.2 * min(x, y)), rng.uniform(0.006, 0.03)
-    parts = [_box((x, bar, thick), (0.0, side * (y - bar) / 2, 0.0)) for side in (-1.0, 1.0)]
-    return parts + [_box((bar, y, thick), (side * (x - bar) / 2, 0.0, 0.0)) for side in (-1.0, 1.0)]
+    return _walls(x, y, thick, bar)
 
 
 FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
@@ -337,12 +328,19 @@ def _solid(radii: Numbers, heights: Numbers) -> Part:
 def _box(size: Array | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Part:
     """A box; `cut` of its size is taken off its upright edges."""
     x, y, z = np.asarray(size) / 2
-    outline = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
+    outline = _rectangle(2 * x, 2 * y)
     if cut:
         outline = np.repeat(outline, 2, axis=0)
         inward = np.array([[0, 1], [1, 0], [-1, 0], [0, 1], [0, -1], [-1, 0], [1, 0], [0, -1]])
         outline = outline + inward * cut * 2 * np.minimum(x, y)
     return _placed([_loft(outline, [1.0, 1.0], [-z, z])], centre)[0]
+
+
+def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
+    """Four bars around an opening, x by y outside and z high."""
+    sides = -1.0, 1.0
+    parts = [_box((x, thick, z), (0.0, side * (y - thick) / 2, z / 2)) for side in sides]
+    return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
 def _rod(start: Array, end: Array, first: float, last: float) -> Part:

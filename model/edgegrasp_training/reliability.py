@@ -115,9 +115,7 @@ def main() -> None:
     paths = find_views(given.data)
     if given.validation_share is not None:
         paths = split_by_scene(paths, given.validation_share, seed=0)[1]
-    names = [path.stem for path in given.weights]
-    if len(set(names)) < len(names):
-        names = [str(path) for path in given.weights]
+    names = list(map(str, given.weights))
     sys.stdout.write(reliability_tables(score_views(paths, given.weights), names) + "\n")
 
 

@@ -71,18 +71,8 @@ class HandBatch:
         """
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
-        description = describe_hands(
-            cloud,
-            candidates,
-            gripper,
-            up,
-            support,
-            viewpoint,
-            at_side,
-            view,
-            object_of_point,
-            description_size,
-        )
+        of_points = at_side, view, object_of_point, description_size
+        description = describe_hands(cloud, candidates, gripper, up, support, viewpoint, *of_points)
         points, count = points_around_fingers(
             cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
         )
