@@ -207,6 +207,24 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
     assert detected
 
 
+def test_no_page_installs_cuda_unasked() -> None:
+    with_torch = [
+        " ".join(words)
+        for _, words in commands()
+        if words[0] == "pip" and re.search(r"\[.*(service|model|train|dev)", words[-1])
+    ]
+    assert len(with_torch) >= 3
+    assert all("download.pytorch.org/whl/cpu" in line for line in with_torch)
+
+
+def test_published_figures_name_their_papers() -> None:
+    rows = tomllib.loads((ROOT / "clients/edgegrasp_sim/published.toml").read_text())["result"]
+    for row in rows:
+        assert f"| [{row['method']}]({row['paper']}) |" in PAGES["results.md"]
+    first = PAGES["results.md"].index("\n| ")
+    assert PAGES["results.md"][:first].count("\n") < 12  # figures first
+
+
 def test_other_blocks_can_be_read() -> None:
     for page, block in blocks("json"):
         assert json.loads(block), page
