@@ -5,9 +5,12 @@ its context, and `visualize_grasps` shows it a picture.
 """
 
 import functools
+import importlib.metadata
 import io
 import json
+import re
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,15 +22,20 @@ from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
+    from mcp.server.mcpserver.tools.base import Tool
 
     from edgegrasp_client import Detection, GraspClient
 
 MOST_GRASPS = 20  # in one answer: some 5,000 characters
+BACK = 0.05  # metres from the pregrasp to the grasp
+AROUND = 0.4  # metres around the objects that a picture shows
+ABOVE = 0.6  # metres from the objects to the second picture's viewpoint
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
     "camera's: x right, y down, z forward. Scores are probabilities that the grasp holds. To "
-    "grasp: open to `width`, stand 0.05 m back along `approach_direction`, go in straight, close. "
+    "grasp: open to `width`, go to `pregrasp_hand_position` in the orientation of the grasp, go in "
+    "straight, close. "
     "Read `warnings` before a robot moves."
 )
 
@@ -51,6 +59,8 @@ def mcp(
 
     HTTP asks for no token: bind it to 127.0.0.1, or put a proxy that does in front of it.
     """
+    if not folder.is_dir():
+        raise ValueError(f"--folder: {folder} is no folder. Name one with clouds or images.")
     with connect(server, timeout, **connection) as client:
         tools = grasp_tools(client, folder.resolve())
         if http is None:
@@ -66,23 +76,17 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
     Files are named relative to the folder; no file outside of it is read.
     """
     from mcp.server.mcpserver import Image, MCPServer
+    from pydantic import Field
 
-    from edgegrasp_client.options import DetectOptions
-
-    server = MCPServer("edgegrasp", instructions=INSTRUCTIONS, log_level="WARNING")
     inputs = _Inputs(client, folder)
-    options_text = f"`options` has any of: {', '.join(DetectOptions.__annotations__)}."
-
-    def tool(function: Callable[..., Any]) -> None:
-        description = f"{function.__doc__} {options_text if 'grasps' in function.__name__ else ''}"
-        # Compact text: as structured output the SDK would send it twice, once indented.
-        server.tool(description=description.strip(), structured_output=False)(
-            _with_sentences(function)
-        )
+    NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
+    Matrix = Annotated[
+        list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")
+    ]
 
     def generate_grasps_from_point_cloud(
         point_cloud_file: str,
-        num_grasps: int = 5,
+        num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
         options: dict[str, Any] | None = None,
     ) -> str:
@@ -98,17 +102,20 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         intrinsics: list[float],
         mask_file: str | None = None,
         depth_scale: float | None = None,
-        num_grasps: int = 5,
+        T_base_camera: Matrix | None = None,
+        num_grasps: NumGrasps = 5,
         options: dict[str, Any] | None = None,
     ) -> str:
         """Grasps in a depth image (.png of 16 bits, or .npy), best first.
 
         `intrinsics` are fx, fy, cx, cy in pixels. `mask_file` is an image of the same size that is
         not 0 on what is to be grasped, as a segmenter gives it. `depth_scale` is metres for one
-        unit of the image (0.001 for whole numbers).
+        unit of the image (0.001 for whole numbers). With `T_base_camera` all that is asked and
+        answered is in the base frame.
         """
         asked = _asked(options, num_grasps)
-        return _short(inputs.detect_in_depth(depth_file, intrinsics, mask_file, depth_scale, asked))
+        camera = intrinsics, mask_file, depth_scale, T_base_camera
+        return _short(inputs.detect_in_depth(depth_file, *camera, asked))
 
     def visualize_grasps(
         point_cloud_file: str | None = None,
@@ -116,11 +123,14 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         intrinsics: list[float] | None = None,
         mask_file: str | None = None,
         depth_scale: float | None = None,
-        num_grasps: int = 5,
+        T_base_camera: Matrix | None = None,
+        num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
         options: dict[str, Any] | None = None,
     ) -> list[str | Image]:
-        """A picture of the grasps in a point cloud file or a depth image, from two sides.
+        """Two pictures of the grasps in a cloud file or a depth image: from the camera, from above.
+
+        The best five carry their rank in the answer.
 
         Arguments are those of the tools that generate grasps; the same ones give the same grasps.
         """
@@ -130,12 +140,18 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         if point_cloud_file is not None:
             found = inputs.detect_in_file(point_cloud_file, asked)
         else:
-            found = inputs.detect_in_depth(
-                str(depth_file), intrinsics or [], mask_file, depth_scale, asked
-            )
+            camera = intrinsics or [], mask_file, depth_scale, T_base_camera
+            found = inputs.detect_in_depth(str(depth_file), *camera, asked)
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
-        return [text.strip(), Image(data=_picture(found, asked.get("viewpoint")), format="png")]
+        image = intrinsics, depth_scale, T_base_camera
+        points, colors = inputs.shown(point_cloud_file, depth_file, *image)
+        eye = np.zeros(3) if T_base_camera is None else np.asarray(T_base_camera)[:3, 3]
+        eye = np.reshape(asked.get("viewpoint", eye), (-1, 3))[0]
+        middle = np.median(found.debug.points, axis=0) if found.debug else eye
+        above = middle + ABOVE * found.up + 1e-3
+        drawn = [_picture(found, points, colors, place) for place in (eye, above)]
+        return [text.strip(), *(Image(data=each, format="png") for each in drawn)]
 
     def edgegrasp_health_check() -> str:
         """Whether the grasp server is there and answers requests."""
@@ -147,15 +163,55 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         models = client.models()
         return json.dumps([{name: getattr(model, name) for name in names} for model in models])
 
-    for function in (
+    functions: list[Callable[..., Any]] = [
         generate_grasps_from_point_cloud,
         generate_grasps_from_depth,
         visualize_grasps,
         edgegrasp_health_check,
         edgegrasp_server_info,
-    ):
-        tool(function)
-    return server
+    ]
+    return MCPServer(
+        "edgegrasp",
+        instructions=INSTRUCTIONS,
+        version=importlib.metadata.version("edgegrasp"),
+        log_level="WARNING",
+        tools=[_tool(function) for function in functions],
+    )
+
+
+def _tool(function: Callable[..., Any]) -> "Tool":
+    """The tool, which refuses arguments that it does not have, and describes its options."""
+    from mcp.server.mcpserver.tools.base import Tool
+
+    # Compact text: as structured output the SDK would send it twice, once indented.
+    tool = Tool.from_function(_with_sentences(function), structured_output=False)
+    arguments = tool.fn_metadata.arg_model
+    arguments.model_config["extra"] = "forbid"
+    arguments.model_rebuild(force=True)
+    tool.parameters["additionalProperties"] = False
+    if "options" in tool.parameters["properties"]:
+        options, definitions = _schema_of_options()
+        tool.parameters["properties"]["options"] = options
+        tool.parameters["$defs"] = tool.parameters.get("$defs", {}) | definitions
+    return tool
+
+
+@functools.cache
+def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
+    """The JSON Schema of options, without grippers as boxes, and what it refers to."""
+    document = resources.files("edgegrasp.v1").joinpath("openapi.json").read_text()
+    text = document.replace("#/components/schemas/", "#/$defs/")
+    schemas = json.loads(text)["components"]["schemas"]
+    options = schemas["DetectOptions"]
+    options["properties"]["gripper"] = {"type": ["string", "null"], "description": "its name"}
+    definitions: dict[str, Any] = {}
+    todo = [options]
+    while todo:
+        for name in re.findall(r'"#/\$defs/(\w+)"', json.dumps(todo.pop())):
+            if name not in definitions:
+                definitions[name] = schemas[name]
+                todo.append(schemas[name])
+    return options, definitions
 
 
 class _Inputs:
@@ -173,6 +229,7 @@ class _Inputs:
         intrinsics: list[float],
         mask: str | None,
         scale: float | None,
+        T_base_camera: list[list[float]] | None,
         options: dict[str, Any],
     ) -> "Detection":
         from edgegrasp_client import DepthImage, on_mask
@@ -182,7 +239,41 @@ class _Inputs:
         image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
         if scale is not None:
             image["depth_scale"] = scale
+        if T_base_camera is not None:
+            image["T_cloud_camera"] = T_base_camera
+            options = {"up": [0.0, 0.0, 1.0], **options}
         return self._client.detect(depth_images=[image], **options)
+
+    def shown(
+        self,
+        cloud: str | None,
+        depth: str | None,
+        intrinsics: list[float] | None,
+        scale: float | None,
+        T_base_camera: list[list[float]] | None,
+    ) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+        """Points (N, 3) and colours (N, 3) to draw; None: what only the server can read."""
+        path = self._path(str(cloud or depth))
+        arrays: dict[str, Any] = {}
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+        elif cloud is None:
+            arrays = {"depth": _pixels(path), "intrinsics": intrinsics}
+        elif path.suffix == ".npy":
+            arrays = {"points": np.load(path, allow_pickle=False)}
+        if "depth" in arrays:
+            arrays["points"] = _points_of_depth(arrays["depth"], arrays["intrinsics"], scale)
+        if "points" not in arrays:
+            return None, None
+        points = arrays["points"].reshape(-1, 3)
+        if T_base_camera is not None:
+            pose = np.asarray(T_base_camera)
+            points = points @ pose[:3, :3].T + pose[:3, 3]
+        colors = arrays.get("rgb")
+        if colors is None or colors.dtype != np.uint8 or colors.size != points.size:
+            return points, None
+        return points, colors.reshape(-1, 3)
 
     def _path(self, name: str) -> Path:
         path = (self._folder / name).resolve()
@@ -195,7 +286,7 @@ def _asked(
     options: dict[str, Any] | None, num_grasps: int, viewpoint: list[float] | None = None
 ) -> dict[str, Any]:
     """The options of a request: arguments of a tool of their own come first."""
-    given = {"top_k": min(max(num_grasps, 1), MOST_GRASPS)}
+    given = {"top_k": num_grasps}
     return {**(options or {}), **given, **({"viewpoint": viewpoint} if viewpoint else {})}
 
 
@@ -226,6 +317,7 @@ def _short(found: "Detection") -> str:
             "hand_quaternion_xyzw": _digits(quaternion_from_matrix(grasp.T_cloud_hand[:3, :3]), 4),
             "tcp_position": _digits(grasp.T_cloud_tcp[:3, 3], 4),
             "approach_direction": _digits(grasp.approach_direction, 3),
+            "pregrasp_hand_position": _digits(grasp.pregrasp(BACK)[:3, 3], 4),
             "width": round(grasp.width, 4),
             "object": grasp.object,
         }
@@ -258,33 +350,32 @@ def _pixels(path: Path) -> NDArray[Any]:
     return np.asarray(Image.open(path))
 
 
-def _picture(found: "Detection", viewpoint: Any) -> bytes:
-    """The processed cloud and the grasps as PNG, turned so that up is up."""
-    from dataclasses import replace
+def _points_of_depth(
+    depth: NDArray[Any], intrinsics: Any, scale: float | None
+) -> NDArray[np.float64]:
+    """Points (H, W, 3) of depths (H, W), camera frame; NaN where there is no reading."""
+    numbers = np.ravel(intrinsics)
+    fx, fy, cx, cy = numbers if len(numbers) == 4 else numbers[[0, 4, 2, 5]]
+    z = depth * (scale or (0.001 if depth.dtype.kind == "u" else 1.0))
+    z = np.where(z > 0, z, np.nan)
+    rows, columns = np.indices(depth.shape)
+    return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1)
 
-    from edgegrasp_sim.picture import draw_grasps
+
+def _picture(
+    found: "Detection", points: NDArray[Any] | None, colors: NDArray[Any] | None, eye: Any
+) -> bytes:
+    """The cloud near the grasps, or else the processed one, and the grasps as PNG."""
+    from edgegrasp_sim.picture import Picture, View
 
     assert found.debug is not None
-    z = found.up.astype(np.float64)
-    y = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    y /= np.linalg.norm(y)
-    T_level_cloud = np.eye(4)
-    T_level_cloud[:3, :3] = [np.cross(y, z), y, z]
-    turn = T_level_cloud[:3, :3].T
-    grasps = [
-        replace(each, T_cloud_hand=(T_level_cloud @ each.T_cloud_hand).astype(np.float32))
-        for each in found.grasps
-    ]
-    eye = np.zeros(3) if viewpoint is None else np.reshape(viewpoint, (-1, 3))[0]
+    seen = found.debug.points
+    if points is not None:
+        near = np.linalg.norm(points - np.median(seen, axis=0), axis=1) < AROUND
+        seen, colors = points[near], None if colors is None else colors[near]
     file = io.BytesIO()
-    title = f"{len(grasps)} grasps of {found.model}; axes turned so that z is up"
-    hand = found.gripper.palm_z, found.gripper.tip_z
-    draw_grasps(
-        file,
-        found.debug.points @ turn,
-        grasps,
-        camera_position=eye @ turn,
-        title=title,
-        palm_and_tip=hand,
-    )
+    title = f"{len(found.grasps)} grasps of {found.model}"
+    picture = Picture(View.of(seen, eye, found.up), seen, colors, title=title)
+    picture.grasps(found.grasps, (found.gripper.palm_z, found.gripper.tip_z))
+    picture.save(file)
     return file.getvalue()

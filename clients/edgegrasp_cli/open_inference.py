@@ -5,9 +5,10 @@ sends them on. The server's workers are what reads them.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
@@ -33,7 +34,9 @@ OUTPUTS = {
     "width": ("FP32", [-1]),  # metres
     "object": ("INT32", [-1]),  # -1: of none
 }
-NOT_OPTIONS = {"binary_data_output"}  # parameters that tell the server how to write
+# Parameters of the protocol and of Triton's clients that say how to serve, not what to detect.
+NOT_OPTIONS = {"binary_data_output", "headers", "priority", "timeout"}
+NOT_OPTIONS |= {"sequence_id", "sequence_start", "sequence_end"}
 PARALLEL_CALLS = 32
 
 Tensors = dict[str, NDArray[Any]]
@@ -97,19 +100,33 @@ class Models:
         """Whether the server answers requests."""
         return self._client.ready(timeout=5.0)
 
-    def check(self, name: str) -> None:
-        """Refuse a name that no model has."""
+    def names(self) -> list[str]:
+        """What models are called."""
         with _refusing():
-            known = [self._default, *(model.name for model in self._client.models())]
+            return [self._default, *(model.name for model in self._client.models())]
+
+    def check(self, name: str, version: str = "") -> None:
+        """Refuse a name that no model has, and a version but the one that there is."""
+        known = self.names()
         if name not in known:
             raise RefusedError(
                 "NOT_FOUND", 404, f"No model {name!r}. Use one of: {', '.join(known)}."
             )
+        if version not in ("", VERSION):
+            raise RefusedError("NOT_FOUND", 404, f"No version {version!r}. Use {VERSION}.")
 
     def infer(
-        self, name: str, inputs: Tensors, parameters: Mapping[str, Any], timeout: float | None
+        self,
+        name: str,
+        inputs: Tensors,
+        parameters: Mapping[str, Any],
+        timeout: float | None,
+        wanted: Sequence[str] = (),
     ) -> Answer:
-        """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options."""
+        """Grasps of `points`, or of `depth` with `intrinsics`; parameters are options.
+
+        `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
+        """
         from edgegrasp_client.requests import plain_options
 
         asked = {key: _option(value) for key, value in parameters.items()}
@@ -126,9 +143,15 @@ class Models:
             named = ", ".join(sorted(given)) or "nothing"
             fix = "Send points, or depth and intrinsics."
             raise RefusedError("INVALID_ARGUMENT", 400, f"inputs: got {named}. {fix}")
+        if unknown := sorted(set(wanted) - set(OUTPUTS)):
+            why = f"outputs: got {unknown[0]}. Ask for {', '.join(OUTPUTS)}."
+            raise RefusedError("INVALID_ARGUMENT", 400, why)
         with _refusing():
             plain_options(options)  # no other argument of the client
             seconds = self._timeout if timeout is None else min(timeout, self._timeout)
+            micro = asked.get("timeout")
+            if isinstance(micro, int | float) and micro > 0:
+                seconds = min(seconds, micro / 1e6)
             found = self._client.detect(**cloud, **options, timeout=seconds)
         grasps = found.grasps
         poses = np.array([grasp.T_cloud_hand for grasp in grasps], "<f4").reshape(-1, 4, 4)
@@ -138,6 +161,7 @@ class Models:
             "width": np.array([grasp.width for grasp in grasps], "<f4"),
             "object": np.array([-1 if g.object is None else g.object for g in grasps], "<i4"),
         }
+        outputs = {each: outputs[each] for each in wanted or OUTPUTS}
         return Answer(outputs, {"model": found.model, "warnings": " ".join(found.warnings)})
 
 
@@ -211,21 +235,23 @@ def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[i
             return messages.ServerReadyResponse(ready=models.ready())
 
         def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-            _or_abort(context, lambda: models.check(request.name))
+            _or_abort(context, lambda: models.check(request.name, request.version))
             return messages.ModelReadyResponse(ready=True)
 
         def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
             return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
 
         def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-            _or_abort(context, lambda: models.check(request.name))
+            _or_abort(context, lambda: models.check(request.name, request.version))
             return messages.ModelMetadataResponse(**_metadata(request.name))
 
         def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
             def infer() -> Answer:
                 tensors, parameters = _grpc_inputs(request), _grpc_parameters(request.parameters)
-                seconds = context.time_remaining()
-                return models.infer(request.model_name, tensors, parameters, seconds)
+                seconds, wanted = context.time_remaining(), [each.name for each in request.outputs]
+                if request.model_version:
+                    models.check(request.model_name, request.model_version)
+                return models.infer(request.model_name, tensors, parameters, seconds, wanted)
 
             answer = _or_abort(context, infer)
             outputs = [
@@ -305,12 +331,19 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
     def server(request: Request) -> Response:
         return JSONResponse({"name": PLATFORM, "version": VERSION, "extensions": []})
 
+    def index(request: Request) -> Response:
+        return JSONResponse({"models": models.names()})
+
+    def repository(request: Request) -> Response:
+        told = {"version": VERSION, "state": "READY", "reason": ""}
+        return JSONResponse([{"name": name, **told} for name in models.names()])
+
     def model(request: Request) -> Response:
-        models.check(request.path_params["name"])
+        models.check(**request.path_params)
         return JSONResponse(_metadata(request.path_params["name"]))
 
     def model_ready(request: Request) -> Response:
-        models.check(request.path_params["name"])
+        models.check(**request.path_params)
         return JSONResponse({"name": request.path_params["name"], "ready": True})
 
     async def infer(request: Request) -> Response:
@@ -322,6 +355,8 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
                 raise RefusedError("RESOURCE_EXHAUSTED", 413, why)
         header = request.headers.get("inference-header-content-length")
         name = request.path_params["name"]
+        if "version" in request.path_params:
+            await run_in_threadpool(partial(models.check, **request.path_params))
         return JSONResponse(await run_in_threadpool(_http_infer, models, name, body, header))
 
     def refused(request: Request, error: Exception) -> Response:
@@ -332,10 +367,15 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
         Route("/v2", server),
         Route("/v2/health/live", live),
         Route("/v2/health/ready", ready),
-        Route("/v2/models/{name}", model),
-        Route("/v2/models/{name}/ready", model_ready),
-        Route("/v2/models/{name}/infer", infer, methods=["POST"]),
+        Route("/v2/models", index),
+        Route("/v2/repository/index", repository, methods=["POST"]),
     ]
+    for path in ("/v2/models/{name}", "/v2/models/{name}/versions/{version}"):
+        routes += [
+            Route(path, model),
+            Route(f"{path}/ready", model_ready),
+            Route(f"{path}/infer", infer, methods=["POST"]),
+        ]
     return Starlette(routes=routes, exception_handlers={RefusedError: refused})
 
 
@@ -345,12 +385,13 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
         head = len(body) if header is None else int(header)
         request = json.loads(body[:head])
         tensors, parameters = _http_inputs(request, bytes(body[head:]))
+        wanted = [str(each["name"]) for each in request.get("outputs") or ()]
     except RefusedError:
         raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         fix = "Give the JSON of an inference request."
         raise RefusedError("INVALID_ARGUMENT", 400, f"body: got {error!r}. {fix}") from None
-    answer = models.infer(name, tensors, parameters, None)
+    answer = models.infer(name, tensors, parameters, None, wanted)
     outputs = [
         {
             "name": each,

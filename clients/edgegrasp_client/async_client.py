@@ -39,6 +39,7 @@ from edgegrasp_client.errors import (
     GraspClientError,
     ServerUnavailableError,
     WorkerLostError,
+    invalid,
 )
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.requests import (
@@ -50,6 +51,7 @@ from edgegrasp_client.requests import (
 )
 from edgegrasp_client.results import (
     Detection,
+    Grasp,
     Model,
     Read,
     Scoring,
@@ -195,6 +197,18 @@ class AsyncGraspClient:
         """
         return await self._retried(self._transport.models, timeout)
 
+    async def record_outcome(
+        self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
+    ) -> None:
+        """Tell a server with an `outcomes_file` what became of a grasp of a detection; over REST.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors; over gRPC there is no such call.
+        """
+        tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
+        call = partial(self._transport.record_outcome, tried)
+        await self._retried(call, timeout)
+
     async def ready(self, *, timeout: float | None = None) -> bool:
         """Whether the server answers requests: False if it is not there or still loading."""
         return await self._transport.ready(self._seconds(timeout))
@@ -272,6 +286,9 @@ class _GrpcTransport:
         message = grasp_pb2.ListModelsRequest()
         return await self._answer(self._stub.ListModels, message, timeout, models_from)
 
+    async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
+        raise invalid("address", "gRPC", "Outcomes are taken over REST: give http://host:port.")
+
     async def _answer(
         self, method: Any, message: Any, timeout: float, parse: Callable[[Any, Read], Answer]
     ) -> Answer:
@@ -347,6 +364,10 @@ class _RestTransport:
 
     async def models(self, timeout: float) -> list[Model]:
         return await self._answer(rest_wire.models_call(), timeout, models_from)
+
+    async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
+        call = {"method": "POST", "url": "/v1/outcomes", "json": tried}
+        await self._answer(call, timeout, lambda _, __: None)
 
     async def _answer(
         self, call: rest_wire.Call, timeout: float, parse: Callable[[Any, Read], Answer]

@@ -74,6 +74,7 @@ class GraspClient:
     detect = _waiting(AsyncGraspClient.detect)
     score = _waiting(AsyncGraspClient.score)
     models = _waiting(AsyncGraspClient.models)
+    record_outcome = _waiting(AsyncGraspClient.record_outcome)
     ready = _waiting(AsyncGraspClient.ready)
     wait_until_ready = _waiting(AsyncGraspClient.wait_until_ready)
     close = _waiting(AsyncGraspClient.close)

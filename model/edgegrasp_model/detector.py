@@ -203,7 +203,7 @@ class GraspDetector:
             if prepared.batch is not None:
                 with prepared.timed("network"):
                     logits = np.concatenate([logits, self.run(prepared.batch)])
-            sure = self._probability(logits) >= SURE_SCORE
+            sure = self._rating(logits) >= SURE_SCORE
             if prepared.options.collision.mode != "ignore":
                 sure &= prepared.sample.collision_free
             if not self._sample(prepared, sure):
@@ -226,7 +226,8 @@ class GraspDetector:
             if sample is not None and len(sample.candidates) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             if scene is not None and sample is not None and len(logits):
-                rows, outcome = select(scene, sample, score, gripper, options, counts)
+                ratings = self._rating(logits)
+                rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
@@ -355,6 +356,13 @@ class GraspDetector:
         scaled = logits.astype(np.float64) / self.metadata.temperature
         probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-scaled))
         return probability
+
+    def _rating(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The probabilities (E,) as they were before outcomes of a robot rescaled them."""
+        scale, shift = self.metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
+        scaled = logits.astype(np.float64) / self.metadata.temperature
+        rating: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-(scaled - shift) / scale))
+        return rating
 
     @property
     def sees_hands(self) -> bool:

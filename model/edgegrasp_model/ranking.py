@@ -36,6 +36,7 @@ def select(
     scene: Scene,
     sample: Sample,
     score: NDArray[np.floating],
+    rating: NDArray[np.floating],
     gripper: Gripper,
     options: DetectOptions,
     counts: dict[str, int],
@@ -48,6 +49,7 @@ def select(
         scene: The scene.
         sample: E scored candidates.
         score: (E,) probabilities.
+        rating: (E,) the same, before outcomes of a robot rescaled them: what orders them.
         gripper: The hand.
         options: min_score, order, suppression and top_k.
         counts: Gets the number of candidates left after each step.
@@ -59,7 +61,7 @@ def select(
     T_cloud_tcp = hands @ gripper.T_hand_tcp
     clearance = clearances(scene, hands, gripper) if options.order == "clearance" else None
     free = sample.collision_free | (options.collision.mode == "ignore")
-    order = ranked(score, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
+    order = ranked(rating, free, options.order, T_cloud_tcp[:, :3, 3] @ UP, clearance)
 
     outcome = np.full(len(score), CODE[Outcome.BEYOND_TOP_K])
     good = score[order] >= options.min_score
@@ -68,7 +70,7 @@ def select(
     counts["above_min_score"] = len(order)
     if options.order == "score":
         number = scene.object_of_point[sample.candidates.contact_index]
-        order = objects_first(order, score, number)
+        order = objects_first(order, rating, number)
     if (rule := options.suppression) is not None:
         near = rule.translation, rule.rotation
         order, dropped = non_max_suppression(T_cloud_tcp, order, *near, options.top_k)

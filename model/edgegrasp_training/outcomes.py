@@ -7,7 +7,7 @@ outcomes can tell. The order of grasps stays; what changes is how far a score ca
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from edgegrasp_training.evaluation import cross_entropy
 SCORES = (1e-4, 1.0 - 1e-4)  # scores are taken to lie between
 # Spread of log(scale) and of shift before there is any outcome: few outcomes change little.
 PRIOR_SCALE, PRIOR_SHIFT = 0.5, 1.5
+FEW = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,9 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     with torch.no_grad():
         last.bias.add_(shift * temperature)
     held = float(outcomes.held.mean())
-    learned = {"outcomes": len(outcomes.held), "outcomes_held": round(held, 3)}
+    learned: dict[str, Any] = {"outcomes": len(outcomes.held), "outcomes_held": round(held, 3)}
+    old_scale, old_shift = metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
+    learned["outcomes_scale_shift"] = [scale * old_scale, scale * old_shift + shift]
     training = {**metadata.training, **learned, "recalibrated_from_digest": metadata.digest}
     name = f"{metadata.name}-robot"
     folder.mkdir(parents=True, exist_ok=True)
@@ -100,7 +103,8 @@ def recalibrate(weights: Path, outcomes_file: Path, folder: Path) -> str:
     save_checkpoint(path, network, new)
     before = cross_entropy(outcomes.logit, outcomes.held)
     after = cross_entropy(scale * outcomes.logit + shift, outcomes.held)
+    few = f" Warning: fewer than {FEW} outcomes say little." if len(outcomes.held) < FEW else ""
     return (
         f"{len(outcomes.held)} outcomes, {held:.2f} held: scores' cross entropy {before:.3f} -> "
-        f"{after:.3f} (scale {scale:.2f}, shift {shift:+.2f}): {path}"
+        f"{after:.3f} (scale {scale:.2f}, shift {shift:+.2f}): {path}.{few}"
     )

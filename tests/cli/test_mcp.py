@@ -1,5 +1,8 @@
 """The tools as an agent has them: mcp's own client, over stdio and over HTTP."""
 
+import base64
+import importlib.metadata
+import io
 import json
 import os
 import socket
@@ -11,8 +14,11 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
+
+from edgegrasp_client import GraspClient
 
 mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
 image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
@@ -60,7 +66,16 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
             "edgegrasp_health_check",
             "edgegrasp_server_info",
         }
-        assert "workspace" in tools["generate_grasps_from_depth"].description
+        schema = tools["generate_grasps_from_depth"].input_schema
+        options = schema["properties"]["options"]["properties"]
+        assert {"objects", "near", "workspace"} <= set(options)
+        jsonschema.Draft202012Validator.check_schema(schema)
+        validator = jsonschema.Draft202012Validator(schema)
+        given = {"depth_file": "depth.png", "intrinsics": CAMERA}
+        validator.validate(given | {"options": {"workspace": {"min": [0, 0, 0], "max": [1, 1, 1]}}})
+        for wrong in ({"object": "bottle"}, {"options": {"workspace": 3}}, {"num_grasps": -3}):
+            assert not validator.is_valid(given | wrong)
+        assert client.server_info.version == importlib.metadata.version("edgegrasp")
         health = await client.call_tool("edgegrasp_health_check", {})
         assert health.content[0].text == "ready"
         (info,) = answer(await client.call_tool("edgegrasp_server_info", {}))
@@ -75,15 +90,56 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         assert np.linalg.norm(grasp["hand_quaternion_xyzw"]) == pytest.approx(1, abs=1e-3)
         tcp = np.subtract(grasp["tcp_position"], grasp["hand_position"])
         assert tcp @ grasp["approach_direction"] == pytest.approx(0.1, abs=1e-3)
+        way = np.subtract(grasp["hand_position"], grasp["pregrasp_hand_position"])
+        np.testing.assert_allclose(way, 0.05 * np.array(grasp["approach_direction"]), atol=2e-4)
 
         shown = await client.call_tool("visualize_grasps", asked)
         assert shown.content[0].text.startswith("3 grasps, the best ")
-        assert shown.content[1].mime_type == "image/png"
+        assert [part.mime_type for part in shown.content[1:]] == ["image/png", "image/png"]
+        assert shown.content[1].data != shown.content[2].data
+
+
+async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, folder: Path) -> None:
+    T_base_camera = np.eye(4)
+    T_base_camera[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    T_base_camera[:3, 3] = 0.4, 0.1, 0.9
+    asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "T_base_camera": T_base_camera}
+    asked["T_base_camera"] = T_base_camera.tolist()
+    depth = np.asarray(image.open(folder / "depth.png"))
+    view = {"depth": depth, "intrinsics": CAMERA, "T_cloud_camera": T_base_camera}
+    with GraspClient(dummy_server.grpc_address) as client:
+        expected = client.detect(depth_images=[view], top_k=5).grasps
+    async with agent(dummy_server.grpc_address, folder) as client:
+        found = answer(await client.call_tool("generate_grasps_from_depth", asked))
+    for grasp, wanted in zip(found["grasps"], expected, strict=True):
+        np.testing.assert_allclose(grasp["tcp_position"], wanted.T_cloud_tcp[:3, 3], atol=1e-4)
+
+
+async def test_a_file_with_a_depth_image_and_its_camera(dummy_server, folder: Path) -> None:
+    depth = np.asarray(image.open(folder / "depth.png"))
+    rgb = np.full((24, 32, 3), (200, 30, 30), np.uint8)
+    np.savez(folder / "scene.npz", depth=depth, intrinsics=np.array(CAMERA), rgb=rgb, labels=depth)
+    async with agent(dummy_server.grpc_address, folder) as client:
+        asked = {"point_cloud_file": "scene.npz", "num_grasps": 2}
+        found = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
+        assert len(found["grasps"]) == 2
+        shown = await client.call_tool("visualize_grasps", asked)
+    seen = np.asarray(
+        image.open(io.BytesIO(base64.b64decode(shown.content[1].data))).convert("RGB")
+    )
+    assert (np.abs(seen.astype(int) - (200, 30, 30)).max(axis=2) < 30).mean() > 0.05
+
+
+def test_a_folder_that_is_not_there_is_refused() -> None:
+    words = [sys.executable, *PROGRAM, "--folder", "/nonexistent"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "/nonexistent is no folder" in done.stderr
 
 
 async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder: Path) -> None:
     async with agent(dummy_server.http_url, folder) as client:
-        asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "num_grasps": 500}
+        asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "num_grasps": 20}
         result = await client.call_tool("generate_grasps_from_depth", asked)
         assert 1 <= len(answer(result)["grasps"]) <= 20
         assert len(result.content[0].text) < 300 * 20
@@ -97,6 +153,16 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
         ("generate_grasps_from_point_cloud", {"point_cloud_file": "none.npy"}, "none.npy"),
         ("generate_grasps_from_point_cloud", {"point_cloud_file": "../outside.npy"}, "not below"),
         ("generate_grasps_from_depth", {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
+        (
+            "generate_grasps_from_point_cloud",
+            {"point_cloud_file": "cloud.npy", "object": "bottle"},
+            "object",
+        ),
+        (
+            "generate_grasps_from_point_cloud",
+            {"point_cloud_file": "cloud.npy", "num_grasps": -3},
+            "greater than or equal to 1",
+        ),
         ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
         (
             "generate_grasps_from_point_cloud",

@@ -27,6 +27,12 @@ def main(transport: str, address: str, model: str, file: str) -> None:
     result = client.infer(model, inputs, parameters={"top_k": 4, "up": "[0, 0, 1]"})
     for name in ("T_cloud_hand", "score", "width", "object"):
         told[name] = result.as_numpy(name).tolist()
+    one = [triton.InferRequestedOutput("score")]
+    timed = {"timeout": 30_000_000}  # microseconds
+    asked = client.infer(model, inputs, model_version="1", outputs=one, **timed)
+    told["alone"] = [asked.as_numpy("score") is not None, asked.as_numpy("width") is None]
+    if transport == "http":
+        told["models"] = [each["name"] for each in client.get_model_repository_index()]
     json.dump(told, sys.stdout)
 
 
