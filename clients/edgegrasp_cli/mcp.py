@@ -278,7 +278,9 @@ class _Inputs:
     def _path(self, name: str) -> Path:
         path = (self._folder / name).resolve()
         if not path.is_relative_to(self._folder):
-            raise ValueError(f"{name} is not below {self._folder}. Name a file below it.")
+            raise ValueError(f"{name} is not below the folder. Name a file below it.")
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError(f"{name} is no file.")
         return path
 
 
@@ -300,7 +302,10 @@ def _with_sentences(function: Callable[..., Any]) -> Callable[..., Any]:
     def run(**arguments: Any) -> Any:
         try:
             return function(**arguments)
-        except (GraspClientError, OSError, ValueError) as error:
+        except OSError as error:  # its own text has the whole path
+            name = Path(str(error.filename or "")).name
+            raise ToolError(f"{name}: {error.strerror}.") from error
+        except (GraspClientError, ValueError) as error:
             raise ToolError(str(error)) from error
 
     return run

@@ -76,7 +76,7 @@ class RefusedError(Exception):
     """The answer to a request that cannot be served: a gRPC code's name, an HTTP status, why."""
 
     def __init__(self, code: str, status: int, why: str) -> None:
-        super().__init__(why)
+        super().__init__(why.encode("utf-8", "backslashreplace").decode())  # half characters
         self.code, self.status = code, status
 
 
@@ -191,7 +191,7 @@ def _option(value: Any) -> Any:
     """The value of a parameter; text that is JSON stands for what it says."""
     try:
         return json.loads(value) if isinstance(value, str) else value
-    except ValueError:
+    except (RecursionError, ValueError):
         return value
 
 
@@ -381,13 +381,19 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
 
 def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
     """The answer to the body of an inference; raises RefusedError."""
+    from edgegrasp_model.errors import EdgeGraspError
+    from edgegrasp_service.worker.http_bodies import read_json
+
     try:
         head = len(body) if header is None else int(header)
-        request = json.loads(body[:head])
+        request = read_json("body", bytes(body[:head]))
+        str(request.get("id", "")).encode()  # or it cannot be sent back
         tensors, parameters = _http_inputs(request, bytes(body[head:]))
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
     except RefusedError:
         raise
+    except EdgeGraspError as error:
+        raise RefusedError("INVALID_ARGUMENT", 400, str(error)) from None
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         fix = "Give the JSON of an inference request."
         raise RefusedError("INVALID_ARGUMENT", 400, f"body: got {error!r}. {fix}") from None
@@ -413,5 +419,7 @@ def _http_inputs(request: dict[str, Any], binary: bytes) -> tuple[Tensors, dict[
         if data is None:
             end = start + int(each["parameters"]["binary_data_size"])
             data, start = binary[start:end], end
+        if not isinstance(each["name"], str):
+            raise TypeError("a name that is no text")
         tensors[each["name"]] = tensor(each["name"], each["datatype"], each["shape"], data)
-    return tensors, request.get("parameters") or {}
+    return tensors, dict((request.get("parameters") or {}).items())

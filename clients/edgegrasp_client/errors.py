@@ -86,6 +86,7 @@ _BY_KIND: dict[str, type[GraspClientError]] = {
     "permission-denied": AccessDeniedError,
     "reload-failed": ServerFailedError,
     "detector-failed": ServerFailedError,
+    "disk-full": ServerFailedError,
     "not-ready": ServerUnavailableError,
     "overloaded": OverloadedError,
     "worker-lost": WorkerLostError,

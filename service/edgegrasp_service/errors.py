@@ -71,6 +71,10 @@ class HarmfulRequest(InvalidRequest):
     """A request that ended the process that worked on it is not tried again for a while."""
 
 
+class DiskFull(ServiceError):  # noqa: N818
+    """What a request asks to keep cannot be written."""
+
+
 class DetectorFailed(ServiceError):  # noqa: N818
     """The detector failed on a good request."""
 
@@ -106,6 +110,7 @@ STATUS: dict[type[Exception], tuple[str, int]] = {
     Cancelled: ("CANCELLED", 499),  # 499: as nginx logs it
     WorkerLost: ("UNAVAILABLE", 503),
     DetectorFailed: ("INTERNAL", 500),
+    DiskFull: ("RESOURCE_EXHAUSTED", 507),
 }
 
 

@@ -1,6 +1,7 @@
 """What is known of a request, and what is logged and counted of it."""
 
 import contextlib
+import ipaddress
 import json
 import logging
 import logging.handlers
@@ -14,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, TextIO
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
@@ -58,7 +59,7 @@ class Call:
     @property
     def client(self) -> str:
         """Whom its requests count for."""
-        return self.token or self.peer
+        return self.token or network_of(self.peer)
 
     def limit(self, timeout: float) -> None:
         """Bring the deadline forward to `timeout` seconds after the start, if it is later."""
@@ -75,6 +76,17 @@ class Call:
             self.code = self.code or "499"  # the caller went away; as nginx logs it
         else:
             self.code = "OK" if self.problem is None else self.problem.code
+
+
+@lru_cache(1024)
+def network_of(address: str) -> str:
+    """The address; of IPv6 its /64, all of which one machine may use."""
+    try:
+        found = ipaddress.IPv6Address(address)
+    except ValueError:
+        return address
+    mapped = found.ipv4_mapped
+    return str(mapped or ipaddress.ip_network((int(found) >> 64 << 64, 64)))
 
 
 CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the running task

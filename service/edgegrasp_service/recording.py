@@ -1,30 +1,61 @@
-"""Requests and answers in a folder, for the day a robot misses; `edgegrasp replay` reads it."""
+"""What is kept in files: requests with their answers, for `edgegrasp replay`; and outcomes."""
 
+import asyncio
+import errno
+import fcntl
 import logging
+import os
+from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
+from edgegrasp_service.errors import DiskFull, InvalidSettings, PayloadTooLarge
 from edgegrasp_service.worker.job import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
 
+MAX_LINE = 4096  # bytes of an outcome, and more
+MAX_OUTCOMES = 64 * 2**20  # bytes at which their file takes no more
+
+
 class Recorder:
     """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
-    Beyond `most` bytes of all files the oldest are deleted.
+    Beyond `most` bytes of all files the oldest are deleted. What `hold` has no room for is not
+    recorded: it is told how many bytes wait to be written, and how many no longer do.
+
+    Raises:
+        InvalidSettings: The folder cannot be made or read.
     """
 
-    def __init__(self, folder: Path, most: int) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, folder: Path, most: int, hold: Callable[[int], bool]) -> None:
+        try:
+            folder.mkdir(exist_ok=True)
+            with os.scandir(folder) as found:
+                files = [(one.path, one.stat().st_size) for one in found if one.name[-4:] == ".job"]
+        except OSError as error:
+            raise InvalidSettings(
+                f"record_folder: got {str(folder)!r}. {error.strerror}."
+            ) from None
         self._folder = folder
         self._most = most
+        self._hold = hold
+        self._files = deque(sorted(files))  # path and size, the oldest first
+        self._bytes = sum(size for _, size in files)
         self._thread = ThreadPoolExecutor(1, "recorder")
 
     def record(self, job: Job, answer: Answer) -> None:
         """Write one request and its answer, soon."""
-        self._thread.submit(self._write, datetime.now(UTC), job, answer)
+        size = len(job.body) + len(answer.body)
+        if not self._hold(size):
+            logger.warning("%s is not recorded: the disk is too slow", job.request_id)
+            return
+        loop = asyncio.get_running_loop()
+        writing = loop.run_in_executor(self._thread, self._write, datetime.now(UTC), job, answer)
+        writing.add_done_callback(lambda _: self._hold(-size))
 
     def close(self) -> None:
         """Write what is left."""
@@ -36,10 +67,48 @@ class Recorder:
         try:
             with path.open("wb") as file:
                 file.writelines((*pack(job), *pack(answer)))
-            files = sorted(self._folder.glob("*.job"))
-            sizes = [path.stat().st_size for path in files]
-            while sum(sizes) > self._most:
-                files.pop(0).unlink(missing_ok=True)
-                sizes.pop(0)
+            self._files.append((str(path), path.stat().st_size))
+            self._bytes += self._files[-1][1]
+            while self._bytes > self._most:
+                oldest, size = self._files.popleft()
+                self._bytes -= size
+                Path(oldest).unlink(missing_ok=True)
         except OSError as error:
             logger.warning("%s is not recorded: %s", job.request_id, error)
+            path.unlink(missing_ok=True)
+
+
+# Outcomes
+
+
+def append_line(path: Path, line: bytes) -> None:
+    """Append a whole line, or nothing; what was left of half a line is removed.
+
+    Raises:
+        PayloadTooLarge: The file is full.
+        DiskFull: The disk is, or the file cannot be written.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        with os.fdopen(descriptor, "r+b", buffering=0) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # workers write one after the other
+            end = file.seek(0, os.SEEK_END)
+            if end > MAX_OUTCOMES:
+                raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
+            start = file.seek(max(0, end - MAX_LINE))
+            end = start + file.read(MAX_LINE).rfind(b"\n") + 1
+            file.truncate(end)
+            file.seek(end)
+            if file.write(line) != len(line):
+                file.truncate(end)
+                raise OSError(errno.ENOSPC, "No space left on device")
+    except OSError as error:
+        raise DiskFull(f"The outcome is not kept: {error.strerror}.") from None
+
+
+def check_outcomes(path: Path) -> None:
+    """Raise InvalidSettings unless outcomes can be kept in a file."""
+    try:
+        append_line(path, b"")
+    except (DiskFull, PayloadTooLarge) as error:
+        raise InvalidSettings(f"outcomes_file: got {str(path)!r}. {error}") from None

@@ -16,12 +16,13 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
+from edgegrasp_service.front.admission import Places
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_app
 from edgegrasp_service.front.http_protocol import HttpProtocol
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
-from edgegrasp_service.recording import Recorder
+from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
@@ -63,15 +64,18 @@ class Server:
         self.metrics = Metrics(lambda: self.pool.models)
         self.pool = WorkerPool(settings, nursery, self.metrics.workers_replaced.inc)
         self._recorder: Recorder | None = None
-        if settings.record_folder is not None:
-            self._recorder = Recorder(settings.record_folder, settings.record_bytes)
         self.service = GraspService(
             settings,
             self.pool,
             load_tokens(settings),
             (self.metrics.count_call, log_call, *observers),
-            None if self._recorder is None else self._recorder.record,
         )
+        if settings.record_folder is not None:
+            hold = self.service.admission.hold
+            self._recorder = Recorder(settings.record_folder, settings.record_bytes, hold)
+            self.service.record = self._recorder.record
+        if settings.outcomes_file is not None:
+            check_outcomes(settings.outcomes_file)
         self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         self._watch()
         self.http_url = ""
@@ -156,7 +160,9 @@ class Server:
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=partial(HttpProtocol, self._settings),  # type: ignore[arg-type]  # made alike
+            http=partial(  # type: ignore[arg-type]  # made alike
+                HttpProtocol, self._settings, Places(self._settings.max_connections)
+            ),
             ws="none",
             backlog=BACKLOG,
             server_header=False,

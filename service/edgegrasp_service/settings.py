@@ -15,7 +15,7 @@ UNIX = "unix:"  # begins a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
 NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
-LISTS = ("weights", "grippers")
+LISTS = ("weights", "grippers", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
@@ -32,6 +32,11 @@ class Settings(BaseModel):
     host: str = Field(
         "127.0.0.1",
         description="address both transports bind to; unix:FOLDER: sockets http.sock and grpc.sock",
+    )
+    allowed_hosts: tuple[str, ...] = Field(
+        (),
+        description="names in the header Host; * any; none: any with tokens, else addresses and "
+        "names without a dot",
     )
     http_port: Port = Field(8000, description="0: any free port")
     grpc_port: Port = Field(50051, description="0: any free port")

@@ -36,6 +36,7 @@ def folder(tmp_path: Path) -> Path:
     mask[4:12, 8:20] = 255
     image.fromarray(depth).save(folder / "depth.png")
     image.fromarray(mask).save(folder / "mask.png")
+    os.mkfifo(folder / "pipe.npy")  # nobody writes to it: who opens it waits for ever
     np.save(folder / "cloud.npy", np.random.default_rng(1).uniform(0, 0.2, (500, 3)))
     np.save(tmp_path / "outside.npy", np.zeros((9, 3)))
     return folder
@@ -152,6 +153,7 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
     [
         ("generate_grasps_from_point_cloud", {"point_cloud_file": "none.npy"}, "none.npy"),
         ("generate_grasps_from_point_cloud", {"point_cloud_file": "../outside.npy"}, "not below"),
+        ("generate_grasps_from_point_cloud", {"point_cloud_file": "pipe.npy"}, "no file"),
         ("generate_grasps_from_depth", {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
         (
             "generate_grasps_from_point_cloud",
@@ -178,6 +180,7 @@ async def test_what_is_wrong_reaches_the_agent(
         result = await client.call_tool(tool, arguments)
         assert result.is_error
         assert told in result.content[0].text
+        assert str(folder.parent) not in result.content[0].text
 
 
 @pytest.fixture

@@ -126,8 +126,15 @@ def test_a_request_in_json(post, gateway, cloud) -> None:
         ({"data": [[1, 2], [3]]}, "grasps", 400, "inputs.points"),
         ({"data": None}, "grasps", 400, "body: got KeyError('parameters')"),
         ({}, "resnet", 404, "resnet"),
-        (b"{", "grasps", 400, "Give the JSON"),
-        (b"[" * 100_000, "grasps", 400, "Give the JSON"),
+        (b"{", "grasps", 400, "Send a JSON object"),
+        (b"[" * 100_000, "grasps", 400, "Send lists"),
+        (b"[" + b"[]," * 60_000, "grasps", 400, "Send lists"),
+        ({"name": 7}, "grasps", 400, "no text"),
+        ({"parameters": [1]}, "grasps", 400, "Give the JSON"),
+        ({"parameters": "seed"}, "grasps", 400, "Give the JSON"),
+        ({"parameters": {"seed": "[" * 20_000}}, "grasps", 400, "options.seed"),
+        ({"id": "\ud800"}, "grasps", 400, "Give the JSON"),
+        ({"name": "\ud800"}, "grasps", 400, "inputs: got"),
         (b" " * (LIMIT + 1), "grasps", 413, "200,000 bytes"),
         ({"parameters": {"seed": -1}}, "grasps", 400, "options.seed: got -1."),
     ],
@@ -135,7 +142,7 @@ def test_a_request_in_json(post, gateway, cloud) -> None:
 def test_what_cannot_be_served(post, cloud, changes, model, status, told) -> None:
     body: Any = changes
     if isinstance(changes, dict):
-        top = {name: changes.pop(name) for name in ("parameters",) if name in changes}
+        top = {name: changes.pop(name) for name in ("parameters", "id") if name in changes}
         body = points_of(cloud, **changes) | top
     answer = post(body, model)
     assert answer.status_code == status, answer.text

@@ -1,6 +1,7 @@
 """Who is let in: bounds of requests and bytes, fairness between clients, and honest refusals."""
 
 import asyncio
+from functools import partial
 
 import grpc
 import httpx
@@ -11,7 +12,8 @@ from grpc import aio
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
-from edgegrasp_service.front.admission import Admission, Ticket
+from edgegrasp_service.front.admission import Admission, Places, Ticket
+from edgegrasp_service.observability import Call
 
 PATIENCE = 60
 FAR = 1000.0  # seconds
@@ -82,6 +84,51 @@ async def test_bytes_are_waited_for_and_one_client_leaves_some_to_others() -> No
     assert inside.admission.held_bytes == 0
 
 
+async def test_two_clients_leave_room_to_a_third() -> None:
+    """Each of them holds half of the places, or of the bytes: nobody holds more than half."""
+    inside = Inside(Admission(workers=2, max_waiting=4, max_bytes=100))
+    greedy = [await inside.enter(client, size=15) for client in "aaabbb"]
+    modest = [await inside.enter("c", size=15) for _ in range(2)]
+    await asyncio.wait([greedy[2], greedy[5]])
+    assert not any(task.done() for task in modest)
+    assert len(inside.tickets) == 8
+    assert sum(task.done() for task in greedy) == 2
+    assert inside.admission.held_bytes <= 100
+    await inside.leave()
+    inside = Inside(Admission(workers=9, max_waiting=9, max_bytes=100))
+    greedy = [await inside.enter(client, size=25) for client in "aabb"]
+    await inside.enter("c", size=20)
+    await asyncio.wait(greedy, return_when=asyncio.FIRST_COMPLETED)
+    assert len(inside.tickets) == 5
+    assert sum(task.done() for task in greedy) == 1
+    await inside.leave()
+    assert inside.admission.held_bytes == 0
+
+
+def test_all_addresses_of_a_network_are_one_client() -> None:
+    def client(address: str) -> str:
+        return Call("http", "DetectGrasps", peer=address).client
+
+    assert client("2001:db8::1") == client("2001:db8:0:0:ffff::2") != client("2001:db8:0:1::1")
+    assert client("::ffff:10.0.0.1") == client("10.0.0.1") != client("10.0.0.2")
+
+
+async def test_a_newcomer_ends_what_was_idle_for_longest_of_whoever_has_most() -> None:
+    places, lost = Places(3), []
+    taken = [places.take(owner, partial(lost.append, row)) for row, owner in enumerate("aab")]
+    places.use(taken[0])
+    places.take("c", lambda: None)
+    assert lost == [1]
+    for place in (taken[0], taken[2]):
+        places.use(place, idle=False)
+    places.take("b", lambda: None)  # in the place of c, which alone is idle
+    assert lost == [1]
+    places.use(taken[0])
+    places.leave(taken[2])
+    places.take("d", lambda: None)
+    assert lost == [1]
+
+
 async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
     inside = Inside(Admission(workers=2, max_waiting=0, max_bytes=100))
     await inside.enter("a", size=1000)
@@ -96,7 +143,10 @@ async def test_a_deadline_that_cannot_be_met_is_refused() -> None:
     inside.admission.worked(4.0)
     for _ in range(3):
         await inside.enter("a")
-    with pytest.raises(Overloaded, match="3 requests come first, which take about 4 s") as caught:
+    assert not (await inside.enter("b", seconds=5.0)).done()  # nobody knows when bodies arrive
+    for ticket in inside.tickets[:3]:
+        ticket.whole = True
+    with pytest.raises(Overloaded, match="4 requests come first, which take about 4 s") as caught:
         await (await inside.enter("a", seconds=5.0))
     assert caught.value.retry_after == 4
     assert not (await inside.enter("a", seconds=50.0)).done()

@@ -20,6 +20,7 @@ import httpx
 import numpy as np
 import pytest
 from grpc import aio
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
@@ -281,32 +282,98 @@ def npy(cloud: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-async def test_connections_are_bounded(serve) -> None:
+async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> None:
+    """Of HTTP: silent ones, and ones that ask for a page and read nothing."""
     running = await serve(max_connections=3)
     url = running.server.http_url
-    held = [http_socket(url) for _ in range(3)]
-    await asyncio.sleep(0.1)
-    extra = http_socket(url)
-    answer = await asyncio.to_thread(extra.recv, 4096)
-    assert b" 429 " in answer.splitlines()[0]
-    for connection in (*held, extra):
-        connection.close()
-    opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes.fromhex("000000040000000000")
-    said = []
-    for _ in range(4):
-        held.append(http_socket(f"http://{running.server.grpc_address}"))
-        held[-1].sendall(opening)
-        said.append(await asyncio.to_thread(held[-1].recv, 4096))
-    assert [bool(answer) for answer in said] == [True, True, True, False]
+    held = [http_socket(url) for _ in range(9)]
+    for connection in held[3:]:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.sendall(b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n")
+    for connection in held[:6]:  # they were ended: to be read to the end, or reset
+        with contextlib.suppress(ConnectionResetError):
+            while await asyncio.to_thread(connection.recv, 2**20):
+                pass
+    async with httpx.AsyncClient(base_url=url, timeout=PATIENCE) as http:
+        assert (await http.get("/health/live")).status_code == 200
     for connection in held:
         connection.close()
-    async with httpx.AsyncClient(base_url=url) as http:
-        for _ in range(100):  # until the server has seen them go
-            with contextlib.suppress(httpx.HTTPError):
-                if (await http.get("/health/live")).status_code == 200:
-                    return
-            await asyncio.sleep(0.05)
-    raise AssertionError("the places of connections that closed are gone")
+
+
+async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> None:
+    running = await serve(max_connections=30)
+    held = [http_socket(f"http://{running.server.grpc_address}") for _ in range(90)]
+    opening = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes.fromhex("000000040000000000")
+    for connection in held:
+        with contextlib.suppress(OSError):  # of those that are not accepted
+            connection.sendall(opening)
+    client = running.connect("grpc")
+    async with asyncio.timeout(PATIENCE):
+        while not (await client.detect(cloud)).fine:
+            await asyncio.sleep(0.1)
+    await client.close()
+    for connection in held:
+        connection.close()
+
+
+async def test_answers_of_pages_are_given_up_too(serve) -> None:
+    running = await serve(write_seconds=0.3, min_bytes_per_second=10**9)
+    with http_socket(running.server.http_url) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.sendall(b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n")
+        await running.until(lambda: running.server.service.in_flight == 1)
+        await running.until(lambda: running.server.service.in_flight == 0)
+
+
+async def test_silent_health_checks_and_watchers_hold_up_nobody(serve, monkeypatch) -> None:
+    """Row 3: hundreds of streams of one connection that ask nothing, or ask for ever."""
+    monkeypatch.setattr("edgegrasp_service.front.grpc.SMALL_READ_SECONDS", PATIENCE)
+    running = await serve()
+    address = running.server.grpc_address
+    async with aio.insecure_channel(address) as channel:
+        check = channel.stream_unary("/grpc.health.v1.Health/Check")
+        silent = [check() for _ in range(400)]
+        watching = [
+            health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest())
+            for _ in range(200)
+        ]
+        await asyncio.sleep(0)
+        async with aio.insecure_channel(address) as other:
+            stub = health_pb2_grpc.HealthStub(other)
+            for _ in range(5):
+                answer = await stub.Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE)
+                assert answer.status == health_pb2.HealthCheckResponse.SERVING
+        for call in (*silent, *watching):
+            call.cancel()
+
+
+async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypatch) -> None:
+    monkeypatch.setattr("edgegrasp_service.front.grpc.STREAM_GRACE_SECONDS", 0.0)
+    running = await serve(max_streams=2)
+    request = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes())
+    async with aio.insecure_channel(running.server.grpc_address) as channel:
+        stub = grasp_pb2_grpc.GraspServiceStub(channel)
+        silent = [stub.DetectGraspsStream() for _ in range(4)]
+        ended = [asyncio.ensure_future(call.code()) for call in silent]
+        await running.until(lambda: sum(code.done() for code in ended) == 2)
+        codes = {code.result() for code in ended if code.done()}
+        assert codes == {grpc.StatusCode.RESOURCE_EXHAUSTED}
+        mine = stub.DetectGraspsStream()
+        await mine.write(grasp_pb2.DetectGraspsStreamRequest(request=request))
+        assert (await mine.read()).detection.grasps
+        for call in (*silent, mine):
+            call.cancel()
+        await asyncio.wait(ended)
+
+
+async def test_a_message_of_a_stream_with_very_many_fields(serve) -> None:
+    running = await serve()
+    async with aio.insecure_channel(
+        running.server.grpc_address, [("grpc.max_send_message_length", -1)]
+    ) as channel:
+        call = channel.stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")()
+        await call.write(b"\x08\x01" * 10**7)
+        assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
 OUT_OF_DESCRIPTORS = """

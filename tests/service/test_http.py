@@ -3,6 +3,7 @@
 import asyncio
 import re
 import socket
+from typing import Any
 
 import httpx
 import pytest
@@ -39,7 +40,7 @@ def test_head_is_get_without_the_body(dummy_server) -> None:
 
 def test_no_redirect_to_a_host_that_the_caller_names(dummy_server) -> None:
     for path in ("/v1/grasps/", "/v1/models/", "//v1/grasps"):
-        answer = httpx.post(dummy_server.http_url + path, headers={"host": "evil.example"})
+        answer = httpx.post(dummy_server.http_url + path, headers={"host": "evil"})
         assert answer.status_code == 404, path
         assert "location" not in answer.headers
         assert answer.headers["content-type"] == "application/problem+json"
@@ -88,3 +89,44 @@ async def test_headers_that_do_not_come_are_not_waited_for(serve) -> None:
     for data in (POST, b""):
         said = await asyncio.to_thread(talk, running.server.http_url, data)
         assert said.startswith(b"HTTP/1.1 408")
+
+
+@pytest.mark.parametrize(
+    ("host", "given", "status"),
+    [
+        ("evil.example", {}, 400),
+        ("evil.example:8000", {}, 400),
+        ("localhost:8000", {}, 200),
+        ("127.0.0.1", {}, 200),
+        ("[::1]:8000", {}, 200),
+        ("edgegrasp", {}, 200),  # a name within one's own network
+        ("robot.example", {"allowed_hosts": ["robot.example"]}, 200),
+        ("evil.example", {"allowed_hosts": ["robot.example"]}, 400),
+        ("evil.example", {"allowed_hosts": ["*"]}, 200),
+    ],
+)
+async def test_names_of_the_server(serve, host: str, given: dict[str, Any], status: int) -> None:
+    """Row 6: a web page can have its own name point to this server."""
+    running = await serve(**given)
+    async with httpx.AsyncClient(base_url=running.server.http_url) as http:
+        for path in ("/v1/models", "/docs", "/metrics"):
+            assert (await http.get(path, headers={"host": host})).status_code == status
+        assert (await http.get("/health/live", headers={"host": host})).status_code == 200
+
+
+async def test_every_answer_says_what_a_browser_may_do_with_it(serve) -> None:
+    running = await serve()
+    async with httpx.AsyncClient(base_url=running.server.http_url) as http:
+        for path in ("/docs", "/playground/", "/v1/models", "/none", "/openapi.json"):
+            headers = (await http.get(path)).headers
+            assert "frame-ancestors 'none'" in headers["content-security-policy"]
+            assert headers["x-content-type-options"] == "nosniff"
+
+
+async def test_timeouts_are_plain_numbers(serve, cloud) -> None:
+    running = await serve()
+    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=20) as http:
+        for text, status in (("1_0", 400), ("nan", 400), ("1e999", 400), ("20", 200), ("2e1", 200)):
+            headers = {"X-Request-Timeout": text}
+            answer = await http.post("/v1/grasps", json={"points": cloud.tolist()}, headers=headers)
+            assert answer.status_code == status

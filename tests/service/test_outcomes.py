@@ -1,13 +1,17 @@
 """What a robot tells of its grasps: kept where the operator wants it, and as much as fits."""
 
 import json
+import resource
+import signal
 from pathlib import Path
 
 import httpx
 import jsonschema
 import pytest
 
+from edgegrasp_service.errors import DiskFull, InvalidSettings
 from edgegrasp_service.front.http import DOCUMENT
+from edgegrasp_service.recording import append_line, check_outcomes
 from edgegrasp_training.outcomes import read_outcomes
 
 TRIED = {"model": "dummy", "score": 0.9, "held": True, "request_id": "a1"}
@@ -59,3 +63,24 @@ def test_files_that_hold_no_outcomes(tmp_path: Path, body: str) -> None:
     file.write_text(body + "\n")
     with pytest.raises(ValueError, match="line 1"):
         read_outcomes(file, "abc")
+
+
+def test_lines_are_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "outcomes.jsonl"
+    file.write_bytes(b'{"a": 1}\n{"half')
+    append_line(file, b'{"b": 2}\n')
+    assert file.read_bytes() == b'{"a": 1}\n{"b": 2}\n'
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (25, hard))  # the disk is full within a line
+    try:
+        with pytest.raises(DiskFull):
+            append_line(file, b'{"c": 333333}\n')
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert file.read_bytes() == b'{"a": 1}\n{"b": 2}\n'
+
+
+def test_a_file_that_cannot_be_written_is_told_at_the_start(tmp_path: Path) -> None:
+    with pytest.raises(InvalidSettings, match="No such file"):
+        check_outcomes(tmp_path / "none" / "outcomes.jsonl")

@@ -1,5 +1,6 @@
 """Requests and answers in a folder, and the same answer when one is replayed."""
 
+import asyncio
 import io
 from pathlib import Path
 
@@ -9,8 +10,12 @@ import pytest
 from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp_cli.replay import answer_again
+from edgegrasp_service.errors import InvalidSettings
+from edgegrasp_service.front.admission import Admission
+from edgegrasp_service.recording import Recorder
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import answer
+from edgegrasp_service.worker.job import Answer, Facts, Job
 
 
 def npy(cloud: np.ndarray) -> bytes:
@@ -53,3 +58,42 @@ async def test_the_oldest_are_deleted(serve, cloud, tmp_path: Path) -> None:
     kept = sorted((tmp_path / "recorded").glob("*.job"))
     assert [path.stem[-2:] for path in kept] == ["r3", "r4"]
     assert sum(path.stat().st_size for path in (tmp_path / "recorded").iterdir()) <= 2**20
+
+
+async def test_what_is_there_already_counts_and_is_looked_at_once(
+    serve, cloud, tmp_path: Path
+) -> None:
+    for number in range(3):
+        (tmp_path / f"20200101T00000{number}000000Z-old.job").write_bytes(bytes(500_000))
+    (tmp_path / "notes.txt").write_text("mine")
+    running = await serve(record_folder=tmp_path, record_bytes=2**20)
+    client = running.connect("rest")
+    assert (await client.detect(cloud)).fine
+    await client.close()
+    running.stop.set()
+    await running.serving
+    kept = sorted(path.name for path in tmp_path.glob("*.job"))
+    assert [name[:4] for name in kept[:-1]] == ["2020"] * (len(kept) - 1)
+    assert sum(path.stat().st_size for path in tmp_path.glob("*.job")) <= 2**20
+    assert (tmp_path / "notes.txt").exists()
+    assert running.server.service.admission.held_bytes == 0
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(InvalidSettings, match="record_folder"):
+        Recorder(tmp_path / "none" / "recorded", 2**20, lambda size: True)
+    assert not (tmp_path / "none").exists()
+
+
+async def test_what_waits_to_be_written_is_bounded(tmp_path: Path) -> None:
+    admission = Admission(1, 1, 1000)
+    recorder = Recorder(tmp_path, 2**20, admission.hold)
+    job, answer_ = Job("DetectGrasps", "http", bytes(600), 1.0), Answer(b"", Facts())
+    recorder.record(job, answer_)
+    recorder.record(job, answer_)  # no room, before the first is written
+    assert admission.held_bytes == 600
+    recorder.close()
+    await asyncio.sleep(0)
+    while admission.held_bytes:
+        await asyncio.sleep(0.01)
+    assert len([*tmp_path.glob("*.job")]) == 1

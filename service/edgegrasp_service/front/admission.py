@@ -3,8 +3,9 @@
 import asyncio
 import math
 import statistics
+import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
@@ -18,6 +19,7 @@ class Ticket:
 
     def __init__(self, client: str) -> None:
         self.client = client
+        self.whole = False  # whether its body is here
         self.at_work = False  # whether a worker has its job
         self.bytes = 0
         self.left = False
@@ -34,8 +36,8 @@ class Ticket:
 class Admission:
     """Bounds the requests and the bytes in the server; used in the event loop only.
 
-    Every client may have all places while nobody else asks. Where there is none left, who holds
-    more than half of them gives one up to the next client.
+    Every client may have all places and half of the bytes while nobody else asks. Where there is no
+    room left, who holds most of it gives some up to a client that would still hold less.
 
     Args:
         workers: Requests worked on at a time.
@@ -94,14 +96,19 @@ class Admission:
         """Raise Overloaded unless there is a place for one more, or another client loses one."""
         if len(self._tickets) < self._max_tickets:
             return
-        holder, count = Counter(ticket.client for ticket in self._tickets).most_common(1)[0]
-        if count * 2 > self._max_tickets and holder != client:
-            for ticket in reversed(self._tickets):
-                if ticket.client == holder and not ticket.at_work:
-                    ticket.refuse(self._full("Others wait, and you hold most of its places"))
-                    self._leave(ticket)
-                    return
-        raise self._full(f"{len(self._tickets)} requests are in it")
+        counts = Counter(ticket.client for ticket in self._tickets)
+        holder, count = counts.most_common(1)[0]
+        if count <= counts[client] + 1 or not self._give_up(holder):
+            raise self._full(f"{len(self._tickets)} requests are in it")
+
+    def _give_up(self, holder: str) -> bool:
+        """End the latest request of a client that no worker has; returns whether there is one."""
+        for ticket in reversed(self._tickets):
+            if ticket.client == holder and not ticket.at_work:
+                ticket.refuse(self._full("Others wait, and you hold most of its places"))
+                self._leave(ticket)
+                return True
+        return False
 
     def resize(self, ticket: Ticket, size: int) -> None:
         """Say how many bytes a ticket really holds."""
@@ -109,10 +116,22 @@ class Admission:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
             ticket.bytes = size
-            for waiting in self._waiting:
-                if not waiting.done():
-                    waiting.set_result(None)
-            self._waiting.clear()
+            self._wake()
+
+    def _wake(self) -> None:
+        for waiting in self._waiting:
+            if not waiting.done():
+                waiting.set_result(None)
+        self._waiting.clear()
+
+    def hold(self, size: int) -> bool:
+        """Hold bytes of no request, or no longer (less than 0); returns whether there is room."""
+        if size > 0 and self.held_bytes + size > self._max_bytes:
+            return False
+        self.held_bytes += size
+        if size < 0:
+            self._wake()
+        return True
 
     def worked(self, seconds: float) -> None:
         """Tell how long a worker took."""
@@ -131,7 +150,8 @@ class Admission:
     def _wait(self) -> float:
         """Seconds until a new request has its turn, at the latest pace."""
         pace = statistics.median(self._took) if self._took else 0.0
-        return max(0, len(self._tickets) + 1 - self._workers) * pace / self._workers
+        ahead = sum(ticket.whole for ticket in self._tickets)  # others may be slow to arrive
+        return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _check_pace(self, deadline: float) -> None:
         remaining = deadline - asyncio.get_running_loop().time()
@@ -156,9 +176,13 @@ class Admission:
             self._client_bytes[ticket.client]
             and self._client_bytes[ticket.client] + size > self._max_bytes // 2
         ):
-            waiting = asyncio.get_running_loop().create_future()
-            self._waiting.append(waiting)
-            await waiting
+            holder, most = max(self._client_bytes.items(), key=lambda row: row[1], default=("", 0))
+            several = sum(held.client == holder and held.bytes > 0 for held in self._tickets) > 1
+            greedy = several and most > self._client_bytes[ticket.client] + size
+            if not (greedy and self._give_up(holder)):
+                waiting = asyncio.get_running_loop().create_future()
+                self._waiting.append(waiting)
+                await waiting
         self.resize(ticket, size)
 
     def _leave(self, ticket: Ticket) -> None:
@@ -171,6 +195,72 @@ class Admission:
             del self._client_bytes[ticket.client]
         if not self._tickets:
             self._empty.set()
+
+
+class Place:
+    """One of the places below."""
+
+    def __init__(self, owner: str, lose: Callable[[], None]) -> None:
+        self.owner, self.lose = owner, lose
+        self.idle = True  # nothing is lost with it
+        self.used = time.monotonic()
+
+
+class Places:
+    """So many connections, streams or reads at a time.
+
+    Where all are taken, a newcomer ends one that was idle for `grace` seconds: of whoever has most
+    of those, the one that was idle for longest.
+    """
+
+    def __init__(self, most: int, grace: float = 0.0) -> None:
+        self._most, self._grace = most, grace
+        self._taken: dict[Place, None] = {}  # the latest used at the end
+
+    def take(self, owner: str, lose: Callable[[], None]) -> Place:
+        """A place, until `leave`; `lose` is called if it is lost. Raises Overloaded."""
+        if len(self._taken) >= self._most:
+            since = time.monotonic() - self._grace
+            idle = [place for place in self._taken if place.idle and place.used <= since]
+            if not idle:
+                raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
+            greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
+            lost = next(place for place in idle if place.owner == greedy)
+            self.leave(lost)
+            lost.lose()
+        place = Place(owner, lose)
+        self._taken[place] = None
+        return place
+
+    def use(self, place: Place, idle: bool = True) -> None:
+        """Something happens at a place, which is idle then or not."""
+        place.idle, place.used = idle, time.monotonic()
+        if place in self._taken:
+            self._taken[place] = self._taken.pop(place)
+
+    def leave(self, place: Place) -> None:
+        """Give a place back."""
+        self._taken.pop(place, None)
+
+    @asynccontextmanager
+    async def hold(self, owner: str) -> AsyncIterator[Place]:
+        """Have a place for a while; what happens inside is cancelled if it is lost.
+
+        Raises:
+            Overloaded: There is no place, or it was lost.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(None) as ends:
+                place = self.take(owner, lambda: ends.reschedule(loop.time()))
+                try:
+                    yield place
+                finally:
+                    self.leave(place)
+        except TimeoutError:
+            if not ends.expired():
+                raise
+            raise Overloaded("The server is full, and others wait. Try again in 1 s.") from None
 
 
 def _whole_seconds(wait: float) -> int:

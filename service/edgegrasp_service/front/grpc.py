@@ -5,22 +5,24 @@ method then reads its message once there is room for it, and knows when its answ
 """
 
 import asyncio
+import contextlib
 import logging
 import math
+import os
+import socket
 import struct
 import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
 from google.protobuf import any as any_message
 from google.protobuf import duration
 from google.protobuf.any_pb2 import Any as AnyMessage
-from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
-from google.protobuf.unknown_fields import UnknownFieldSet
 from google.protobuf.wrappers_pb2 import BytesValue
 from google.rpc.error_details_pb2 import (  # type: ignore[import-untyped]
     BadRequest,
@@ -40,13 +42,13 @@ from edgegrasp_service.errors import (
     AddressInUse,
     Cancelled,
     NotReady,
-    Overloaded,
     Problem,
     RequestTimeout,
     report,
 )
+from edgegrasp_service.front.admission import Places
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call, network_of
 from edgegrasp_service.settings import UNIX
 from edgegrasp_service.worker.job import Answer, Job, Method
 
@@ -61,6 +63,15 @@ LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 point
 SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
 SMALL_READS = 8  # messages of health checks and reflection read at a time
 SMALL_READ_SECONDS = 2.0
+WATCHERS = 64  # of health
+STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
+STREAM_GRACE_SECONDS = 10.0  # the same, while others wait for its place
+DESCRIPTORS = Path("/proc/self/fd")
+SPARE_CONNECTIONS = 2  # times as many as may stay are accepted
+TRIM_SECONDS = 0.5  # until those that are too many are closed
+LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
+
+MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
 
 # Number and wire type, 2 of bytes and 1 of a double, of those of a DetectGraspsStreamRequest.
 STREAM_FIELDS = {(1, 2): "request_id", (2, 2): "request", (3, 1): "timeout"}
@@ -95,7 +106,12 @@ class GrpcServer:
             # What is compressed is unpacked before its length is known: none of it.
             ("grpc.compression_enabled_algorithms_bitset", 1),
             ("grpc.so_reuseport", 0),
-            ("grpc.max_allowed_incoming_connections", settings.max_connections),
+            (
+                "grpc.max_allowed_incoming_connections",
+                SPARE_CONNECTIONS * settings.max_connections,
+            ),
+            ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
+            ("grpc.max_connection_idle_ms", 300_000),
             # A cloud comes in one go, without waiting for leave to send the rest of it.
             ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
             ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
@@ -120,11 +136,16 @@ class GrpcServer:
         except RuntimeError as error:
             raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
+        self._port = 0 if sockets else port
+        self._most_connections = settings.max_connections
+        self._trimming: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
         await self.set_serving(False)
         await self._server.start()
+        if self._port:
+            self._trimming = asyncio.create_task(self._trim())
 
     async def set_serving(self, serving: bool) -> None:
         """Tell health checks."""
@@ -134,7 +155,46 @@ class GrpcServer:
 
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
+        if self._trimming is not None:
+            self._trimming.cancel()
         await self._server.stop(grace_seconds)
+
+    async def _trim(self) -> None:
+        """Close connections that are too many: gRPC cannot tell whose they are."""
+        while True:
+            await asyncio.sleep(TRIM_SECONDS)
+            if len([*DESCRIPTORS.iterdir()]) > self._most_connections:
+                with contextlib.ExitStack() as stack:
+                    trim(_connections(self._port, stack), self._most_connections)
+
+
+def trim(connections: list[socket.socket], most: int) -> None:
+    """Shut down, of whoever has most of them, those that have been silent for longest."""
+    found: dict[str, list[tuple[int, socket.socket]]] = {}
+    for connection in connections:
+        with contextlib.suppress(OSError):
+            owner = network_of(connection.getpeername()[0])
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
+            found.setdefault(owner, []).append((*LAST_RECEIVED.unpack(info), connection))
+    for rows in found.values():
+        rows.sort(key=lambda row: row[0])
+    for _ in range(sum(map(len, found.values())) - most):
+        _, connection = max(found.values(), key=len).pop()
+        with contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+
+
+def _connections(port: int, stack: contextlib.ExitStack) -> list[socket.socket]:
+    """Those that this process has accepted at a port, until the stack closes."""
+    found = []
+    for link in DESCRIPTORS.iterdir():
+        with contextlib.suppress(OSError):
+            if not link.is_socket():
+                continue
+            one = stack.enter_context(socket.socket(fileno=os.dup(int(link.name))))
+            if one.family != socket.AF_UNIX and one.getsockname()[1] == port and one.getpeername():
+                found.append(one)
+    return found
 
 
 class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
@@ -146,8 +206,9 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         self._checks = checks
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
-        self._small_reads = asyncio.Semaphore(SMALL_READS)
-        self._streams = 0
+        self._small_reads = Places(SMALL_READS)
+        self._watchers = Places(WATCHERS)
+        self._streams = Places(service.settings.max_streams, STREAM_GRACE_SECONDS)
         ours: dict[str, Behaviour] = {
             "DetectGrasps": partial(self._answer, "DetectGrasps"),
             "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
@@ -223,15 +284,14 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         await service.answer(current_call(), job, most, read, write)
 
     async def _stream(self, context: Any) -> None:
-        most = self._service.settings.max_streams
-        if self._streams >= most:
-            raise Overloaded(f"The server has {most} streams open. Try again in 1 s.")
-        self._streams += 1
-        try:
-            async for response in answer_stream(self._service, current_call(), context):
+        call = current_call()
+        async with self._streams.hold(call.client) as place:
+
+            def use(idle: bool) -> None:
+                self._streams.use(place, idle)
+
+            async for response in answer_stream(self._service, call, context, use):
                 await self._service.send(context.write(response), len(response))
-        finally:
-            self._streams -= 1
 
     async def _list_models(self, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in self._service.models()]
@@ -246,11 +306,13 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         request = await self._read_health(context)
         if request.service not in ("", SERVICE.full_name):
             await _abort(context, _not_found(grpc.StatusCode.NOT_FOUND, request.service))
-        await context.write(await self._checks.Check(request, context))
+        status = STATES.SERVING if self._service.ready else STATES.NOT_SERVING
+        await context.write(health_pb2.HealthCheckResponse(status=status))
 
     async def _watch_health(self, context: Any) -> None:
         request = await self._read_health(context)
-        await self._checks.Watch(request, context)
+        async with self._watchers.hold(current_call().client):
+            await self._checks.Watch(request, context)
 
     async def _read_health(self, context: Any) -> Any:
         kind = health_pb2.HealthCheckRequest
@@ -268,8 +330,9 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
     async def _read_small(self, kind: Any, context: Any) -> Any:
         """The next message of a method whose messages are small; None: there are no more."""
         try:
-            async with self._small_reads, asyncio.timeout(SMALL_READ_SECONDS):
-                data = await context.read()
+            async with self._small_reads.hold(context.peer()):
+                async with asyncio.timeout(SMALL_READ_SECONDS):
+                    data = await context.read()
             return None if data is EOF else kind.FromString(data)
         except TimeoutError:
             value = f"nothing whole in {SMALL_READ_SECONDS:g} s"
@@ -337,17 +400,20 @@ def _details(problem: Problem) -> list[AnyMessage]:
 # Streams: requests of one at work side by side, answered in their order
 
 
-async def answer_stream(service: GraspService, stream: Call, context: Any) -> AsyncIterator[bytes]:
+async def answer_stream(
+    service: GraspService, stream: Call, context: Any, use: Callable[[bool], None]
+) -> AsyncIterator[bytes]:
     """Answer the requests of one stream.
 
     A request is read only when fewer than `max_stream_requests` are unanswered; what the client
     sends beyond that stays with it. Where this is closed early, what is under way is cancelled.
 
-    Gives serialized DetectGraspsStreamResponses.
+    Gives serialized DetectGraspsStreamResponses; calls `use` when there is something to do or not.
 
     Raises:
         NotReady: The server is stopping; what was read is answered before.
         InvalidRequest: A message is no DetectGraspsStreamRequest.
+        RequestTimeout: No message came for long.
     """
     ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
     stopping = asyncio.create_task(service.stopping.wait())
@@ -357,7 +423,15 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
             waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
             if reading and len(ahead) < service.settings.max_stream_requests:
                 waiting |= {reading, stopping}
-            await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            use(not ahead)
+            done, _ = await asyncio.wait(
+                waiting,
+                timeout=None if ahead else STREAM_IDLE_SECONDS,
+                return_when=asyncio.FIRST_COMPLETED,
+            )
+            if not done:
+                value = f"no message in {STREAM_IDLE_SECONDS:.0f} s"
+                raise RequestTimeout("request", value, "Open another stream.")
             if ahead and ahead[0].done():
                 yield ahead.popleft().result()
             elif reading and reading.done():
@@ -380,20 +454,36 @@ async def answer_stream(service: GraspService, stream: Call, context: Any) -> As
 async def _next_request(context: Any) -> dict[str, Any] | None:
     """The fields of the next DetectGraspsStreamRequest; None: there are no more.
 
-    It is read as a message without fields of its own, which keeps what is inside of it as bytes.
+    Read here: protobuf would take seconds of the front for millions of fields.
     """
     data = await context.read()
     if data is EOF:
         return None
+    fields: dict[str, Any] = {"request_id": b"", "request": b"", "timeout": None}
+    place = 0
     try:
-        found = UnknownFieldSet(Empty.FromString(data))
-        fields: dict[str, Any] = {"request_id": b"", "request": b"", "timeout": None}
-        for one in (found[row] for row in range(len(found))):
-            name = STREAM_FIELDS.get((one.field_number, one.wire_type), "unknown")
-            fields[name] = one.data
-        return fields | {"request_id": fields["request_id"].decode()}
-    except (DecodeError, UnicodeDecodeError):
-        raise _no_message(data) from None
+        for _ in range(MOST_STREAM_FIELDS):
+            if place == len(data):
+                return fields | {"request_id": fields["request_id"].decode()}
+            tag, place = _varint(data, place)
+            size, place = _varint(data, place) if tag & 7 == 2 else (8, place)
+            if tag & 7 not in (1, 2) or place + size > len(data):
+                break
+            name = STREAM_FIELDS.get((tag >> 3, tag & 7), "unknown")
+            fields[name] = data[place : place + size]
+            place += size
+    except (IndexError, UnicodeDecodeError):
+        pass
+    raise _no_message(data)
+
+
+def _varint(data: bytes, place: int) -> tuple[int, int]:
+    """The number at a place, and the place behind it."""
+    value = shift = 0
+    while data[place] & 128 and shift < 63:
+        value |= (data[place] & 127) << shift
+        place, shift = place + 1, shift + 7
+    return value | data[place] << shift, place + 1
 
 
 async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) -> bytes:
@@ -434,7 +524,7 @@ def _timeout(request: dict[str, Any]) -> float:
         raise InvalidRequest("request", "a field that this server does not know", fix)
     if request["timeout"] is None:
         return math.inf
-    (timeout,) = struct.unpack("<d", struct.pack("<Q", request["timeout"]))
+    (timeout,) = struct.unpack("<d", request["timeout"])
     if not 0.0 < timeout < math.inf:
         raise InvalidRequest("timeout", str(timeout), "Send seconds, or leave it out.")
     return float(timeout)

@@ -1,8 +1,10 @@
 """The HTTP transport: routes, and the middleware around every request."""
 
 import asyncio
+import ipaddress
 import json
 import math
+import re
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
@@ -27,12 +29,16 @@ from edgegrasp_service.worker.job import Answer, Job, Method
 ASSETS = "/docs/assets"
 PLAYGROUND = "/playground/"
 PLAYGROUND_FILES = Path(__file__).parents[1] / "playground"
-OWN_ONLY = (  # what the playground may load, and who may show it
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+OWN_ONLY = (  # what a page may load, and who may show it
+    "default-src 'none'; script-src 'self'{0}; style-src 'self'{0}; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+# The page of the interface has a script inside, and nothing of a stranger's.
+POLICIES = {"/docs": OWN_ONLY.format(" 'unsafe-inline'")}
+POLICY = OWN_ONLY.format("")
 CHALLENGE = 'Bearer realm="edgegrasp"'
 TIMEOUT = "X-Request-Timeout"
+NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
 
 # Values of the label `method`: the gRPC method's name where there is one.
 METHODS = {
@@ -84,7 +90,11 @@ class HttpMiddleware:
             async def send_named(message: Message) -> None:
                 if message["type"] == "http.response.start":
                     call.code = str(message["status"])
-                    extra = [(REQUEST_ID_HEADER.encode(), call.request_id.encode())]
+                    extra = [
+                        (REQUEST_ID_HEADER.encode(), call.request_id.encode()),
+                        (b"content-security-policy", POLICIES.get(path, POLICY).encode()),
+                        (b"x-content-type-options", b"nosniff"),
+                    ]
                     # What still comes in of a request that is answered is not waited for.
                     if not whole or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
@@ -105,11 +115,31 @@ class HttpMiddleware:
         size += len(scope["raw_path"]) + len(scope["query_string"])
         most = self._service.settings.max_header_bytes
         check_headers("headers", len(scope["headers"]), size, most)
+        if call.method not in ("Live", "Ready"):
+            self._check_host(headers.get("host", ""))
         if call.method not in OPEN:
             self._service.authorize(call, headers.get("authorization"))
         if (encoding := headers.get("content-encoding", "identity").lower()) != "identity":
             fix = "Send the body as it is; .npz and .pcd files may be compressed inside."
             raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
+
+    def _check_host(self, host: str) -> None:
+        """Refuse names that a stranger's web page may have pointed here, to read the answers."""
+        name = re.sub(r":\d*$", "", host).strip("[]").lower()
+        allowed = self._service.settings.allowed_hosts
+        if not allowed and (self._service.tokens.required or "." not in name or is_address(name)):
+            return  # nobody can register a name without a dot, nor an address
+        if name not in allowed and "*" not in allowed and name != self._service.settings.host:
+            fix = "Use an address of the server, or name it in the setting allowed_hosts."
+            raise InvalidRequest("Host", brief(host), fix)
+
+
+def is_address(name: str) -> bool:
+    """Whether it is an IP address."""
+    try:
+        return bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False
 
 
 def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> FastAPI:
@@ -172,19 +202,9 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
             return grippers
 
         samples = settings.samples or PLAYGROUND_FILES / "samples"
-        app.mount(f"{PLAYGROUND}samples", _Pages(directory=samples))
-        app.mount(PLAYGROUND.rstrip("/"), _Pages(directory=PLAYGROUND_FILES, html=True))
+        app.mount(f"{PLAYGROUND}samples", StaticFiles(directory=samples))
+        app.mount(PLAYGROUND.rstrip("/"), StaticFiles(directory=PLAYGROUND_FILES, html=True))
     return app
-
-
-class _Pages(StaticFiles):
-    """Files of the playground."""
-
-    def file_response(self, *args: Any, **named: Any) -> Response:
-        response = super().file_response(*args, **named)
-        response.headers["content-security-policy"] = OWN_ONLY
-        response.headers["x-content-type-options"] = "nosniff"
-        return response
 
 
 class _GraspResponse(Response):
@@ -269,10 +289,7 @@ def requested_timeout(headers: Headers) -> float:
     text = headers.get(TIMEOUT)
     if text is None:
         return math.inf
-    try:
-        timeout = float(text)
-    except ValueError:
-        timeout = math.nan
+    timeout = float(text) if NUMBER.fullmatch(text) else math.nan
     if not 0.0 < timeout < math.inf:
         raise InvalidRequest(TIMEOUT, brief(text), "Send seconds, such as 2.5, or leave it out.")
     return timeout

@@ -9,6 +9,8 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_service.errors import HeadersTooLarge, Overloaded, Problem, RequestTimeout, report
+from edgegrasp_service.front.admission import Place, Places
+from edgegrasp_service.observability import network_of
 from edgegrasp_service.settings import Settings
 
 LINGER_SECONDS = 5.0  # for a client to take what is not sent yet, though it may still send
@@ -16,16 +18,19 @@ MANY_PIECES, SMALL_PIECE = 1024, 16  # so many chunks of so few bytes are no bod
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Ends connections whose headers do not arrive, and bodies in crumbs; closes gently."""
+    """Ends connections whose headers do not come or whose answers nobody takes; closes gently."""
 
-    def __init__(self, settings: Settings, **arguments: Any) -> None:
+    def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
         self._settings = settings
+        self._places = places
+        self._write_timer: asyncio.TimerHandle | None = None
         self._header_timer: asyncio.TimerHandle | None = None
         self._header_bytes = 0
         self._in_headers = self._receiving = True
         self._pieces = self._body_bytes = 0
         self._refusal: EdgeGraspError | None = None
+        self._place = Place("", lambda: None)
 
     def connection_made(self, transport: Any) -> None:
         """Wait for the first header."""
@@ -34,14 +39,18 @@ class HttpProtocol(HttpToolsProtocol):
             transport, lambda: self._receiving
         )
         self._await_headers()
-        if len(self.connections) > self._settings.max_connections:
-            self._refuse(Overloaded(f"The server has {len(self.connections)} connections."))
+        try:
+            owner = network_of(self.client[0] if self.client else "")
+            self._place = self._places.take(owner, transport.abort)
+        except Overloaded as error:
+            self._refuse(error)
 
     def data_received(self, data: bytes) -> None:
         """Take a part of a request; nothing of one that was refused."""
         if self.transport.is_closing():
             return
         self._header_bytes += len(data)
+        self._places.use(self._place, self._place.idle)
         super().data_received(data)
         if not self._in_headers:
             self._header_bytes = 0
@@ -61,7 +70,27 @@ class HttpProtocol(HttpToolsProtocol):
         """Its headers are there."""
         self._in_headers = False
         self._stop_timer()
+        # How many of these there are is bounded elsewhere, and somebody waits for each.
+        self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
         super().on_headers_complete()
+
+    def on_response_complete(self) -> None:
+        """It is answered."""
+        self._places.use(self._place)
+        super().on_response_complete()
+
+    def pause_writing(self) -> None:
+        """The client takes its answer more slowly than it is made: for some time only."""
+        super().pause_writing()
+        seconds = self._settings.write_seconds
+        seconds += self.transport.get_write_buffer_size() / self._settings.min_bytes_per_second
+        self._write_timer = self.loop.call_later(seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """It has taken most of it."""
+        if self._write_timer is not None:
+            self._write_timer.cancel()
+        super().resume_writing()
 
     def on_body(self, body: bytes) -> None:
         """A piece of its body."""
@@ -81,6 +110,8 @@ class HttpProtocol(HttpToolsProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """The end."""
         self._stop_timer()
+        self.resume_writing()
+        self._places.leave(self._place)
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
@@ -141,6 +172,11 @@ class _GentleTransport:
     def is_closing(self) -> bool:
         """Whether it is closed, or soon will be."""
         return self._closing or self._transport.is_closing()
+
+    def write(self, data: bytes) -> None:
+        """Send, unless nothing more can be."""
+        if not self._closing:
+            self._transport.write(data)
 
     def close(self) -> None:
         """Send what is written, drop what comes in, and close."""

@@ -51,6 +51,7 @@ class GraspService:
         tokens: Replaced when they are read anew.
         stopping: Set: new requests are refused.
         in_flight: Calls that have not ended.
+        record: Called with each job and its answer.
     """
 
     def __init__(
@@ -59,7 +60,6 @@ class GraspService:
         pool: WorkerPool,
         tokens: Tokens,
         observers: Sequence[Observer] = (),
-        record: Recorder | None = None,
     ) -> None:
         self.settings = settings
         self.pool = pool
@@ -68,7 +68,7 @@ class GraspService:
         self.in_flight = 0
         self.admission = Admission(pool.size, settings.max_queue_length, settings.max_held_bytes)
         self._observers = observers
-        self._record = record
+        self.record: Recorder | None = None
         self._harmful = HarmfulRequests()
 
     @property
@@ -152,6 +152,7 @@ class GraspService:
             call.end_stage("read")
             call.bytes_in = len(job.body)
             self.admission.resize(ticket, call.bytes_in)
+            ticket.whole = True
             await self._harmful.check(job)
             began = 0.0
 
@@ -179,8 +180,8 @@ class GraspService:
             call.stages |= answer.facts.seconds
             call.bytes_out = len(answer.body)
             self.admission.resize(ticket, call.bytes_out)
-            if self._record is not None:
-                self._record(job, answer)
+            if self.record is not None:
+                self.record(job, answer)
             del job
             await self.send(write(answer), call.bytes_out)
             call.end_stage("write")

@@ -6,12 +6,11 @@ from typing import Any
 import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
-from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
+from edgegrasp_service.errors import UnsupportedMediaType
+from edgegrasp_service.recording import append_line
 from edgegrasp_service.worker.http_bodies import JSON, read_json
 from edgegrasp_service.worker.job import Job
 from edgegrasp_service.worker.request_cloud import parse
-
-MAX_BYTES = 64 * 2**20  # size at which the file takes no more
 
 
 class TriedGrasp(BaseModel):
@@ -33,8 +32,5 @@ def append(job: Job, catalogue: Any, path: Any) -> bytes:
     catalogue.get(tried.model)  # or it is unknown
     digest = {row["name"]: row["digest"] for row in catalogue.describe()}[tried.model]
     line = tried.model_dump() | {"digest": digest, "time": datetime.now(UTC).isoformat()}
-    with path.open("ab") as file:
-        if file.tell() > MAX_BYTES:
-            raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
-        file.write(orjson.dumps(line) + b"\n")  # one write: lines of several workers stay whole
+    append_line(path, orjson.dumps(line) + b"\n")
     return b"{}"

@@ -361,9 +361,11 @@ class _Worker:
             self._killing.cancel()
             self._killing = None
         waiting, self.answer = self.answer, None
-        if waiting is not None and isinstance(answer, EdgeGraspError):
+        if waiting is None:
+            return
+        if isinstance(answer, EdgeGraspError):
             waiting.set_exception(answer)
-        elif waiting is not None:
+        else:
             waiting.set_result(answer)
 
     def abandon(self) -> None:
