@@ -333,6 +333,7 @@ def _short(found: "Detection") -> str:
             "number": thing.number,
             "center": _digits(thing.center, 3),
             "size": _digits(2 * thing.half_extents, 3),
+            "confidence": None if thing.confidence is None else round(thing.confidence, 3),
             "best_score": None if thing.best_score is None else round(thing.best_score, 3),
         }
         for thing in found.objects[:MOST_GRASPS]

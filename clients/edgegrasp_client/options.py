@@ -75,7 +75,7 @@ class RansacPlane(TypedDict):
 
 
 class AutoPlane(TypedDict):
-    """Look for the plane that things stand on, and that faces the viewpoint."""
+    """Find the support plane: that of the points recognised as a support near objects."""
 
     kind: Literal["auto"]
 
@@ -248,15 +248,14 @@ class DetectOptions(TypedDict, total=False):
     up: Vector | None
     # plane the objects rest on; no part of the hand goes below it; a bare kind will do; None: none
     support: Literal["auto", "ransac", "none"] | SupportPlane | RansacPlane | AutoPlane | None
-    # what grasps are for: the things that stand on the support plane, some of them by number, or
-    # everything; all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0
-    # and less none
+    # what grasps are for: the objects that are recognised, some of them by number, or everything;
+    # all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none
     objects: Literal["auto", "off"] | ObjectChoice
     # pixel of the image; grasps are for the object that is seen there
     at: Vector | None
     # position, metres; grasps are for the object next to it, 0.1 m away at most
     near: Vector | None
-    # longest side of a thing, metres
+    # longest side of an object, metres; longer ones are obstacles
     max_object_size: float
     # where grasps may be; points outside stay as obstacles; None: everywhere
     workspace: Workspace | None

@@ -294,10 +294,10 @@ class RansacPlane(Strict):
 
 
 class AutoPlane(Strict):
-    """Look for the plane that things stand on, and that faces the viewpoint.
+    """Find the support plane: that of the points recognised as a support near objects.
 
-    Not the largest one: the floor under a table and the wall behind it are larger. Where `up` is
-    sent, it lies within 30 degrees of the level. None found: a warning, and no support plane.
+    Where `up` is sent, it lies within 30 degrees of the level. None found: a warning, and objects
+    without a support plane.
     """
 
     kind: Literal["auto"] = "auto"
@@ -558,7 +558,7 @@ class DetectOptions(Strict):
     )
     objects: Literal["auto", "off"] | ObjectChoice = Field(
         default="auto",
-        description="what grasps are for: the things that stand on the support plane, some of "
+        description="what grasps are for: the objects that are recognised, some of "
         "them by number, or everything; all the rest is an obstacle. Where segment_ids are sent, "
         "they are the objects, 0 and less none",
     )
@@ -571,7 +571,10 @@ class DetectOptions(Strict):
         description="position, metres; grasps are for the object next to it, 0.1 m away at most",
     )
     max_object_size: Number = Field(
-        default=0.4, gt=0.0, le=10.0, description="longest side of a thing, metres"
+        default=0.4,
+        gt=0.0,
+        le=10.0,
+        description="longest side of an object, metres; longer ones are obstacles",
     )
     workspace: Workspace | None = Field(
         default=None,

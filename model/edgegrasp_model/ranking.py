@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.collision import clearances, met_first, required_openings
@@ -19,7 +20,6 @@ from edgegrasp_model.results import DebugInfo, DetectedObject, FoundSupport, Gra
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
-from edgegrasp_model.scene.things import smallest_rectangle
 from edgegrasp_model.unseen import DepthMap, unseen_space
 
 Int64 = NDArray[np.int64]
@@ -190,6 +190,7 @@ def detected_objects(scene: Scene, grasps: Sequence[Grasp]) -> list[DetectedObje
                 half_extents=half,
                 quaternion=Rotation.from_matrix(T_cloud_box[:3, :3]).as_quat().astype(np.float32),
                 best_score=best.get(which),
+                confidence=scene.confidence.get(which),
             )
         )
     return objects
@@ -198,13 +199,30 @@ def detected_objects(scene: Scene, grasps: Sequence[Grasp]) -> list[DetectedObje
 def _upright_box(scene: Scene, held: NDArray[np.bool_]) -> tuple[Float32, Float32]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
     points = scene.cloud.points[held].astype(np.float64)
-    axes, low, size = smallest_rectangle(points[:, :2])
+    axes, low, size = _smallest_rectangle(points[:, :2])
     T_canonical_box = np.eye(4)
     T_canonical_box[:2, :2] = axes.T
     bottom, top = points[:, 2].min(), points[:, 2].max()
     T_canonical_box[:3, 3] = [*(axes.T @ (low + size / 2)), (bottom + top) / 2]
     half: Float32 = np.array([*size, top - bottom], dtype=np.float32) / np.float32(2)
     return scene.frame.poses_in_cloud(T_canonical_box), half
+
+
+def _smallest_rectangle(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """The smallest rectangle around points (M, 2): unit axes (2, 2), lowest corner, size (2,)."""
+    try:
+        corners = plan[ConvexHull(plan).vertices]
+    except (QhullError, ValueError):  # too few points, or all in a line
+        corners = plan
+    edges = np.roll(corners, -1, axis=0) - corners
+    edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]
+    edges = np.concatenate([edges, [[1.0, 0.0]]])
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    axes = np.stack([edges, np.stack([-edges[:, 1], edges[:, 0]], axis=1)], axis=1)  # (K, 2, 2)
+    turned = np.einsum("kad,cd->kca", axes, corners)
+    size = np.ptp(turned, axis=1)
+    best = int(size.prod(axis=1).argmin())
+    return axes[best], turned[best].min(axis=0), size[best]
 
 
 def debug_info(

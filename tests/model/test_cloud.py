@@ -92,7 +92,7 @@ def test_a_camera_at_the_origin_sees_what_lies_wholly_in_front_of_it() -> None:
     assert seen_from_origin(seen, (0, -1.0, -0.5))
     assert not seen_from_origin(seen, (0, 0, 1.0))  # it would look straight up
     assert not seen_from_origin(seen - (0, 0, 0.8), None)
-    assert not seen_from_origin((*seen, 1.5, 0, 0), None)
+    assert not seen_from_origin(seen + np.array([1.5, 0, 0]), None)
 
 
 def voxel_means(points: np.ndarray, size: float) -> np.ndarray:

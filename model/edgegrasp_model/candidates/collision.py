@@ -15,7 +15,7 @@ from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.scene.things import FIXED
+from edgegrasp_model.scene.segment import FIXED
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -22,8 +22,6 @@ OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
-BORDER = 3  # pixels
-FRAME = 0.05  # of an image's width or height without depths along its border
 CUBE = 8  # voxels along the edge of a cube whose points follow one another
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
@@ -71,24 +69,6 @@ class CheckedCloud:
             self.image_size,
             self.warnings,
         )
-
-    def at_border(self) -> NDArray[np.bool_] | None:
-        """Which points (N,) lie at the border of what the image shows; None: it is no image.
-
-        That is the first or last point of a row or column of pixels, with no more than a frame
-        without depths (as in one aligned to a colour image) between it and the image's border.
-        """
-        if self.image_size is None:
-            return None
-        held = np.zeros(self.image_size, dtype=bool)
-        held.reshape(-1)[self.row] = True
-        at_border = np.zeros(self.image_size, dtype=bool)
-        for image, marked in ((held, at_border), (held.T, at_border.T)):
-            frame = round(FRAME * image.shape[1])
-            for side in (np.s_[:, : frame + BORDER], np.s_[:, : -frame - BORDER - 1 : -1]):
-                before = np.cumsum(image[side], axis=1, dtype=np.int32)
-                marked[side] |= image[side] & (before <= BORDER)
-        return at_border.reshape(-1)[self.row]
 
 
 def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:

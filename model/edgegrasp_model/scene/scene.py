@@ -1,16 +1,15 @@
 """A request's scene: the small clean cloud in the canonical frame, and what else is there."""
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
+    AutoPlane,
     DetectOptions,
     RansacPlane,
     Region,
@@ -40,16 +39,23 @@ from edgegrasp_model.scene.regions import (
     has_rows,
     inside_region,
 )
-from edgegrasp_model.scene.support import Seen, Support, find_support, measured, raised
-from edgegrasp_model.scene.things import (
-    BOX_FLOOR,
-    CELL,
-    FINE_CELL,
+from edgegrasp_model.scene.segment import (
     FIXED,
     UNKNOWN,
-    PlaneView,
-    find_things,
-    without_speckles,
+    Segmentation,
+    segment,
+    with_risen,
+    without_long,
+)
+from edgegrasp_model.scene.support import LIMITS as PLANE_LIMITS
+from edgegrasp_model.scene.support import (
+    Seen,
+    Support,
+    area,
+    by_surface,
+    fit_plane,
+    measured,
+    near_objects,
 )
 
 Float32 = NDArray[np.float32]
@@ -64,10 +70,9 @@ MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
-WALL = 0.008  # metres, at least, inside a side of the workspace where a wall at it is seen
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
-MIN_BOX_FLOOR = 500  # points of a box's floor that make it the support of what is in the box
-ON = 10_000  # points of the support, at least, that tell its outline
+LIKELY = 0.5  # probability of object or support from which what rises may be an object
+SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,7 @@ class Scene:
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
+    confidence: dict[int, float] = field(default_factory=dict)  # of objects that were found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
 
@@ -97,6 +103,7 @@ class SelectedPoints:
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras
     labels: Int64  # (R,) of the rows of the cloud as sent, as in `DebugInfo`
+    confidence: dict[int, float]  # of each object that the network found
 
 
 def select_points(
@@ -105,7 +112,7 @@ def select_points(
     counts: dict[str, int],
     warnings: list[str],
 ) -> SelectedPoints:
-    """Correct depths, remove the support, number the objects, drop what no hand can meet.
+    """Correct depths, segment, remove the support, drop what no hand at an object can meet.
 
     Raises:
         InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
@@ -113,88 +120,111 @@ def select_points(
     """
     viewpoints = camera_positions(sent, options)
     check_pixel(sent, options)
-    for field in ("approach_region", "contact_region"):
-        if (region := getattr(options, field)) is not None:
-            check_region(region, sent, field)
+    for name in ("approach_region", "contact_region"):
+        if (region := getattr(options, name)) is not None:
+            check_region(region, sent, name)
     counts["points"] = len(sent.points)
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
     sent = near_workspace(sent, options.workspace, REACH)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
-    camera = None if viewpoints is None else viewpoints.mean(axis=0)
-    seen = Seen(sent.points, camera, sent.at_border())
-    support = choose_support(seen, inside, options, warnings)
-    up = _up(options, support)
-    if support is None:
-        counts["above_support"] = int(inside.sum())
-        number = np.where(inside, _given_numbers(sent), UNKNOWN)
-        labels = _labels(sent, number)
-        number = chosen_objects(number, sent, options, warnings)
-        return SelectedPoints(sent, number, None, up, viewpoints, labels)
-    said: list[str] = []
-    standing = _standing_on(support, sent, seen, inside, options, said)
-    floor = standing.number == BOX_FLOOR
-    if floor.sum() > MIN_BOX_FLOOR and not isinstance(options.support, SupportPlane):
-        # Things in an open box stand on its floor.
-        walls = standing.sent.row[standing.number == FIXED]
-        support, said = raised(support, standing.seen.take(np.flatnonzero(floor))), []
-        standing = _standing_on(support, sent, seen, inside, options, said, walls)
-    warnings += said
-    counts["above_support"] = int(standing.inside.sum())
-    labels = _labels(standing.sent, standing.number)
-    labels[standing.on] = SUPPORT
-    number = chosen_objects(standing.number, standing.sent, options, warnings)
-    kept = near_things(standing.plan, number)
-    near, number = standing.sent.take(kept), number[kept]
-    return SelectedPoints(near, number, support, up, viewpoints, labels)
-
-
-def _labels(sent: CheckedCloud, number: Int64) -> Int64:
-    """Labels (R,) of the rows of a cloud as sent, of which M are numbered."""
+    seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
+    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
+    given = sent.segment_ids is not None or by_rows or options.objects == "off"
+    shown = None
+    wanted = options.support is not None and (not given or isinstance(options.support, AutoPlane))
+    if len(sent.points) and wanted:
+        views = _views(sent, viewpoints, options)
+        shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
+    support = choose_support(seen, inside, shown, options, warnings)
+    up = _up(options, support, seen)
+    number = _given_numbers(sent) if given or shown is None else shown.number
+    confidence = {} if given else _confidences(number, shown)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
+    if support is not None:
+        height, margin = support.heights(seen)
+        labels[sent.row[np.abs(height) <= margin]] = SUPPORT
+        above = np.flatnonzero(height > margin)
+        sent, number, inside = sent.take(above), number[above], inside[above]
+    counts["above_support"] = int(inside.sum())
+    plan = sent.points[:, :2].astype(np.float64)
+    if support is not None:
+        plan = support.plan(sent.points)
+    if support is not None and shown is not None and not given:
+        # Callers who cut the support off have left little but objects.
+        likely = (shown.object + shown.support)[above] > LIKELY
+        likely |= math.isnan(support.spread)
+        number = with_risen(number, plan, height[above], margin[above], likely)
+    if support is None and not given and (viewpoints is None or not (number >= 0).any()):
+        number = np.zeros_like(number)  # a cloud of one object, without what it stands on
+    if not given:
+        number = without_long(number, sent.points, options.max_object_size)
+    number = np.where(inside | (number == FIXED), number, UNKNOWN)
+    if counts["above_support"] and not given and not (number >= 0).any():
+        warnings.append(
+            "no object was recognised above the support plane. Send objects: off to look for "
+            "grasps on everything above it."
+        )
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
-    labels[sent.row[number == BOX_FLOOR]] = SUPPORT
-    return labels
+    number = chosen_objects(number, sent, options, warnings)
+    kept = near_things(plan, number)
+    near, number = sent.take(kept), number[kept]
+    return SelectedPoints(near, number, support, up, viewpoints, labels, confidence)
 
 
-class _Standing(NamedTuple):
-    """M points over the support."""
-
-    sent: CheckedCloud
-    seen: Seen
-    inside: Bools  # (M,) in the workspace
-    plan: Float64  # (M, 2) metres along the support
-    number: Int64  # (M,) as from `find_things`
-    on: Int64  # rows of the cloud as sent that belong to the support
+def _known_up(options: DetectOptions) -> Float64 | None:
+    """(3,) unit, away from gravity; None where the caller tells neither it nor the support."""
+    known = options.up
+    if known is None and isinstance(options.support, SupportPlane):
+        known = options.support.normal
+    return None if known is None else np.asarray(known) / np.linalg.norm(known)
 
 
-def _standing_on(
-    support: Support,
-    sent: CheckedCloud,
-    seen: Seen,
-    inside: Bools,
-    options: DetectOptions,
-    warnings: list[str],
-    walls: Int64 | None = None,
-) -> _Standing:
-    """What stands on a support; of points that are known as walls, nothing does."""
-    height, margin, thick = support.heights(seen)
-    # Where the cloud was cut off above the support, what is near it does not tell its outline.
-    near = (np.abs(height) < thick) & math.isfinite(support.spread)
-    on, above = np.flatnonzero(near), np.flatnonzero(height > margin)
-    each = max(len(on) // ON, 1)
-    on_plan = support.plan(sent.points[on[::each]])
-    belongs = sent.row[np.abs(height) <= margin]
-    sent, seen, inside = sent.take(above), seen.take(above), inside[above]
-    plan = support.plan(sent.points)
-    height, margin = height[above], margin[above]
-    number = np.full(len(plan), FIXED)
-    rest = np.flatnonzero(~np.isin(sent.row, [] if walls is None else walls))
-    border = None if seen.at_border is None else seen.at_border[rest]
-    view = PlaneView(plan[rest], height[rest], margin[rest], on_plan, border, each)
-    number[rest] = _numbers(view, sent.take(rest), seen.take(rest), inside[rest], options, warnings)
-    return _Standing(sent, seen, inside, plan, number, belongs)
+def _views(
+    sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
+) -> list[tuple[Float64, Int64 | None]]:
+    """The position of each camera and the rows that it saw; without any, one above the points."""
+    if viewpoints is None:
+        up = _known_up(options)
+        up = np.array([0.0, 0.0, 1.0]) if up is None else up
+        low, high = np.percentile(sent.points, (1, 99), axis=0)
+        away = max(1.0, 1.5 * float((high - low).max()))
+        return [((low + high) / 2 + away * up, None)]
+    if len(viewpoints) == 1:
+        return [(viewpoints[0], None)]
+    assert sent.view_ids is not None
+    return [(eye, np.flatnonzero(sent.view_ids == k)) for k, eye in enumerate(viewpoints)]
+
+
+def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | None:
+    """(3,) unit, cloud frame, downward in the image; None: unknown.
+
+    Without a camera, one that turns with the cloud.
+    """
+    if viewpoints is None:
+        apart = sent.points - sent.points.mean(axis=0)
+        furthest: Float64 = apart[np.linalg.norm(apart, axis=1).argmax()].astype(np.float64)
+        return furthest / max(float(np.linalg.norm(furthest)), 1e-9)
+    if sent.image_size is None or len(viewpoints) > 1:
+        return None
+    some = slice(None, None, max(len(sent.row) // 5000, 1))
+    sight = sent.points[some] - viewpoints[0]
+    sight = sight / np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
+    row = sent.row[some] // sent.image_size[1]
+    down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
+    length = float(np.linalg.norm(down))
+    return down / length if length > 0 else None
+
+
+def _confidences(number: Int64, shown: Segmentation | None) -> dict[int, float]:
+    """How sure the network is of each object: its mean probability over the object's points."""
+    held = number >= 0
+    if shown is None or not held.any():
+        return {}
+    count = np.bincount(number[held])
+    total = np.bincount(number[held], shown.object[held])
+    return {int(k): float(total[k] / count[k]) for k in np.flatnonzero(count)}
 
 
 def build_scene(
@@ -264,6 +294,7 @@ def build_scene(
         support=None if support is None else plane_in_frame(support.plane, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
         viewpoint=single_viewpoint(viewpoints, frame),
+        confidence=selected.confidence,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )
 
@@ -281,22 +312,37 @@ def _too_many_voxels(
 
 
 def choose_support(
-    seen: Seen, inside: Bools, options: DetectOptions, warnings: list[str]
+    seen: Seen,
+    inside: Bools,
+    shown: Segmentation | None,
+    options: DetectOptions,
+    warnings: list[str],
 ) -> Support | None:
-    """The support plane, given or found."""
+    """The support plane: given, or fitted to what the network calls a support."""
     request = options.support
     if request is None or len(seen.points) == 0:
         return None
-    up = None if options.up is None else np.asarray(options.up, dtype=np.float64)
+    up = _known_up(options)
+    found: Support | None
     if isinstance(request, SupportPlane):
         # A bin's floor is not measured by the table around it.
         around = BELOW_WORKSPACE * np.abs(request.normal)
         over = inside_workspace(seen.points, options.workspace, around)
-        found: Support | None = measured(seen.take(np.flatnonzero(over)), request)
+        found = measured(Seen(seen.points[over], seen.viewpoint), request)
     else:
-        where = seen.take(np.flatnonzero(inside)) if isinstance(request, RansacPlane) else seen
         rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
-        found = find_support(where, request, up, options.max_object_size, rng, warnings)
+        if isinstance(request, RansacPlane):
+            weight = by_surface(seen.points) * inside
+            plane = fit_plane(seen, weight, rng, up, request.max_tilt)
+            found = None if plane is None else measured(seen, plane, request.distance)
+            found = None if found is None or found.share < request.min_share else found
+        else:
+            found = _fitted_support(seen, shown, up, rng)
+        if found is None:
+            warnings.append(
+                "no support plane is seen: objects are returned without one. Send support, or the "
+                "true up, if there is one in view."
+            )
     if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
         warnings.append(
             "the viewpoint lies below the support plane: check viewpoint, up and support."
@@ -304,12 +350,33 @@ def choose_support(
     return found
 
 
-def _up(options: DetectOptions, support: Support | None) -> Float64:
-    """Unit vector (3,) away from gravity: as sent, else the support's normal, else +z."""
+def _fitted_support(
+    seen: Seen, shown: Segmentation | None, up: Float64 | None, rng: np.random.Generator
+) -> Support | None:
+    """The plane of the points that the network calls a support, those near objects above all."""
+    assert shown is not None
+    on = np.flatnonzero(shown.support > 0.5)
+    on = on[:: max(len(on) // SUPPORT_POINTS, 1)]
+    part = Seen(seen.points[on], seen.viewpoint)
+    weight = near_objects(part.points, seen.points[shown.number >= 0])
+    plane = fit_plane(part, weight, rng, up)
+    if plane is None:
+        return None
+    found = measured(part, plane, PLANE_LIMITS.margin[0])
+    return found if area(found, part.points) > PLANE_LIMITS.least_area else None
+
+
+def _up(options: DetectOptions, support: Support | None, seen: Seen) -> Float64:
+    """Unit vector (3,) away from gravity: as sent, else the support's normal, else a guess.
+
+    Where a support was looked for and none is seen, that is the way to the camera; else +z.
+    """
     given = options.up
-    if given is None:
-        given = (0.0, 0.0, 1.0) if support is None else support.plane.normal
-    up = np.asarray(given, dtype=np.float64)
+    if given is None and support is not None:
+        given = support.plane.normal
+    up = np.array([0.0, 0.0, 1.0]) if given is None else np.asarray(given, dtype=np.float64)
+    if given is None and isinstance(options.support, AutoPlane) and seen.viewpoint is not None:
+        up = seen.viewpoint - np.median(seen.points, axis=0)
     return np.asarray(up / np.linalg.norm(up))
 
 
@@ -318,69 +385,6 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
     if sent.segment_ids is None:
         return np.zeros(len(sent.points), dtype=np.int64)
     return np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
-
-
-def _numbers(
-    view: PlaneView,
-    sent: CheckedCloud,
-    seen: Seen,
-    inside: Bools,
-    options: DetectOptions,
-    warnings: list[str],
-) -> Int64:
-    """The object (M,) of each point over the support; FIXED: furniture; UNKNOWN: neither.
-
-    What the caller says are objects are: segments, or regions by rows.
-    """
-    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
-    if sent.segment_ids is not None or by_rows or options.objects == "off":
-        return np.where(inside, _given_numbers(sent), UNKNOWN)
-    if options.workspace is not None:
-        beyond = beyond_workspace(view, sent.points, options.workspace)
-        view = view._replace(beyond=beyond)
-    # Things that touch furniture may be told from it more finely.
-    for cell, strict in ((CELL, True), (FINE_CELL, True), (CELL, False)):
-        number = find_things(view, options.max_object_size, cell, strict)
-        number = np.where((number >= 0) & ~inside, UNKNOWN, number)
-        if sent.image_size is not None:
-            number = without_speckles(number, sent.row, sent.image_size, seen.distance())
-        if (number >= 0).any() or not inside.any():
-            break
-    if strict:
-        return number
-    said = "nothing over the support plane looks like a thing (longer than max_object_size, "
-    said += "cut off by the image, or not on the plane)"
-    if (number >= 0).any():
-        said += ": what the image cuts off is taken for things"
-    warnings.append(f"{said}. Send objects: off to look for grasps on all that is over it.")
-    return number
-
-
-def beyond_workspace(view: PlaneView, points: Float32, box: Workspace) -> Int64:
-    """Which side of the workspace points are beyond, or at, beside something beyond it.
-
-    The walls of a bin whose inside is the workspace are seen partly in it: as far as their points
-    may lie off them.
-
-    Args:
-        view: M points.
-        points: (M, 3) the same, cloud frame, metres.
-        box: The workspace.
-
-    Returns:
-        (M,) number of the side, from 1; 0: in it.
-    """
-    low, high = np.asarray(box.min), np.asarray(box.max)
-    outside = np.concatenate([points < low, points > high], axis=1)  # (M, 6)
-    wall = np.maximum(view.margin, WALL)[:, None]
-    at_side = np.concatenate([points < low + wall, points > high - wall], axis=1)
-    inside = ~outside.any(axis=1)
-    beside = np.flatnonzero(inside & at_side.any(axis=1))
-    if not inside.all() and len(beside):
-        around = cKDTree(view.plan[~inside])
-        apart, _ = around.query(view.plan[beside], distance_upper_bound=2 * WALL)
-        outside[beside] = at_side[beside] & np.isfinite(apart)[:, None]
-    return np.where(outside.any(axis=1), outside.argmax(axis=1) + 1, 0)
 
 
 def near_things(plan: Float64, number: Int64) -> Bools:

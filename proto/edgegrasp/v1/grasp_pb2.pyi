@@ -603,12 +603,12 @@ class DetectOptions(_message.Message):
     seed: _builtins.int
     """Seed of every random choice."""
     objects: _builtins.str
-    """What grasps are for: the things that stand on the support plane, some of them by number, or
-    everything; all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0
-    and less none. One of "auto", "off".
+    """What grasps are for: the objects that are recognised, some of them by number, or everything;
+    all the rest is an obstacle. Where segment_ids are sent, they are the objects, 0 and less none.
+    One of "auto", "off".
     """
     max_object_size: _builtins.float
-    """Longest side of a thing, metres."""
+    """Longest side of an object, metres; longer ones are obstacles."""
     min_score: _builtins.float
     """Lowest score returned."""
     top_k: _builtins.int
@@ -862,8 +862,8 @@ class Support(_message.Message):
 
     @_builtins.property
     def auto(self) -> Global___AutoPlane:
-        """Look for the plane that things stand on, and that faces the viewpoint. `kind` is "auto" in
-        JSON, its fields beside it.
+        """Find the support plane: that of the points recognised as a support near objects. `kind` is
+        "auto" in JSON, its fields beside it.
         """
 
     def __init__(
@@ -934,7 +934,7 @@ Global___RansacPlane: _TypeAlias = RansacPlane  # noqa: Y015
 
 @_typing.final
 class AutoPlane(_message.Message):
-    """Look for the plane that things stand on, and that faces the viewpoint."""
+    """Find the support plane: that of the points recognised as a support near objects."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1865,7 +1865,7 @@ Global___FoundSupport: _TypeAlias = FoundSupport  # noqa: Y015
 
 @_typing.final
 class DetectedObject(_message.Message):
-    """A thing that grasps are for; cloud frame, metres."""
+    """An object that grasps are for; cloud frame, metres."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1875,12 +1875,15 @@ class DetectedObject(_message.Message):
     HALF_EXTENTS_FIELD_NUMBER: _builtins.int
     QUATERNION_FIELD_NUMBER: _builtins.int
     BEST_SCORE_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
     number: _builtins.int
     """As in Grasp.object; the segment, where segment_ids were sent."""
     points: _builtins.int
     """Voxels of the processed cloud that are seen of it."""
     best_score: _builtins.float
     """Best of the scores of the grasps returned; absent (null in JSON): there is none on it."""
+    confidence: _builtins.float
+    """Mean probability that its points show an object; absent (null in JSON): the caller named it."""
     @_builtins.property
     def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """3 floats: the middle of the smallest upright box around them."""
@@ -1902,14 +1905,20 @@ class DetectedObject(_message.Message):
         half_extents: _abc.Iterable[_builtins.float] | None = ...,
         quaternion: _abc.Iterable[_builtins.float] | None = ...,
         best_score: _builtins.float | None = ...,
+        confidence: _builtins.float | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "best_score", b"best_score"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "best_score", b"best_score", "confidence", b"confidence"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "best_score", b"best_score", "center", b"center", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "best_score", b"best_score", "center", b"center", "confidence", b"confidence", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__best_score: _TypeAlias = _typing.Literal["best_score"]  # noqa: Y015
     _WhichOneofArgType__best_score: _TypeAlias = _typing.Literal["_best_score", b"_best_score"]  # noqa: Y015
+    _WhichOneofReturnType__confidence: _TypeAlias = _typing.Literal["confidence"]  # noqa: Y015
+    _WhichOneofArgType__confidence: _TypeAlias = _typing.Literal["_confidence", b"_confidence"]  # noqa: Y015
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__best_score) -> _WhichOneofReturnType__best_score | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__confidence) -> _WhichOneofReturnType__confidence | None: ...
 
 Global___DetectedObject: _TypeAlias = DetectedObject  # noqa: Y015
 

@@ -1,0 +1,171 @@
+"""The `scene` network: what each pixel of a range image shows, and which pixels belong together.
+
+A U-Net on depth alone, as networks that segment unseen objects from simulated depth (UOIS-Net, Xie
+et al., T-RO 2021): its input has twice the resolution of its output.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
+
+from edgegrasp_model.kernels import compiled
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+HEIGHT, WIDTH = 240, 320  # pixels of the input
+MULTIPLE = 16  # its sides are multiples of
+CLASSES = ("other", "support", "object")
+CHANNELS = 12  # of `scene_features`
+WIDTHS = (16, 32, 64, 96, 128)
+STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
+VOTE_UNIT = 0.05  # metres
+OUTPUTS = len(CLASSES) + 3 + 2
+
+
+class SceneOutput(NamedTuple):
+    """What the network says of each pixel, at half of the input's resolution."""
+
+    classes: Tensor  # (B, 3, H/2, W/2) logits of CLASSES
+    votes: Tensor  # (B, 3, H/2, W/2) metres from the point to the centre of its object
+    links: (
+        Tensor  # (B, 2, H/2, W/2) logits: shows the same object as its right, its lower neighbour
+    )
+
+
+class SceneNet(nn.Module):
+    """Classes, votes for centres and links of range images."""
+
+    def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
+        """With random weights; `widths` are channels at each resolution, from the output's."""
+        super().__init__()
+        first = widths[0]
+        self.stem = _layer(CHANNELS, first, kernel=4, stride=2)
+        self.fine = _layer(first, first)
+        pairs = list(pairwise(widths))
+        self.down = nn.ModuleList(
+            [nn.Sequential(_layer(a, b, stride=2), _Block(b)) for a, b in pairs]
+        )
+        self.context = _Block(widths[-1], dilation=3)
+        self.across = nn.ModuleList([nn.Conv2d(b, a, 1) for a, b in pairs[::-1]])
+        self.up = nn.ModuleList([_layer(a, a) for a, _ in pairs[::-1]])
+        self.head = nn.Conv2d(first, OUTPUTS, 1)
+
+    def forward(self, features: Tensor) -> SceneOutput:
+        """Of features (B, CHANNELS, H, W), where H and W are multiples of 16."""
+        x = self.fine(self.stem(features))
+        kept = []
+        for layer in self.down:
+            kept.append(x)
+            x = layer(x)
+        x = self.context(x)
+        for across, layer, beside in zip(self.across, self.up, kept[::-1], strict=True):
+            x = functional.interpolate(
+                across(x), size=beside.shape[2:], mode="bilinear", align_corners=False
+            )
+            x = layer(x + beside)
+        out = self.head(x)
+        return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:])
+
+    def fused(self) -> "SceneNet":
+        """This network with each normalisation folded into its convolution, for inference."""
+        for module in self.modules():
+            if isinstance(module, nn.Sequential) and isinstance(module[0], nn.Conv2d):
+                normalisation = module[1]
+                assert isinstance(normalisation, nn.BatchNorm2d)
+                module[0] = fuse_conv_bn_eval(module[0], normalisation)
+                module[1] = nn.Identity()
+        return self
+
+
+class _Block(nn.Module):
+    """Two convolutions beside the identity."""
+
+    def __init__(self, width: int, dilation: int = 1) -> None:
+        super().__init__()
+        self.first = _layer(width, width, dilation=dilation)
+        self.second = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=False),
+            nn.BatchNorm2d(width),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.relu(x + self.second(self.first(x)))
+
+
+def _layer(
+    inside: int, outside: int, kernel: int = 3, stride: int = 1, dilation: int = 1
+) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inside, outside, kernel, stride, padding=dilation, dilation=dilation, bias=False),
+        nn.BatchNorm2d(outside),
+        nn.ReLU(inplace=True),
+    )
+
+
+def scene_features(points: Float32, up: Float64 | None, footprint: float) -> Float32:
+    """What the network reads of a range image.
+
+    Args:
+        points: (H, W, 3) camera frame, metres; NaN without a reading.
+        up: (3,) unit, away from gravity, camera frame; None where it is unknown.
+        footprint: Width of a pixel at a depth of one metre, metres.
+
+    Returns:
+        (CHANNELS, H, W); zero where there is no reading.
+    """
+    known = np.zeros(3) if up is None else np.asarray(up, dtype=np.float64)
+    features = np.zeros((CHANNELS, *points.shape[:2]), dtype=np.float32)
+    _fill_features(
+        np.ascontiguousarray(points), known, up is not None, np.log(footprint) + 6.0, features
+    )
+    return features
+
+
+@compiled("contract")
+def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out: Float32) -> None:
+    height, width, _ = points.shape
+    middle, count = np.zeros(3), 0
+    for i in range(0, height, 2):
+        for j in range(0, width, 2):
+            if not np.isnan(points[i, j, 2]):
+                count += 1
+                for d in range(3):
+                    middle[d] += points[i, j, d]
+    middle /= max(count, 1)
+    s = STRIDE
+    for i in range(height):
+        for j in range(width):
+            x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
+            if np.isnan(z):
+                continue
+            z = max(z, 0.05)
+            out[0, i, j] = min(max(2.0 * (z - middle[2]), -3.0), 3.0)
+            out[1, i, j] = np.log(z)
+            out[2, i, j] = np.log(z) + offset
+            out[3, i, j] = x / z
+            out[4, i, j] = y / z
+            if known:
+                level = up[0] * (x - middle[0]) + up[1] * (y - middle[1]) + up[2] * (z - middle[2])
+                out[8, i, j] = min(max(2.0 * level, -3.0), 3.0)
+                out[10, i, j] = 1.0
+            out[11, i, j] = 1.0
+            if i < s or j < s or i >= height - s or j >= width - s:
+                continue
+            ax = points[i + s, j, 0] - points[i - s, j, 0]
+            ay = points[i + s, j, 1] - points[i - s, j, 1]
+            az = points[i + s, j, 2] - points[i - s, j, 2]
+            bx = points[i, j + s, 0] - points[i, j - s, 0]
+            by = points[i, j + s, 1] - points[i, j - s, 1]
+            bz = points[i, j + s, 2] - points[i, j - s, 2]
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length > 0.0:  # false for NaN too
+                out[5, i, j], out[6, i, j], out[7, i, j] = nx / length, ny / length, nz / length
+                if known:
+                    out[9, i, j] = (up[0] * nx + up[1] * ny + up[2] * nz) / length

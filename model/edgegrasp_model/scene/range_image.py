@@ -1,0 +1,157 @@
+"""What a viewpoint sees of points, as the range image that the `scene` network reads."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_model.kernels import compiled
+from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+SAMPLE = 6000  # points that decide what part of the view the image covers
+WIDEST = 1.2  # tangent of half of the widest view, 100 degrees
+NEAREST = 0.05  # metres from the viewpoint
+COVERED = 0.5  # percent of the points that may lie beyond each side of the image
+COARSE = 40  # cells across the view, which tell how densely points lie
+SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
+SURFACE = 0.02  # metres by which a nearer point of the same pixel hides another
+
+
+class RangeImage(NamedTuple):
+    """Points in the frame of a camera (x right, y down, z forward) at a viewpoint."""
+
+    points: Float32  # (H, W, 3) metres; NaN where nothing was seen
+    footprint: float  # metres, width of a pixel at a depth of one metre
+    T_cloud_camera: Float64  # (4, 4)
+    pixel: Int64  # (N,) row-major pixel of each point; -1: outside of the image
+
+
+def range_image(
+    points: Float32, viewpoint: Float64, up: Float64 | None, down: Float64 | None = None
+) -> RangeImage:
+    """Render points as seen from a viewpoint.
+
+    Args:
+        points: (N, 3) cloud frame, metres; at least one.
+        viewpoint: (3,) of the camera.
+        up: (3,) away from gravity, which becomes upward in the image; None: unknown.
+        down: (3,) downward in the image where `up` does not say; None: as cloud frames usually are.
+    """
+    downward = [way for way in (None if up is None else -up, down) if way is not None]
+    apart = points[:: max(len(points) // SAMPLE, 1)].astype(np.float64) - viewpoint
+    sight = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+    turn = _camera_axes(sight.mean(axis=0), downward)
+    for _ in range(2):
+        low, high = _view(apart @ turn.T)
+        turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
+    low, high = _view(apart @ turn.T)
+    pixel_size = _pixel_size(apart @ turn.T, low, high, len(points))
+    width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
+    middle = (low + high) / 2
+    image = np.full((height, width, 3), np.nan, dtype=np.float32)
+    pixel = np.full(len(points), -1, dtype=np.int64)
+    corner = middle - pixel_size * np.array([width, height]) / 2
+    _render(points, viewpoint, turn, corner, pixel_size, image, pixel)
+    filled = image.copy()
+    _fill_holes(image, filled)
+    T_cloud_camera = np.eye(4)
+    T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
+    return RangeImage(filled, float(pixel_size), T_cloud_camera, pixel)
+
+
+def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
+    """Axes (3, 3), rows x right, y down, z forward along `sight`; cloud frame.
+
+    The first of `downward` that is not along the sight decides.
+    """
+    length = float(np.linalg.norm(sight))
+    z = sight / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
+    # Clouds come in a camera's frame (y down) or in one whose z points up.
+    usual = np.array([0.0, 1.0, 0.0]) if abs(z[2]) > 0.7 else np.array([0.0, 0.0, -1.0])
+    choices = [*downward, usual, np.array([1.0, 0.0, 0.0])]
+    x = next(x for x in (np.cross(way, z) for way in choices) if np.linalg.norm(x) > 0.1)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _view(points: Float64) -> tuple[Float64, Float64]:
+    """Lowest and highest x / z and y / z (2,) that an image of points (N, 3) covers."""
+    ahead = points[points[:, 2] > NEAREST]
+    if len(ahead) == 0:
+        return np.full(2, -0.1), np.full(2, 0.1)
+    low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
+    edge = 0.02 * (high - low) + 1e-3
+    return np.maximum(low - edge, -WIDEST), np.minimum(high + edge, WIDEST)
+
+
+def _pixel_size(points: Float64, low: Float64, high: Float64, count: int) -> float:
+    """Side of a pixel at z = 1: as fine as the points allow, as coarse as the network asks for."""
+    side = high - low
+    finest = float(np.sqrt(side.prod() / (WIDTH * HEIGHT)))
+    ahead = points[points[:, 2] > NEAREST]
+    cell = max(float(side.max()) / COARSE, 1e-6)
+    place = ((ahead[:, :2] / ahead[:, 2:] - low) / cell).astype(np.int64)
+    occupied = len(np.unique(place[:, 0] * 4096 + place[:, 1])) * cell * cell
+    return max(finest, SPACING * float(np.sqrt(occupied / max(count, 1))))
+
+
+@compiled("contract")
+def _render(
+    points: Float32,
+    viewpoint: Float64,
+    turn: Float64,
+    corner: Float64,
+    pixel_size: float,
+    image: Float32,
+    pixel: Int64,
+) -> None:
+    """Put into each pixel the point nearest to its middle, of the nearest surface."""
+    height, width, _ = image.shape
+    best = np.full((height, width), np.inf, dtype=np.float32)
+    for n in range(len(points)):
+        a = points[n, 0] - viewpoint[0]
+        b = points[n, 1] - viewpoint[1]
+        c = points[n, 2] - viewpoint[2]
+        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c
+        if z < NEAREST:
+            continue
+        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c
+        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c
+        u = (x / z - corner[0]) / pixel_size
+        v = (y / z - corner[1]) / pixel_size
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        i, j = int(v), int(u)
+        pixel[n] = i * width + j
+        off = (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
+        there = image[i, j, 2]
+        if np.isnan(there) or z < there - SURFACE or (z < there + SURFACE and off < best[i, j]):
+            image[i, j, 0], image[i, j, 1], image[i, j, 2] = x, y, z
+            best[i, j] = off
+
+
+@compiled("contract")
+def _fill_holes(image: Float32, out: Float32) -> None:
+    """Give an empty pixel the mean of its neighbours where most of them are there and agree."""
+    height, width, _ = image.shape
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if not np.isnan(image[i, j, 2]):
+                continue
+            count, low, high = 0, np.inf, 0.0
+            x = y = z = 0.0
+            for k in range(-1, 2):
+                for m in range(-1, 2):
+                    depth = image[i + k, j + m, 2]
+                    if not np.isnan(depth):
+                        count += 1
+                        low, high = min(low, depth), max(high, depth)
+                        x += image[i + k, j + m, 0]
+                        y += image[i + k, j + m, 1]
+                        z += depth
+            if count >= 4 and high - low < SURFACE + 0.01 * high:
+                out[i, j, 0], out[i, j, 1], out[i, j, 2] = x / count, y / count, z / count

@@ -1,0 +1,308 @@
+"""What each point shows, by the `scene` network: an object and which one, the support, or else."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from edgegrasp_model.kernels import compiled
+from edgegrasp_model.scene.network import SceneNet, scene_features
+from edgegrasp_model.scene.range_image import range_image
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+# In place of an object's number: background; what may belong to an object.
+FIXED, UNKNOWN = -1, -2
+WEIGHTS = Path(__file__).with_name("network.safetensors")
+
+
+@dataclass(frozen=True)
+class GroupingLimits:
+    """When pixels show the same object."""
+
+    link: float = 0.6  # probability that neighbouring pixels show one object
+    vote: float = 0.04  # metres between the centres that neighbours vote for
+    same_centre: float = 0.035  # metres between the mean votes of two parts of one object
+    smallest: int = 16  # pixels of the network's output
+    cell: float = 0.012  # metres between points of one object that the network did not see
+    most_cells: int = 2000  # along a side of the ground that is looked at
+    fewest_points: int = 6  # of such an object in a cell, the mean
+    fewest_cells: int = 5
+    tall: float = 0.03  # metres over what belongs to the support from which background is a wall
+    beside_background: float = 0.4  # share of such an object's cells that lie beside a wall
+    stands_out: float = 0.004  # metres over what belongs to the support that it rises at least
+
+
+LIMITS = GroupingLimits()
+REACH, REACH_GROWTH = 0.03, 0.01  # metres, and share of the depth, from a point to its pixel
+
+
+class Segmentation(NamedTuple):
+    """What N points show."""
+
+    number: Int64  # (N,) the object, from 0; FIXED; UNKNOWN
+    object: Float32  # (N,) probability of an object
+    support: Float32  # (N,) probability of a support
+
+
+@cache
+def scene_network() -> SceneNet:
+    """The network with the weights that ship; loaded once a process."""
+    network = SceneNet()
+    network.load_state_dict(load_file(WEIGHTS))
+    network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network
+
+
+def segment(
+    points: Float32,
+    views: list[tuple[Float64, Int64 | None]],
+    up: Float64 | None,
+    down: Float64 | None = None,
+) -> Segmentation:
+    """Segment points, view by view; an object that several views show has one number.
+
+    Args:
+        points: (N, 3) cloud frame, metres.
+        views: The position (3,) of each camera, and the rows (M,) of the points that it saw;
+            None: all.
+        up: (3,) unit, away from gravity; None: unknown.
+        down: (3,) unit, downward in the image, of use where `up` is unknown; None: unknown.
+    """
+    number = np.full(len(points), UNKNOWN)
+    objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    for viewpoint, rows in views:
+        if rows is None:
+            return _segment_view(points, viewpoint, up, down)
+        if len(rows) == 0:
+            continue
+        own, objects[rows], support[rows] = _segment_view(points[rows], viewpoint, up, down)
+        number[rows] = np.where(own >= 0, own + int(number.max(initial=-1)) + 1, own)
+    return Segmentation(_joined(points, number), objects, support)
+
+
+def _segment_view(
+    points: Float32, viewpoint: Float64, up: Float64 | None, down: Float64 | None
+) -> Segmentation:
+    """What M points show that one camera saw."""
+    image = range_image(points, viewpoint, up, down)
+    turn = image.T_cloud_camera[:3, :3]
+    features = scene_features(image.points, None if up is None else up @ turn, image.footprint)
+    with torch.inference_mode():
+        batch = torch.from_numpy(features)[None].contiguous(memory_format=torch.channels_last)
+        output = scene_network()(batch)
+        classes = output.classes[0].softmax(dim=0).contiguous().numpy()
+        votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
+        links = output.links[0].sigmoid().contiguous().numpy()
+    seen = np.ascontiguousarray(image.points[::2, ::2])
+    shown = Segmentation(
+        np.full(len(points), UNKNOWN), *np.zeros((2, len(points)), dtype=np.float32)
+    )
+    T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
+    of_pixel = group(seen, classes, votes, links)
+    _look_up(
+        points, image.pixel, T_camera_cloud, image.points.shape[1], seen, of_pixel, classes, *shown
+    )
+    return shown
+
+
+def with_risen(
+    number: Int64,
+    plan: Float64,
+    height: Float32,
+    margin: Float32,
+    likely: Bools,
+) -> Int64:
+    """The numbers (N,), and those of what rises above the support but was called none of it.
+
+    Geometry sees what is too thin for the network: such points join the object beside them, or
+    become one.
+
+    Args:
+        number: (N,) as from `segment`.
+        plan: (N, 2) metres along the support.
+        height: (N,) metres over it.
+        margin: (N,) metres over it that belong to it.
+        likely: (N,) whether they show an object or a support rather than background.
+    """
+    rises = (number < 0) & (height > margin + LIMITS.stands_out) & likely
+    rows = np.flatnonzero(rises)
+    if len(rows) == 0:
+        return number
+    number = number.copy()
+    held = np.flatnonzero((number >= 0) & (height > margin))
+    if len(held):
+        held = held[:: max(len(held) // 20_000, 1)]
+        places = np.column_stack([plan[held], height[held]])
+        apart, nearest = cKDTree(places).query(
+            np.column_stack([plan[rows], height[rows]]), distance_upper_bound=LIMITS.cell
+        )
+        near = np.isfinite(apart)
+        number[rows[near]] = number[held[np.asarray(nearest)[near]]]
+        rows = rows[~near]
+    return _with_clusters(number, rows, plan, height > margin + LIMITS.tall)
+
+
+def _with_clusters(number: Int64, rows: Int64, plan: Float64, tall: Bools) -> Int64:
+    """The numbers (N,) where rows that lie close together, not beside walls, are objects."""
+    if len(rows) == 0:
+        return number
+    low = plan[rows].min(axis=0) - LIMITS.cell
+    cell = np.floor((plan - low) / LIMITS.cell).astype(np.int64)
+    size = np.minimum(cell[rows].max(axis=0) + 2, LIMITS.most_cells)
+    inside = ((cell >= 0) & (cell < size)).all(axis=1)
+    count = np.zeros((2, *size), dtype=np.int64)  # of the rows, of background
+    mine = np.zeros(len(number), dtype=bool)
+    mine[rows] = True
+    for layer, held in enumerate((mine & inside, (number == FIXED) & tall & ~mine & inside)):
+        np.add.at(count[layer], tuple(cell[held].T), 1)
+    labels, found = ndimage.label(count[0] > 0, np.ones((3, 3)))
+    which = np.arange(1, found + 1)
+    cells = ndimage.sum_labels(count[0] > 0, labels, which)
+    points = ndimage.sum_labels(count[0], labels, which)
+    beside = ndimage.sum_labels(ndimage.maximum_filter(count[1], 3) > 0, labels, which)
+    good = (cells >= LIMITS.fewest_cells) & (points >= LIMITS.fewest_points * cells)
+    good &= beside < LIMITS.beside_background * cells
+    first = int(number.max(initial=-1)) + 1
+    new = np.concatenate([[UNKNOWN], np.where(good, first + np.cumsum(good) - 1, UNKNOWN)])
+    rows = rows[inside[rows]]
+    here = new[labels[tuple(cell[rows].T)]]
+    number[rows] = np.where(here >= 0, here, number[rows])
+    return number
+
+
+def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
+    """The numbers (N,) but for objects longer than `max_size` metres, which are background."""
+    held = np.flatnonzero(number >= 0)
+    if len(held) == 0:
+        return number
+    order = held[np.argsort(number[held], kind="stable")]
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+    number = number.copy()
+    for rows in np.split(order, starts[1:]):
+        some = points[rows[:: max(len(rows) // 400, 1)]].astype(np.float64)
+        around = some - some.mean(axis=0)
+        _, axes = np.linalg.eigh(around.T @ around)
+        low, high = np.percentile(around @ axes, (1, 99), axis=0)
+        if (high - low).max() > max_size:
+            number[rows] = FIXED
+    return number
+
+
+def group(points: Float32, classes: Float32, votes: Float32, links: Float32) -> Int64:
+    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN where in doubt.
+
+    Args:
+        points: (H, W, 3) metres; NaN where nothing was seen.
+        classes: (3, H, W) probabilities.
+        votes: (H, W, 3) metres from each point to the centre of its object.
+        links: (2, H, W) probability of showing the same object as the right, the lower pixel.
+    """
+    seen = ~np.isnan(points[..., 2])
+    held = seen & (classes.argmax(axis=0) == 2)
+    height, width = held.shape
+    number = np.where(held, UNKNOWN, FIXED)
+    if not held.any():
+        return number
+    centre = points + votes
+    pairs = []
+    for axis, offset in ((1, 1), (0, width)):
+        first = np.s_[:, :-1] if axis == 1 else np.s_[:-1]
+        second = np.s_[:, 1:] if axis == 1 else np.s_[1:]
+        near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
+        joined = held[first] & held[second] & (links[1 - axis][first] > LIMITS.link) & near
+        start = np.flatnonzero(
+            np.pad(joined, ((0, height - joined.shape[0]), (0, width - joined.shape[1])))
+        )
+        pairs.append(np.stack([start, start + offset]))
+    start, end = np.concatenate(pairs, axis=1)
+    size = height * width
+    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(size, size))
+    _, component = connected_components(graph, directed=False)
+    pixels = np.flatnonzero(held)
+    _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
+    flat = centre.reshape(-1, 3)[pixels].astype(np.float64)
+    mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
+    large = np.flatnonzero(count >= LIMITS.smallest)
+    if len(large) == 0:
+        return number
+    # Parts that something in front separates vote for one centre.
+    apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
+    _, merged = connected_components(apart < LIMITS.same_centre, directed=False)
+    of_part = np.full(len(count), UNKNOWN)
+    of_part[large] = merged
+    number.reshape(-1)[pixels] = of_part[part]
+    return number
+
+
+@compiled("contract")
+def _look_up(
+    points: Float32,
+    pixel: Int64,
+    T_camera_cloud: Float64,
+    width: int,
+    seen: Float32,
+    of_pixel: Int64,
+    classes: Float32,
+    number: Int64,
+    objects: Float32,
+    support: Float32,
+) -> None:
+    """Give each point what the nearest output pixel around it shows, if one is near enough."""
+    rows, columns, _ = seen.shape
+    T = T_camera_cloud
+    for n in range(len(points)):
+        if pixel[n] < 0:
+            continue
+        i, j = pixel[n] // width // 2, pixel[n] % width // 2
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        nearest = (REACH + REACH_GROWTH * z) ** 2
+        for k in range(i, min(i + 2, rows)):
+            for m in range(j, min(j + 2, columns)):
+                dx, dy, dz = seen[k, m, 0] - x, seen[k, m, 1] - y, seen[k, m, 2] - z
+                away = dx * dx + dy * dy + dz * dz
+                if away < nearest:  # false for NaN
+                    nearest = away
+                    number[n] = of_pixel[k, m]
+                    objects[n], support[n] = classes[2, k, m], classes[1, k, m]
+
+
+JOINED_CELL = 0.01  # metres
+JOINED_SHARE = 0.25  # of the smaller one's cells that two views of one object share
+
+
+def _joined(points: Float32, number: Int64) -> Int64:
+    """The numbers (N,) where objects that lie in the same place are one."""
+    held = np.flatnonzero(number >= 0)
+    if len(held) == 0:
+        return number
+    cell = np.floor(points[held] / JOINED_CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    size = cell.max(axis=0) + 1
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    _, key = np.unique(key, return_inverse=True)
+    count = int(number.max()) + 1
+    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key))).tocsr()
+    lies.data[:] = 1
+    shared = (lies @ lies.T).toarray()
+    cells = np.diag(shared)
+    same = shared >= JOINED_SHARE * np.maximum(np.minimum.outer(cells, cells), 1)
+    same &= shared > 0
+    assert len(same) == count
+    _, joined = connected_components(same, directed=False)
+    return np.where(number >= 0, joined[np.maximum(number, 0)], number)

@@ -1,0 +1,295 @@
+"""Train the `scene` network on the labelled images of `scene_images`."""
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+from torch.nn import functional
+from torch.optim import swa_utils
+
+from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
+from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
+
+UP_SHARE = 0.5  # of the images whose `up` the network is told
+UP_ERROR = 0.02  # radians, standard deviation of what it is told
+BATCH = 16
+SIZES, SIZE_SHARES = ((240, 320), (192, 256), (144, 192)), (0.5, 0.3, 0.2)  # pixels, of batches
+CROPPED_SHARE = 0.12  # of the images, of which only what is above the support and near is left
+HELD_OUT = 2  # files, the first ones, that the network never learns from
+LEARNING_RATE = 3e-3
+WARM_UP = 200  # steps
+SAVE_EVERY = 300  # seconds
+AVERAGED = 0.998  # of the mean weights that stay at each step
+CLASS_WEIGHT, VOTE_WEIGHT, LINK_WEIGHT, APART = 1.0, 1.0, 0.5, 4.0  # APART: of links that are none
+
+
+class SceneBatch(NamedTuple):
+    """Images and what to say of them, at the output's resolution."""
+
+    features: Tensor  # (B, CHANNELS, H, W)
+    classes: Tensor  # (B, H/2, W/2) int64; -1 without a reading
+    votes: Tensor  # (B, 3, H/2, W/2) metres
+    weight: Tensor  # (B, H/2, W/2) of each pixel's vote: all objects of an image count alike
+    links: Tensor  # (B, 2, H/2, W/2) 1 same object, 0 not, -1 not judged
+
+
+class SceneImages:
+    """Stored images, in memory."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        """Read files of `generate`."""
+        self.arrays: list[dict[str, NDArray[np.generic]]] = []
+        for path in files:
+            with np.load(path) as stored:
+                self.arrays.append({name: stored[name] for name in SceneImage._fields})
+        self.where = [
+            (a, k) for a, each in enumerate(self.arrays) for k in range(len(each["depth"]))
+        ]
+
+    def __len__(self) -> int:
+        return len(self.where)
+
+    def __getitem__(self, index: int) -> SceneImage:
+        file, row = self.where[index]
+        return SceneImage(*(self.arrays[file][name][row] for name in SceneImage._fields))
+
+
+def image_points(image: SceneImage) -> NDArray[np.float32]:
+    """(H, W, 3) camera frame, metres; NaN without a reading."""
+    fx, fy, cx, cy = image.camera
+    z = np.where(image.depth > 0, image.depth * np.float32(DEPTH_UNIT), np.float32(np.nan))
+    y, x = np.indices(z.shape, dtype=np.float32)
+    return np.stack([(x - cx) / fx * z, (y - cy) / fy * z, z], axis=-1)
+
+
+def make_batch(
+    images: Sequence[SceneImage], rng: np.random.Generator, told: bool | None = None
+) -> SceneBatch:
+    """Features and targets; every other image is mirrored.
+
+    Args:
+        images: Of one size.
+        rng: Of what differs each time.
+        told: Whether the network gets `up`; None: at random, and images mirrored too.
+    """
+    size = SIZES[0] if told is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
+    rows = [_example(image, rng, told, size) for image in images]
+    return SceneBatch(*(torch.from_numpy(np.stack(each)) for each in zip(*rows, strict=True)))
+
+
+def _example(
+    image: SceneImage, rng: np.random.Generator, told: bool | None, size: tuple[int, int]
+) -> tuple[NDArray[np.generic], ...]:
+    points, label, centre, up = (
+        image_points(image),
+        image.label.astype(np.int64),
+        image.centre,
+        image.up.astype(np.float64),
+    )
+    full = label.shape
+    row, column = (
+        ((np.arange(size[d]) + 0.5) * full[d] / size[d]).astype(np.int64) for d in (0, 1)
+    )
+    points, label = points[row][:, column], label[row][:, column]
+    if told is None and rng.random() < CROPPED_SHARE:
+        points = _cropped(points, label, image.plane, rng)
+    if told is None:
+        up = up + rng.normal(0.0, UP_ERROR, 3)
+        if rng.random() < 0.5:
+            mirror = np.array([-1, 1, 1], dtype=np.float32)
+            points, label, centre, up = (
+                points[:, ::-1] * mirror,
+                label[:, ::-1],
+                centre * mirror,
+                up * mirror,
+            )
+        if rng.random() < 0.5:
+            turn = np.array([-1, -1, 1], dtype=np.float32)
+            points, label, centre, up = (
+                points[::-1, ::-1] * turn,
+                label[::-1, ::-1],
+                centre * turn,
+                up * turn,
+            )
+    known = rng.random() < UP_SHARE if told is None else told
+    footprint = full[1] / size[1] / float(image.camera[0])
+    features = scene_features(points, up / np.linalg.norm(up) if known else None, footprint)
+    points, label = points[::2, ::2], label[::2, ::2]
+    seen = ~np.isnan(points[..., 2])
+    number = np.where(seen & (label >= OBJECT), label - OBJECT, -1)
+    classes = np.where(seen, np.minimum(label, OBJECT), -1)
+    votes = np.where((number >= 0)[..., None], centre[np.maximum(number, 0)] - points, 0.0)
+    count = np.bincount(number[number >= 0], minlength=1)
+    weight = np.where(number >= 0, 1.0 / np.sqrt(count[np.maximum(number, 0)] + 20.0), 0.0)
+    links = np.full((2, *number.shape), -1, dtype=np.int64)
+    links[0, :, :-1] = np.where(
+        (number[:, :-1] >= 0) & seen[:, 1:], number[:, :-1] == number[:, 1:], -1
+    )
+    links[1, :-1] = np.where((number[:-1] >= 0) & seen[1:], number[:-1] == number[1:], -1)
+    return (
+        features,
+        classes,
+        votes.astype(np.float32).transpose(2, 0, 1).copy(),
+        weight.astype(np.float32),
+        links.astype(np.float32),
+    )
+
+
+def _cropped(
+    points: NDArray[np.float32],
+    label: NDArray[np.int64],
+    plane: NDArray[np.float32],
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """The points above the support and near the objects alone, as callers cut clouds off."""
+    objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
+    if len(objects) < 50:
+        return points
+    height = points @ plane[:3] - plane[3]
+    away = points - np.median(objects, axis=0)
+    away -= (away @ plane[:3])[..., None] * plane[:3]
+    kept = (height > rng.uniform(-0.03, 0.012)) & (
+        np.linalg.norm(away, axis=-1) < rng.uniform(0.12, 0.5)
+    )
+    return np.where(kept[..., None], points, np.float32(np.nan))
+
+
+def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
+    """The parts of the loss, weighted."""
+    classes = functional.cross_entropy(output.classes, batch.classes, ignore_index=-1)
+    error = functional.smooth_l1_loss(
+        output.votes / VOTE_UNIT, batch.votes / VOTE_UNIT, reduction="none", beta=0.2
+    )
+    votes = (error.sum(dim=1) * batch.weight).sum() / batch.weight.sum().clamp(min=1e-6)
+    judged = (batch.links >= 0).float()
+    weight = judged * torch.where(batch.links == 0, APART, 1.0)
+    wrong = functional.binary_cross_entropy_with_logits(
+        output.links, batch.links.clamp(min=0), reduction="none"
+    )
+    links = (wrong * weight).sum() / weight.sum().clamp(min=1.0)
+    return {
+        "classes": CLASS_WEIGHT * classes,
+        "votes": VOTE_WEIGHT * votes,
+        "links": LINK_WEIGHT * links,
+    }
+
+
+def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[str, float]:
+    """Losses and the intersection over union of each class, half of the images with `up`."""
+    network.eval()
+    rng, totals = np.random.default_rng(0), np.zeros((3, 3))
+    losses: dict[str, float] = {}
+    rows = range(0, len(images), max(len(images) // limit, 1))
+    with torch.inference_mode():
+        for number, start in enumerate(rows):
+            batch = make_batch([images[start]], rng, told=number % 2 == 0)
+            output = network(batch.features)
+            for name, value in scene_loss(output, batch).items():
+                losses[name] = losses.get(name, 0.0) + float(value) / len(rows)
+            said, true = output.classes.argmax(1).numpy(), batch.classes.numpy()
+            np.add.at(totals, (true[true >= 0], said[true >= 0]), 1)
+    both = np.diag(totals)
+    union = totals.sum(0) + totals.sum(1) - both
+    return losses | {
+        f"iou_{name}": both[k] / union[k] for k, name in enumerate(("other", "support", "object"))
+    }
+
+
+def batches(images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
+    """Endless batches, each image once before any twice; one is made while another is learned."""
+
+    def one(rows: NDArray[np.int64]) -> SceneBatch:
+        return make_batch([images[int(k)] for k in rows], rng)
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = None
+        while True:
+            order = rng.permutation(len(images))
+            for start in range(0, len(order) - BATCH + 1, BATCH):
+                following = pool.submit(one, order[start : start + BATCH])
+                if waiting is not None:
+                    yield waiting.result()
+                waiting = following
+
+
+def train(
+    data: Path,
+    run: Path,
+    seconds: float,
+    seed: int = 0,
+    start: Path | None = None,
+    threads: int = 1,
+    rate: float = LEARNING_RATE,
+) -> None:
+    """Train for a given time; `run/scene.safetensors` gets the mean weights every few minutes.
+
+    Args:
+        data: Folder of `scenes-*.npz`.
+        run: Gets checkpoints and `log.txt`.
+        seconds: How long.
+        seed: Of weights and batches.
+        start: A checkpoint to go on from.
+        threads: Of the processor.
+        rate: The highest learning rate.
+    """
+    torch.manual_seed(seed)
+    torch.set_num_threads(threads)
+    run.mkdir(parents=True, exist_ok=True)
+    network = SceneNet()
+    if start is not None:
+        network.load_state_dict(load_file(start))
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    averaging = swa_utils.get_ema_multi_avg_fn(AVERAGED)  # type: ignore[no-untyped-call]
+    mean = swa_utils.AveragedModel(network, multi_avg_fn=averaging, use_buffers=True)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01)
+    files = sorted(data.glob("scenes-????.npz"))
+    held, images = SceneImages(files[:HELD_OUT]), SceneImages(files[HELD_OUT:])
+    source = batches(images, np.random.default_rng(seed))
+    begin = saved = time.monotonic()
+    step, running = 0, dict[str, float]()
+    while (spent := time.monotonic() - begin) < seconds:
+        factor = min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * spent / seconds))
+        for group in optimiser.param_groups:
+            group["lr"] = rate * max(factor, 1e-3)
+        for name, value in _learn(network, optimiser, next(source)).items():
+            running[name] = 0.98 * running.get(name, value) + 0.02 * value
+        mean.update_parameters(network)
+        step += 1
+        now = time.monotonic()
+        if now - saved > SAVE_EVERY or now - begin >= seconds:
+            saved = now
+            averaged = mean.module
+            assert isinstance(averaged, SceneNet)
+            save_file(
+                {k: v.contiguous() for k, v in averaged.state_dict().items()}, run / "scene.partial"
+            )
+            (run / "scene.partial").replace(run / "scene.safetensors")
+            losses = f"train {_text(running)} held {_text(evaluate(averaged, held))}"
+            with (run / "log.txt").open("a") as log:
+                log.write(f"{step} {now - begin:.0f}s images {len(images)} {losses}\n")
+
+
+def _learn(
+    network: SceneNet, optimiser: torch.optim.Optimizer, batch: SceneBatch
+) -> dict[str, float]:
+    """One step; returns the parts of the loss."""
+    network.train()
+    output = network(batch.features.contiguous(memory_format=torch.channels_last))
+    parts = scene_loss(output, batch)
+    optimiser.zero_grad(set_to_none=True)
+    torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+    optimiser.step()
+    return {name: value.item() for name, value in parts.items()}
+
+
+def _text(values: dict[str, float]) -> str:
+    return " ".join(f"{name} {value:.3f}" for name, value in values.items())

@@ -1,0 +1,102 @@
+"""Labelled depth images, and a few steps of training on them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("open3d", reason="rays are cast by Open3D")
+
+from edgegrasp_training.scene_images import (
+    DEPTH_UNIT,
+    OBJECT,
+    SUPPORT,
+    PoolMesh,
+    box,
+    draw_pose,
+    draw_scene,
+    generate,
+    make_image,
+    pool_mesh,
+)
+from edgegrasp_training.scene_training import (
+    SceneImages,
+    image_points,
+    make_batch,
+    scene_loss,
+    train,
+)
+
+CUBE = """v 0 0 0
+v 0.05 0 0
+v 0.05 0.04 0
+v 0 0.04 0
+v 0 0 0.06
+v 0.05 0 0.06
+v 0.05 0.04 0.06
+v 0 0.04 0.06
+f 1 4 3 2
+f 5 6 7 8
+f 1 2 6 5
+f 2 3 7 6
+f 3 4 8 7
+f 4 1 5 8
+"""
+
+
+@pytest.fixture(scope="module")
+def pool() -> list[PoolMesh]:
+    rng = np.random.default_rng(0)
+    return [pool_mesh(rng, box(rng.uniform(0.03, 0.12, 3), (0, 0, 0))) for _ in range(12)]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_labels_agree_with_the_depths(pool: list[PoolMesh], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    images = []
+    while len(images) < 3:
+        scene = draw_scene(rng, pool, [])
+        image = make_image(rng, scene, draw_pose(rng, scene))
+        images += [] if image is None else [image]
+    for image in images:
+        points = image_points(image)
+        on = points[(image.label == SUPPORT) & (image.depth > 0)]
+        heights = on @ image.plane[:3] - image.plane[3]
+        if len(on) > 500:  # several supports may be in view, the main one among them
+            assert np.median(np.abs(heights)) < 0.7
+        for number in np.unique(image.label[image.label >= OBJECT]):
+            mine = points[(image.label == number) & (image.depth > 0)]
+            away = np.linalg.norm(mine - image.centre[number - OBJECT], axis=1)
+            assert len(mine) == 0 or np.median(away) < 0.25
+        assert abs(np.linalg.norm(image.up) - 1) < 1e-5
+        assert image.depth.max() * DEPTH_UNIT < 13.2
+
+
+def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> None:
+    one, other = (draw_scene(np.random.default_rng(5), pool, []) for _ in range(2))
+    assert [label for _, label in one.parts] == [label for _, label in other.parts]
+    for (mesh, _), (again, _) in zip(one.parts, other.parts, strict=True):
+        np.testing.assert_array_equal(mesh[0], again[0])
+
+
+def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from edgegrasp_training import scene_images, scene_training
+
+    for name, value in {"SCENES_PER_FILE": 4, "NUM_POOL": 12, "NUM_ARMS": 0}.items():
+        monkeypatch.setattr(scene_images, name, value)
+    monkeypatch.setattr(scene_training, "HELD_OUT", 1)
+    monkeypatch.setattr(scene_training, "BATCH", 4)
+    mesh = tmp_path / "cube.obj"
+    mesh.write_text(CUBE)
+    generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
+    files = sorted((tmp_path / "data").glob("scenes-????.npz"))
+    assert len(files) == 2
+    batch = make_batch([SceneImages(files)[0]], np.random.default_rng(0), told=True)
+    train(tmp_path / "data", tmp_path / "run", seconds=2.0)
+    assert (tmp_path / "run" / "scene.safetensors").is_file()
+    assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
+    from edgegrasp_model.scene.network import SceneNet
+
+    output = SceneNet().eval()(batch.features)
+    assert output.classes.shape[2:] == batch.classes.shape[1:]
+    assert all(np.isfinite(each.item()) for each in scene_loss(output, batch).values())
