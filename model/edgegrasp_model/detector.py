@@ -50,6 +50,7 @@ from edgegrasp_model.scene.scene import (
     Scene,
     SelectedPoints,
     build_scene,
+    object_probability,
     select_points,
 )
 
@@ -226,7 +227,8 @@ class GraspDetector:
             if sample is not None and len(sample.candidates) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
             if scene is not None and sample is not None and len(logits):
-                ratings = self._rating(logits)
+                found = object_probability(scene, sample.candidates.contact_index)
+                score, ratings = score * found, self._rating(logits) * found
                 rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)

@@ -26,7 +26,7 @@ from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import Collision
 from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import Evaluation, NoGrasp
-from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.scene import Scene, object_probability
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -72,6 +72,7 @@ def evaluate(
         score = scorer.probability(hand_batch(scene, candidates, gripper, scorer.network, view))
     else:
         score = _score_balls(scene, candidates, scorer)
+    score = score * object_probability(scene, candidates.contact_index)
     if given.T_cloud_hand is not None:
         candidates = replace(candidates, T_cloud_hand=given.T_cloud_hand)
     hands = candidates.T_cloud_hand

@@ -83,7 +83,7 @@ class DetectedObject:
     half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
     quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
     best_score: float | None  # of the grasps returned; None: there is none on it
-    confidence: float | None  # that its points show an object; None: the caller named it
+    confidence: float | None  # probability that it is an object; None: the caller named it
 
 
 @dataclass(frozen=True)

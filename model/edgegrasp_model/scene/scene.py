@@ -71,6 +71,10 @@ SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
+# Probability of an object by the network's mean over its pixels: logistic, fitted to 1,306 objects
+# of held-out simulated images.
+CALIBRATION = 12.0, 0.62
+UNSEEN_BY_NETWORK = 0.3  # probability of an object that only geometry sees
 LIKELY = 0.5  # probability of object or support from which what rises may be an object
 SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
 
@@ -89,7 +93,7 @@ class Scene:
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
     viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
-    confidence: dict[int, float] = field(default_factory=dict)  # of objects that were found
+    confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
 
@@ -156,8 +160,10 @@ def select_points(
         likely = (shown.object + shown.support)[above] > LIKELY
         likely |= math.isnan(support.spread)
         number = with_risen(number, plan, height[above], margin[above], likely)
+        new = {int(k) for k in np.unique(number[number >= 0])} - confidence.keys()
+        confidence |= dict.fromkeys(new, UNSEEN_BY_NETWORK)
     if support is None and not given and (viewpoints is None or not (number >= 0).any()):
-        number = np.zeros_like(number)  # a cloud of one object, without what it stands on
+        number, confidence = np.zeros_like(number), {}  # one object, without what it stands on
     if not given:
         number = without_long(number, sent.points, options.max_object_size)
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
@@ -218,13 +224,15 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
 
 
 def _confidences(number: Int64, shown: Segmentation | None) -> dict[int, float]:
-    """How sure the network is of each object: its mean probability over the object's points."""
+    """How probable it is that each object is one, by the network's mean over its points."""
     held = number >= 0
     if shown is None or not held.any():
         return {}
     count = np.bincount(number[held])
-    total = np.bincount(number[held], shown.object[held])
-    return {int(k): float(total[k] / count[k]) for k in np.flatnonzero(count)}
+    mean = np.bincount(number[held], shown.object[held]) / np.maximum(count, 1)
+    steepness, middle = CALIBRATION
+    probability = 1.0 / (1.0 + np.exp(-steepness * (mean - middle)))
+    return {int(k): float(probability[k]) for k in np.flatnonzero(count)}
 
 
 def build_scene(
@@ -385,6 +393,15 @@ def _given_numbers(sent: CheckedCloud) -> Int64:
     if sent.segment_ids is None:
         return np.zeros(len(sent.points), dtype=np.int64)
     return np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
+
+
+def object_probability(scene: Scene, points: Int64) -> Float64:
+    """How probable it is that points (E,), rows of the cloud, are of an object; 1 where given."""
+    number = scene.object_of_point[points]
+    probability = np.ones(len(points))
+    for which, confidence in scene.confidence.items():
+        probability[number == which] = confidence
+    return probability
 
 
 def near_things(plan: Float64, number: Int64) -> Bools:

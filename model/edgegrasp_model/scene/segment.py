@@ -36,6 +36,7 @@ class GroupingLimits:
     vote: float = 0.04  # metres between the centres that neighbours vote for
     same_centre: float = 0.035  # metres between the mean votes of two parts of one object
     smallest: int = 16  # pixels of the network's output
+    smallest_area: float = 5e-4  # square metres, as seen
     cell: float = 0.012  # metres between points of one object that the network did not see
     most_cells: int = 2000  # along a side of the ground that is looked at
     fewest_points: int = 6  # of such an object in a cell, the mean
@@ -111,7 +112,7 @@ def _segment_view(
         np.full(len(points), UNKNOWN), *np.zeros((2, len(points)), dtype=np.float32)
     )
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
-    of_pixel = group(seen, classes, votes, links)
+    of_pixel = group(seen, classes, votes, links, 2 * image.footprint)
     _look_up(
         points, image.pixel, T_camera_cloud, image.points.shape[1], seen, of_pixel, classes, *shown
     )
@@ -201,7 +202,9 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
     return number
 
 
-def group(points: Float32, classes: Float32, votes: Float32, links: Float32) -> Int64:
+def group(
+    points: Float32, classes: Float32, votes: Float32, links: Float32, footprint: float
+) -> Int64:
     """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN where in doubt.
 
     Args:
@@ -209,6 +212,7 @@ def group(points: Float32, classes: Float32, votes: Float32, links: Float32) -> 
         classes: (3, H, W) probabilities.
         votes: (H, W, 3) metres from each point to the centre of its object.
         links: (2, H, W) probability of showing the same object as the right, the lower pixel.
+        footprint: Width of one of these pixels at a depth of one metre, metres.
     """
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
@@ -235,7 +239,8 @@ def group(points: Float32, classes: Float32, votes: Float32, links: Float32) -> 
     _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
     flat = centre.reshape(-1, 3)[pixels].astype(np.float64)
     mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
-    large = np.flatnonzero(count >= LIMITS.smallest)
+    area = np.bincount(part, (points[..., 2].reshape(-1)[pixels] * footprint) ** 2)
+    large = np.flatnonzero((count >= LIMITS.smallest) & (area >= LIMITS.smallest_area))
     if len(large) == 0:
         return number
     # Parts that something in front separates vote for one centre.

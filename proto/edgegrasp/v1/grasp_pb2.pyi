@@ -1883,7 +1883,9 @@ class DetectedObject(_message.Message):
     best_score: _builtins.float
     """Best of the scores of the grasps returned; absent (null in JSON): there is none on it."""
     confidence: _builtins.float
-    """Mean probability that its points show an object; absent (null in JSON): the caller named it."""
+    """Probability that it is an object, a factor of its grasps' scores; absent (null in JSON): the
+    caller named it.
+    """
     @_builtins.property
     def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """3 floats: the middle of the smallest upright box around them."""
