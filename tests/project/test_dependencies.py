@@ -23,12 +23,12 @@ def test_base_install_is_the_light_client() -> None:
     assert names == {"grpcio", "httpx", "numpy", "protobuf", "typing-extensions"}
 
 
-def test_dockerfile_installs_the_libraries_that_the_set_up_script_looks_for() -> None:
+def test_dockerfile_installs_what_torch_needs_and_not_the_libraries_of_open3d() -> None:
     script = (ROOT / "scripts" / "system_packages.sh").read_text()
     table = script.partition("<<'LIBRARIES'\n")[2].partition("LIBRARIES")[0]
     looked_for = {line.split()[1] for line in table.splitlines()}
     dockerfile = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
     lists = re.findall(r"apt-get (?:install|download) ([^&]*)", dockerfile)
     installed = {word for words in lists for word in shlex.split(words)}
-    assert looked_for <= installed
+    assert looked_for & installed == {"libgomp1"}
     assert len(looked_for) == 5

@@ -417,7 +417,7 @@ def test_without_file_descriptors_left_the_log_stays_short(tmp_path: Path, cloud
 
 
 def test_a_cloud_far_too_dense(real_server, cloud) -> None:
-    """Row 4: 2 M points in a cube of 1 m are within every limit here, and take minutes."""
+    """2 M points in a cube of 1 m, all of them objects, are within every limit and take minutes."""
     dense = np.random.default_rng(0).random((2_000_000, 3), np.float32).astype("<f4").tobytes()
     codes = []
 
@@ -426,8 +426,11 @@ def test_a_cloud_far_too_dense(real_server, cloud) -> None:
             real_server.grpc_address, (("grpc.max_send_message_length", -1),)
         ) as channel:
             stub = grasp_pb2_grpc.GraspServiceStub(channel)
+            no_support = grasp_pb2.Support(disabled=True)
+            everything = grasp_pb2.DetectOptions(objects="off", support=no_support)
+            request = grasp_pb2.DetectGraspsRequest(points=dense, options=everything)
             with pytest.raises(grpc.RpcError) as caught:
-                stub.DetectGrasps(grasp_pb2.DetectGraspsRequest(points=dense), timeout=2.0)
+                stub.DetectGrasps(request, timeout=2.0)
             codes.append(caught.value.code())
 
     threads = [threading.Thread(target=attack) for _ in range(2)]

@@ -136,7 +136,10 @@ def test_many_options_give_the_same_grasps_everywhere(
 def evaluated(scoring: Any) -> list[Any]:
     return [
         evaluation.reason
-        or [np.asarray(value, np.float32).tolist() for value in vars(evaluation.grasp).values()]
+        or [
+            None if value is None else np.asarray(value, np.float32).tolist()
+            for value in vars(evaluation.grasp).values()
+        ]
         for evaluation in scoring.evaluations
     ]
 
@@ -163,7 +166,8 @@ def test_too_many_voxels_are_named() -> None:
     room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
     np.save(file, room)
     few = Settings(max_voxels=20_000)
-    job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy")
+    whole = "objects=off&support=null"
+    job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy", whole)
     error = answer(job, load_catalogue(few), few).error
     assert error is not None
     assert "voxels" in error.value

@@ -1,5 +1,7 @@
 """What each point shows, by the `scene` network: an object and which one, the support, or else."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -101,7 +103,7 @@ def _segment_view(
     image = range_image(points, viewpoint, up, down)
     turn = image.T_cloud_camera[:3, :3]
     features = scene_features(image.points, None if up is None else up @ turn, image.footprint)
-    with torch.inference_mode():
+    with torch.inference_mode(), _one_thread():
         batch = torch.from_numpy(features)[None].contiguous(memory_format=torch.channels_last)
         output = scene_network()(batch)
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
@@ -117,6 +119,17 @@ def _segment_view(
         points, image.pixel, T_camera_cloud, image.points.shape[1], seen, of_pixel, classes, *shown
     )
     return shown
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """What the network says must not depend on how many threads a process has."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def with_risen(
