@@ -1,8 +1,8 @@
 """Clutter removal in simulation: make a scene, look at it, grasp in it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self, TypedDict, Unpack
 
@@ -53,6 +53,13 @@ from edgegrasp_sim.surroundings import (
 )
 
 NOISE_STD = 0.001  # metres
+# What objects stand in, the usual range of their scales, and how they are put there.
+STANDING_IN: dict[SceneKind, tuple[Callable[..., Any], tuple[float, float], Callable[..., Any]]] = {
+    SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
+    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN), PILE_SCALE, make_full_bin),
+    SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
+    SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
+}
 WOOD = np.array([168.0, 140.0, 110.0])  # colour of what never moves
 PAINTS = np.array(
     [
@@ -232,22 +239,10 @@ class ClutterSimulation:
             case SceneKind.PILE:
                 self._clear(open_table(table_thickness))
                 made = make_pile(self.world, objects, rng, num_objects, scales or PILE_SCALE)
-            case SceneKind.BIN:
-                around = self._clear(random_bin(rng))
-                given = scales or PILE_SCALE
-                made = make_bin(self.world, around, objects, rng, num_objects, given)
-            case SceneKind.TABLE:
-                around = self._clear(random_table(rng))
-                given = scales or PACKED_SCALE
-                made = make_table(self.world, around, objects, rng, num_objects, given)
-            case SceneKind.FULL_BIN:
-                around = self._clear(random_bin(rng, SMALL_BIN))
-                given = scales or PILE_SCALE
-                made = make_full_bin(self.world, around, objects, rng, num_objects, given)
-            case SceneKind.SHELF:
-                around = self._clear(random_shelf(rng))
-                given = scales or PACKED_SCALE
-                made = make_table(self.world, around, objects, rng, num_objects, given)
+            case _:
+                surround, usual, make = STANDING_IN[kind]
+                around = self._clear(surround(rng))
+                made = make(self.world, around, objects, rng, num_objects, scales or usual)
         self._objects = made
         self._gripper = self._add_gripper()
         return self.num_objects

@@ -99,10 +99,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class SelectedPoints:
-    """What is left of a cloud: M points of things and of what is around them."""
+    """What is left of a cloud: M points of objects and of what is around them."""
 
     sent: CheckedCloud  # M points
-    number: Int64  # (M,) the object that each is of; FIXED: of furniture; UNKNOWN: of neither
+    number: Int64  # (M,) the object that each is of; FIXED: of background; UNKNOWN: of neither
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras

@@ -39,6 +39,8 @@ class GroupingLimits:
     same_centre: float = 0.035  # metres between the mean votes of two parts of one object
     smallest: int = 16  # pixels of the network's output
     smallest_area: float = 5e-4  # square metres, as seen
+    view_cell: float = 0.01  # metres, in which the views of one object lie in the same place
+    view_share: float = 0.25  # of the smaller one's cells that two views of one object share
     cell: float = 0.012  # metres between points of one object that the network did not see
     most_cells: int = 2000  # along a side of the ground that is looked at
     fewest_points: int = 6  # of such an object in a cell, the mean
@@ -229,24 +231,18 @@ def group(
     """
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
-    height, width = held.shape
     number = np.where(held, UNKNOWN, FIXED)
     if not held.any():
         return number
     centre = points + votes
-    pairs = []
-    for axis, offset in ((1, 1), (0, width)):
-        first = np.s_[:, :-1] if axis == 1 else np.s_[:-1]
-        second = np.s_[:, 1:] if axis == 1 else np.s_[1:]
+    index, pairs = np.arange(held.size).reshape(held.shape), []
+    right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
+    for link, (first, second) in zip(links, (right, lower), strict=True):
         near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
-        joined = held[first] & held[second] & (links[1 - axis][first] > LIMITS.link) & near
-        start = np.flatnonzero(
-            np.pad(joined, ((0, height - joined.shape[0]), (0, width - joined.shape[1])))
-        )
-        pairs.append(np.stack([start, start + offset]))
+        joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
+        pairs.append(np.stack([index[first][joined], index[second][joined]]))
     start, end = np.concatenate(pairs, axis=1)
-    size = height * width
-    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(size, size))
+    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(held.size, held.size))
     _, component = connected_components(graph, directed=False)
     pixels = np.flatnonzero(held)
     _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
@@ -300,16 +296,12 @@ def _look_up(
                     objects[n], support[n] = classes[2, k, m], classes[1, k, m]
 
 
-JOINED_CELL = 0.01  # metres
-JOINED_SHARE = 0.25  # of the smaller one's cells that two views of one object share
-
-
 def _joined(points: Float32, number: Int64) -> Int64:
     """The numbers (N,) where objects that lie in the same place are one."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return number
-    cell = np.floor(points[held] / JOINED_CELL).astype(np.int64)
+    cell = np.floor(points[held] / LIMITS.view_cell).astype(np.int64)
     cell -= cell.min(axis=0)
     size = cell.max(axis=0) + 1
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
@@ -319,7 +311,7 @@ def _joined(points: Float32, number: Int64) -> Int64:
     lies.data[:] = 1
     shared = (lies @ lies.T).toarray()
     cells = np.diag(shared)
-    same = shared >= JOINED_SHARE * np.maximum(np.minimum.outer(cells, cells), 1)
+    same = shared >= LIMITS.view_share * np.maximum(np.minimum.outer(cells, cells), 1)
     same &= shared > 0
     assert len(same) == count
     _, joined = connected_components(same, directed=False)

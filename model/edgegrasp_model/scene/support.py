@@ -202,11 +202,8 @@ def measured(seen: Seen, plane: SupportPlane, least: float = LIMITS.given_margin
     """
     each = max(len(seen.points) // MEASURED, 1)
     sample = Seen(seen.points[::each], seen.viewpoint)
-    points, distance, thick = (
-        sample.points.astype(np.float64),
-        sample.distance(),
-        sample.thickness(),
-    )
+    points, distance = sample.points.astype(np.float64), sample.distance()
+    thick = sample.thickness()
     normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
     origin = points.mean(axis=0) if len(points) else np.zeros(3)
     height: Float64 = plane.heights(points).astype(np.float64)
