@@ -2,9 +2,9 @@
 
 import re
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from edgegrasp_model.candidates.collision import clearances
-from edgegrasp_model.candidates.sample import Sample, sample_candidates
+from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
     Scorer,
@@ -71,21 +71,18 @@ DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
 Batch = BallBatch | HandBatch
 
 
-@dataclass
+@dataclass(frozen=True)
 class Prepared:
-    """A request between the stages: what to score, and what turns scores into grasps."""
+    """A request with its scene; counts, warnings and seconds grow from stage to stage."""
 
     options: DetectOptions
     gripper: Gripper
     crop_radius: float  # metres
-    selected: SelectedPoints | None = None
-    scene: Scene | None = None
-    further: Generator[Sample, Int64 | None, None] | None = None  # where the sample is not enough
-    sample: Sample | None = None  # E candidates
-    batch: Batch | None = None  # the candidates that were sampled last; None where there are none
-    counts: dict[str, int] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    selected: SelectedPoints
+    scene: Scene | None  # None where too few points are left
+    counts: dict[str, int]
+    warnings: list[str]
+    seconds: dict[str, float]
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -94,22 +91,22 @@ class Prepared:
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
-    def draw_all(self) -> None:
-        """Add all further candidates to the sample, whatever it is worth."""
-        for further in self.further or ():
-            assert self.sample is not None
-            self.sample = self.sample.and_further(further)
-
-    def warn_of_few_points(self) -> None:
-        """Say that too few points are left for a scene."""
-        self.warnings.append(
-            f"only {self.counts['kept']} points are left beside the support plane, what is far "
-            "from every thing, and outliers; see counts."
-        )
-
     def total_seconds(self) -> dict[str, float]:
         """Seconds of each stage and of all."""
         return self.seconds | {"total": sum(self.seconds.values())}
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The candidates of a request, E of them, and the network's logit (E,) of each."""
+
+    sample: Sample
+    logits: Float32
+
+    def and_further(self, other: "Scored") -> "Scored":
+        """These and what was scored after them."""
+        logits = np.concatenate([self.logits, other.logits])
+        return Scored(self.sample.and_further(other.sample), logits)
 
 
 class GraspDetector:
@@ -182,34 +179,45 @@ class GraspDetector:
         return self.finish(prepared, self.evaluate(prepared))
 
     def prepare(self, cloud: object, options: DetectOptions) -> Prepared:
-        """First stage: the scene, and candidates around half of the approach points."""
-        prepared = self._with_scene(check_cloud(cloud, options.num_approach_points or 1), options)
-        scene, gripper = prepared.scene, prepared.gripper
-        if scene is None:
-            return prepared
-        if not scene.approach_allowed.any():
-            prepared.warnings.append(NO_APPROACH_POINT)
-            return prepared
-        radius, counts = prepared.crop_radius, prepared.counts
-        prepared.further = sample_candidates(
-            scene, prepared.options, gripper, radius, counts, self.sees_hands
-        )
-        self._sample(prepared, None)
-        return prepared
+        """First stage: the gripper, and the scene where enough of the cloud is left."""
+        return self._with_scene(check_cloud(cloud, options.num_approach_points or 1), options)
 
-    def evaluate(self, prepared: Prepared) -> Float32:
-        """Second stage: the network's logits (E,); of further candidates too where none is sure."""
-        logits = np.empty(0, dtype=np.float32)
-        while prepared.sample is not None:
-            if prepared.batch is not None:
-                with prepared.timed("network"):
-                    logits = np.concatenate([logits, self.run(prepared.batch)])
-            sure = self._rating(logits) >= SURE_SCORE
-            if prepared.options.collision.mode != "ignore":
-                sure &= prepared.sample.collision_free
-            if not self._sample(prepared, sure):
-                break
-        return logits
+    def evaluate(self, prepared: Prepared) -> Scored | None:
+        """Second stage: candidates, and the network's logits; None where there is no scene.
+
+        Half of the approach points first, then the other half on objects without a sure grasp,
+        then others where few hands are collision-free.
+        """
+        scene = prepared.scene
+        if scene is None or not scene.approach_allowed.any():
+            return None
+        sampler = self.sampler(prepared)
+        with prepared.timed("candidates"):
+            first = sampler.first()
+        scored = self._score(prepared, first)
+        with prepared.timed("candidates"):
+            second = sampler.second(self._sure_objects(prepared, scored))
+        if second is not None:
+            scored = scored.and_further(self._score(prepared, second))
+        further = sampler.further()
+        while True:
+            with prepared.timed("candidates"):
+                more = next(further, None)
+            if more is None:
+                return scored
+            scored = scored.and_further(self._score(prepared, more))
+
+    def sampler(self, prepared: Prepared) -> Sampler:
+        """What draws the candidates of a request that has a scene."""
+        assert prepared.scene is not None
+        return Sampler(
+            prepared.scene,
+            prepared.options,
+            prepared.gripper,
+            prepared.crop_radius,
+            prepared.counts,
+            self.sees_hands,
+        )
 
     def run(self, batch: Batch) -> Float32:
         """The network's logits of a batch.  # (E,)."""
@@ -217,33 +225,34 @@ class GraspDetector:
             logits: Float32 = self.network(batch.to(self.device)).float().cpu().numpy()
         return logits
 
-    def finish(self, prepared: Prepared, logits: NDArray[np.floating]) -> Detection:
+    def finish(self, prepared: Prepared, scored: Scored | None) -> Detection:
         """Last stage: scores, ranking, suppression, poses."""
-        scene, sample = prepared.scene, prepared.sample
-        counts, options, gripper = prepared.counts, prepared.options, prepared.gripper
-        grasps, debug = [], None
+        scene, gripper, options = prepared.scene, prepared.gripper, prepared.options
+        counts, grasps, debug = prepared.counts, [], None
         with prepared.timed("ranking"):
+            logits = np.empty(0, dtype=np.float32) if scored is None else scored.logits
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
-            if sample is not None and len(sample.candidates) == 0:
+            if scene is not None and scored is None:
+                prepared.warnings.append(NO_APPROACH_POINT)
+            elif scored is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
-            if scene is not None and sample is not None and len(logits):
+            elif scene is not None and scored is not None:
+                sample = scored.sample
                 found = object_probability(scene, sample.candidates.contact_index)
                 score, ratings = score * found, self._rating(logits) * found
                 rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
                 best, free = sample.candidates.take(rows), sample.collision_free[rows]
                 clear = clearances(scene, best.T_cloud_hand, gripper)
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
-            if options.debug and scene is not None and prepared.selected is not None:
-                labels = prepared.selected.labels
-                debug = debug_info(scene, sample, score, outcome, labels)
+            if options.debug and scene is not None:
+                drawn = None if scored is None else scored.sample
+                debug = debug_info(scene, drawn, score, outcome, prepared.selected.labels)
         counts["returned"] = len(grasps)
-        seconds, name = prepared.total_seconds(), self.metadata.name
-        assert prepared.selected is not None
         return Detection(
             grasps,
             counts,
-            seconds,
-            name,
+            prepared.total_seconds(),
+            self.metadata.name,
             GripperOutline(gripper.name, gripper.palm_z, gripper.tip_z),
             prepared.warnings,
             debug,
@@ -312,46 +321,30 @@ class GraspDetector:
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
 
     def _with_scene(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
-        """Choose the gripper and build the scene, where enough of the cloud is left."""
-        prepared = self._start(sent, options)
-        with prepared.timed("cloud"):
-            counts, warnings = prepared.counts, prepared.warnings
-            prepared.selected = select_points(sent, prepared.options, counts, warnings)
-            prepared.scene = build_scene(
-                prepared.selected,
-                prepared.options,
-                self.metadata.voxel_size,
-                counts,
-                self.max_voxels,
-            )
-        if prepared.scene is None:
-            prepared.warn_of_few_points()
-        return prepared
-
-    def _start(self, sent: CheckedCloud, options: DetectOptions) -> Prepared:
-        """Choose the gripper, the crop radius and an unknown viewpoint; warn of what is unknown."""
-        gripper = choose_gripper(options, self.gripper, self.grippers)
+        """Choose the gripper and the crop radius, and build the scene."""
+        counts: dict[str, int] = {}
+        gripper, warnings = choose_gripper(options, self.gripper, self.grippers), [*sent.warnings]
         radius = self.metadata.network.crop_radius
         if options.gripper is not None:  # the ball has to hold every contact within reach
             radius = max(radius, gripper.max_opening / 2)
-        prepared = Prepared(options, gripper, radius, warnings=list(sent.warnings))
         hands = self.metadata.training.get("training_hands", 1)
         if gripper.name != self.gripper.name and hands < MANY_HANDS:
-            prepared.warnings.append(
-                f"the weights were trained for the gripper {self.gripper.name!r}: for "
-                f"{gripper.name!r} their scores rank grasps, but promise less."
+            warnings.append(
+                f"the weights were trained for the gripper {self.gripper.name!r}: their scores are "
+                f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
-        if options.viewpoint is None and seen_from_origin(sent.points, options.up):
-            prepared.options = options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
-            prepared.warnings.append(
-                "viewpoint is not given: the camera is assumed at the origin, in front of which "
-                "the whole cloud lies; send the camera's position where it is another."
+        options = _with_viewpoint(sent, options, warnings)
+        start = time.perf_counter()
+        selected = select_points(sent, options, counts, warnings)
+        voxel_size = self.metadata.voxel_size
+        scene = build_scene(selected, options, voxel_size, counts, self.max_voxels)
+        if scene is None:
+            warnings.append(
+                "after removing the support plane, background and outliers, "
+                f"{counts['kept']} points remain: too few for a surface; see counts."
             )
-        elif options.viewpoint is None and sent.normals is None:
-            prepared.warnings.append(
-                "viewpoint is not given: normals are turned upward; send the camera's position."
-            )
-        return prepared
+        seconds = {"cloud": time.perf_counter() - start}
+        return Prepared(options, gripper, radius, selected, scene, counts, warnings, seconds)
 
     def _probability(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
         """Calibrated probabilities (E,) of logits (E,)."""
@@ -371,29 +364,26 @@ class GraspDetector:
         """Whether scores are of hands where they are, not of edges wherever their hands are."""
         return self.metadata.network.architecture == "hand"
 
-    def _sample(self, prepared: Prepared, sure: NDArray[np.bool_] | None) -> bool:
-        """Take the next candidates, for objects on which none (E,) is sure; whether there are any.
-
-        What they need to be scored becomes the batch.
-        """
-        scene, gripper, before = prepared.scene, prepared.gripper, prepared.sample
+    def _score(self, prepared: Prepared, sample: Sample) -> Scored:
+        """The network's logits of some candidates."""
+        scene, gripper = prepared.scene, prepared.gripper
         assert scene is not None
-        assert prepared.further is not None
-        numbers = None
-        if before is not None:
-            numbers = scene.object_of_point[before.candidates.approach_index[sure]]
-        with prepared.timed("candidates"):
-            try:
-                sample = prepared.further.send(numbers)
-            except StopIteration:
-                return False
-        prepared.sample = sample if before is None else before.and_further(sample)
-        prepared.batch = None
-        if len(sample.candidates):
-            with prepared.timed("description"):
-                view = hand_views(scene.cloud, sample.candidates.T_cloud_hand, reach_of(gripper))
-                prepared.batch = self._batch(scene, sample, view, gripper)
-        return True
+        if len(sample.candidates) == 0:
+            return Scored(sample, np.empty(0, dtype=np.float32))
+        with prepared.timed("description"):
+            view = hand_views(scene.cloud, sample.candidates.T_cloud_hand, reach_of(gripper))
+            batch = self._batch(scene, sample, view, gripper)
+        with prepared.timed("network"):
+            return Scored(sample, self.run(batch))
+
+    def _sure_objects(self, prepared: Prepared, scored: Scored) -> Int64:
+        """The numbers of the objects that have a sure grasp."""
+        assert prepared.scene is not None
+        sure = self._rating(scored.logits) >= SURE_SCORE
+        if prepared.options.collision.mode != "ignore":
+            sure &= scored.sample.collision_free
+        approach_index = scored.sample.candidates.approach_index[sure]
+        return np.asarray(prepared.scene.object_of_point[approach_index])
 
     def _batch(self, scene: Scene, sample: Sample, view: HandView, gripper: Gripper) -> Batch:
         candidates, network = sample.candidates, self.metadata.network
@@ -409,6 +399,25 @@ class GraspDetector:
             candidates.depth,
             network.k,
         )
+
+
+def _with_viewpoint(
+    sent: CheckedCloud, options: DetectOptions, warnings: list[str]
+) -> DetectOptions:
+    """The options, with the camera at the origin where the cloud was probably seen from there."""
+    if options.viewpoint is not None:
+        return options
+    if seen_from_origin(sent.points, options.up):
+        warnings.append(
+            "viewpoint is not given: the camera is assumed at the origin, in front of which "
+            "the whole cloud lies; send the camera's position where it is another."
+        )
+        return options.model_copy(update={"viewpoint": (0.0, 0.0, 0.0)})
+    if sent.normals is None:
+        warnings.append(
+            "viewpoint is not given: normals are turned upward; send the camera's position."
+        )
+    return options
 
 
 class ModelCatalogue:

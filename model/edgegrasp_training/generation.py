@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial, reduce
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from edgegrasp_model.candidates.edge_grasps import Candidates
-from edgegrasp_model.candidates.sample import Sample, sample_candidates
+from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import (
@@ -449,12 +449,12 @@ def choose_grasps(
         if scene is not None and scene.approach_allowed.any():
             gripper = choose_gripper(request, load_gripper(), {})
             radius = max(CROP_RADIUS, gripper.max_opening / 2)
-            samples = sample_candidates(scene, request, gripper, radius, {})
-            sample = reduce(Sample.and_further, samples)
+            sample = Sampler(scene, request, gripper, radius, {}).all()
     else:
         prepared = guide.prepare(observation.cloud, request)
-        score = guide.evaluate(prepared)
-        selected, scene, sample = prepared.selected, prepared.scene, prepared.sample
+        selected, scene = prepared.selected, prepared.scene
+        if (scored := guide.evaluate(prepared)) is not None:
+            sample, score = scored.sample, scored.logits
     if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return None
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))

@@ -171,10 +171,9 @@ class OwnCandidates:
         options = request_options(observation, seed, self.rules, self.options)
         cloud = CloudInput(observation.cloud, view_ids=view_ids(observation))
         prepared = self.detector.prepare(cloud, parse_options(options))
-        if prepared.scene is None or prepared.sample is None:
+        if prepared.scene is None or not prepared.scene.approach_allowed.any():
             return np.empty((0, 4, 4), dtype=np.float32)
-        prepared.draw_all()
-        sample = prepared.sample
+        sample = self.detector.sampler(prepared).all()
         poses = sample.candidates.take(sample.collision_free).T_cloud_hand
         return prepared.scene.frame.poses_in_cloud(poses[rng.permutation(len(poses))])
 

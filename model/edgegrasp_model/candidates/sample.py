@@ -1,8 +1,9 @@
 """From a scene to the candidates that the network scores."""
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,69 +82,98 @@ class Sample:
         )
 
 
-def sample_candidates(
-    scene: Scene,
-    options: DetectOptions,
-    gripper: Gripper,
-    crop_radius: float,
-    counts: dict[str, int],
-    centre: bool = False,
-) -> Generator[Sample, Int64 | None, None]:
-    """Sample approach points and the candidates around them, collision-free where possible.
+class Sampler:
+    """Draws the candidates of one request in rounds, collision-free where possible.
 
-    Half of the approach points first, then the other half on those objects that do not have a sure
-    grasp, then other ones where few hands are free.
-
-    Args:
-        scene: With at least one point in the approach region.
-        options: Sampling, constraints and seed.
-        gripper: What has to fit.
-        crop_radius: Radius of the balls, metres.
-        counts: Gets the number of candidates left after each constraint, over all attempts.
-        centre: Whether there are centred hands among them: for networks that see where a hand is.
-
-    Yields:
-        Candidates, num_candidates at most in all, and takes the numbers of the objects that have a
-        sure grasp. With `collision: avoid` no candidate collides.
+    All rounds together give at most `num_candidates`; with `collision: avoid` none collides.
     """
-    rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
-    rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
-    approach_rows = np.flatnonzero(scene.approach_allowed)
 
-    def spread(number: Int64, before: Int64 = approach_rows[:0]) -> Int64:
-        return _spread(scene, approach_rows, objects, number, options, rng_approach, before)
+    def __init__(
+        self,
+        scene: Scene,
+        options: DetectOptions,
+        gripper: Gripper,
+        crop_radius: float,
+        counts: dict[str, int],
+        centre: bool = False,
+    ) -> None:
+        """Share the approach points among the objects.
 
-    def around(approach_index: Int64, *, leaning: bool = False) -> Sample:
-        crop = crop_balls(scene.cloud.points, approach_index, crop_radius)
+        Args:
+            scene: With at least one point in the approach region.
+            options: Sampling, constraints and seed.
+            gripper: What has to fit.
+            crop_radius: Radius of the balls, metres.
+            counts: Gets the number of candidates left after each constraint, over all rounds.
+            centre: Whether there are centred hands among them: for networks that see where a hand
+                is.
+        """
+        self.scene, self.options, self.gripper = scene, options, gripper
+        self.crop_radius, self.counts, self.centre = crop_radius, counts, centre
+        self._rng_approach = np.random.default_rng([options.seed, APPROACH_STREAM])
+        self._rng = np.random.default_rng([options.seed, CANDIDATE_STREAM])
+        self._rows = np.flatnonzero(scene.approach_allowed)
+        self._objects, self._wanted = share_approach_points(scene, self._rows, options)
+        half = options.num_approach_points is None
+        self._first = (self._wanted + 1) // 2 if half else self._wanted
+        self._used = self._rows[:0]
+
+    def first(self) -> Sample:
+        """Candidates around half of the approach points; around all where their number is given."""
+        self._used = self._spread(self._first)
+        return self._around(self._used)
+
+    def second(self, sure: Int64 | None = None) -> Sample | None:
+        """Around the other half, all of it on objects that are not among `sure`, numbers (S,)."""
+        left = (self._wanted - self._first).sum()
+        unsure = np.where(np.isin(self._objects, () if sure is None else sure), 0, self._wanted)
+        more = self._spread(unsure * left // max(unsure.sum(), 1))
+        return self._around(more) if len(more) else None
+
+    def further(self) -> Iterator[Sample]:
+        """Around other approach points, as long as few hands are collision-free."""
+        usable = "checked" if self.options.collision.mode == "ignore" else "collision_free"
+        for attempt in range(FURTHER_ATTEMPTS):
+            if self.counts[usable] >= FEW or (attempt and self.counts[usable]):
+                return
+            self._used = self._rows[:0]
+            more = self._spread(self._wanted)
+            if attempt and len(self._rows) <= len(more):  # they would be the same ones
+                return
+            yield self._around(more, leaning=True)
+
+    def all(self) -> Sample:
+        """All rounds, whatever the candidates of the first are worth."""
+        samples = [self.first(), self.second(), *self.further()]
+        return reduce(Sample.and_further, [one for one in samples if one is not None])
+
+    def _around(self, approach_index: Int64, *, leaning: bool = False) -> Sample:
+        scene, options, gripper, counts = self.scene, self.options, self.gripper, self.counts
+        crop = crop_balls(scene.cloud.points, approach_index, self.crop_radius)
         drawn, outcome = _constrained(
-            scene, approach_index, crop, options, gripper, counts, centre, leaning=leaning
+            scene, approach_index, crop, options, gripper, counts, self.centre, leaning=leaning
         )
-        row, free = _checked(drawn, outcome, scene, options, gripper, counts, rng)
+        row, free = _checked(drawn, outcome, scene, options, gripper, counts, self._rng)
         new = free | (options.collision.mode != "avoid")
         new[new] = different(drawn.T_cloud_hand[row[new]], free[new], gripper, options)
         most = options.num_candidates - counts.get("scored", 0)
-        scored = rows_to_score(free, new, options, most, rng)
+        scored = rows_to_score(free, new, options, most, self._rng)
         row, free = row[scored], free[scored]
         outcome[row] = CODE[Outcome.RETURNED]
         add_count(counts, "scored", len(row))
         return Sample(approach_index, crop, drawn.take(row), free, drawn, outcome, row)
 
-    objects, wanted = share_approach_points(scene, approach_rows, options)
-    half = wanted if options.num_approach_points else (wanted + 1) // 2
-    first = spread(half)
-    sure = yield around(first)
-    unsure = np.where(np.isin(objects, () if sure is None else sure), 0, wanted)
-    second = spread(unsure * (wanted - half).sum() // max(unsure.sum(), 1), first)
-    if len(second):
-        yield around(second)
-    for attempt in range(FURTHER_ATTEMPTS):
-        usable = "checked" if options.collision.mode == "ignore" else "collision_free"
-        if counts[usable] >= FEW or (attempt and counts[usable]):
-            return
-        further = spread(wanted)
-        if attempt and len(approach_rows) <= len(further):  # they would be the same ones
-            return
-        yield around(further, leaning=True)
+    def _spread(self, counts: Int64) -> Int64:
+        """Further approach points, `counts` (O,) on each of the objects; rows of the cloud."""
+        number, chosen = self.scene.object_of_point[self._rows], [self._rows[:0]]
+        for which, count in zip(self._objects[counts > 0], counts[counts > 0], strict=True):
+            mine = self._rows[number == which]
+            points, used = self.scene.cloud.points[mine], np.isin(mine, self._used)
+            rows = sample_approach_points(
+                points, count, self.options.sampling, self._rng_approach, np.flatnonzero(used)
+            )
+            chosen.append(mine[rows])
+        return np.concatenate(chosen)
 
 
 def _checked(
@@ -192,24 +222,6 @@ def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> 
     wanted = np.floor(share).astype(np.int64)
     wanted[np.argsort(wanted - share, kind="stable")[: most - wanted.sum()]] += 1
     return objects, wanted
-
-
-def _spread(
-    scene: Scene,
-    rows: Int64,
-    objects: Int64,
-    counts: Int64,
-    options: DetectOptions,
-    rng: np.random.Generator,
-    before: Int64,
-) -> Int64:
-    """Further approach points, `counts` (O,) on each of some objects (O,); rows of the cloud."""
-    number, chosen = scene.object_of_point[rows], [rows[:0]]
-    for which, count in zip(objects[counts > 0], counts[counts > 0], strict=True):
-        mine = rows[number == which]
-        points, used = scene.cloud.points[mine], np.flatnonzero(np.isin(mine, before))
-        chosen.append(mine[sample_approach_points(points, count, options.sampling, rng, used)])
-    return np.concatenate(chosen)
 
 
 def _constrained(
