@@ -45,16 +45,6 @@ def interleaved(
     return seconds
 
 
-def compare(seconds: Mapping[str, list[float]], ours: str, theirs: str) -> dict[str, Any]:
-    """Medians of each variant, and of the ratio of two of them round by round."""
-    ratios = [b / a for a, b in zip(seconds[ours], seconds[theirs], strict=True)]
-    return {
-        "seconds": {name: statistics.median(times) for name, times in seconds.items()},
-        "times_faster": statistics.median(ratios),
-        "rounds": len(ratios),
-    }
-
-
 def machine() -> dict[str, Any]:
     """Where it was measured."""
     import torch

@@ -1,4 +1,4 @@
-"""Measure speed beside the textbook: `python -m benchmarks.speed` writes speed.json.
+"""Measure speed: `python -m benchmarks.speed` writes speed.json.
 
 Most times are processor seconds on one thread, medians of interleaved runs: they hold on a busy
 machine too. Networks carry random weights, which cost what trained ones cost.
@@ -9,7 +9,6 @@ import math
 import re
 import statistics
 import time
-from collections.abc import Callable
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,28 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.measuring import (
-    RESULTS,
-    compare,
-    interleaved,
-    machine,
-    served,
-    write_results,
-)
-from benchmarks.textbook.networks import edge_grasp_logits, vn_edge_grasp_logits
-from benchmarks.textbook.pipeline import detect
+from benchmarks.measuring import RESULTS, RUNS, interleaved, machine, served, write_results
 
 from edgegrasp_cli.real_scenes import load_scenes
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import (
-    EDGEGRASP,
-    EDGEGRASP_SMALL,
-    VN_EDGEGRASP,
-    CheckpointMetadata,
-    NetworkConfig,
-)
+from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.camera import Observation, TableView
 from edgegrasp_sim.engine import ENGINES, installed
@@ -49,12 +33,7 @@ from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import run_round
 from edgegrasp_training.recipes import recipe
 
-TEXTBOOK: dict[str, Callable[..., torch.Tensor]] = {
-    "edgegrasp": edge_grasp_logits,
-    "vn-edgegrasp": vn_edge_grasp_logits,
-}
-PAPER = {"EdgeGraspNet": EDGEGRASP, "VN-EdgeGraspNet": VN_EDGEGRASP}
-SHIPPED = ("edgegrasp-plus", "edgegrasp-small")
+WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
 LABELLED_GRASPS = 240  # candidates in each scene; some hundred differ and are tried
 SIMULATED = 4  # scenes and rounds
 VOXEL_SIZE = 0.0045  # metres
@@ -75,18 +54,9 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     start = time.perf_counter()
-    observation = observe()
-    results: dict[str, Any] = {"machine": machine(), "cloud_points": len(observation.cloud)}
-    parts: dict[str, Callable[[], dict[str, Any]]] = {
-        "camera": camera,
-        "shipped": shipped,
-        "paper": lambda: {
-            name: beside_textbook(config, observation) for name, config in PAPER.items()
-        },
-        "simulator": simulators,
-        "server": server_footprint,
-    }
-    for name, part in parts.items():
+    results: dict[str, Any] = {"machine": machine()}
+    parts = (camera, shipped, simulators, server_footprint)
+    for name, part in zip(("camera", "shipped", "simulator", "server"), parts, strict=True):
         results[name] = part()
         print(name, results[name], flush=True)
     results["minutes"] = (time.perf_counter() - start) / 60
@@ -96,45 +66,19 @@ def main() -> None:
         write_table(ROOT / "docs" / "speed.md", table(results))
 
 
-def beside_textbook(config: NetworkConfig, observation: Observation) -> dict[str, Any]:
-    """One of the paper's networks, alone and end to end, beside the textbook's way."""
-    ours, options = detector(config), request(observation)
-    textbook, network = TEXTBOOK[config.architecture], ours.network
-    batch = ours.prepare(observation.cloud, options).batch
-    assert batch is not None
-    with torch.inference_mode():
-        alone = interleaved(
-            {"ours": lambda: network(batch), "textbook": lambda: textbook(network, batch)}
-        )
-    whole = interleaved(
-        {
-            "ours": lambda: ours.detect(observation.cloud, options),
-            "textbook": lambda: detect(
-                observation.cloud, observation.table_height, lambda b: textbook(network, b)
-            ),
-        }
-    )
-    return {
-        "ball_points": len(batch.points),
-        "candidates": len(batch.contact),
-        "network": compare(alone, "ours", "textbook"),
-        "end_to_end": compare(whole, "ours", "textbook"),
-    }
-
-
 def shipped() -> dict[str, Any]:
-    """The networks for processors in the whole pipeline, a view of each kind of scene.
+    """Each network in the whole pipeline, a view of each kind of scene, the table given.
 
     Processor seconds on one thread, and seconds of the clock on two.
     """
-    scenes = {str(kind): observe(kind, views=1) for kind in CLUTTER}
-    detectors = {name: detector(recipe(name).network) for name in SHIPPED}
+    scenes = {str(kind): observe(kind) for kind in CLUTTER}
+    detectors = {name: detector(recipe(name).network) for name in WEIGHTS}
     runs = {
         (name, scene): partial(ours.detect, seen.cloud, request(seen))
         for name, ours in detectors.items()
         for scene, seen in scenes.items()
     }
-    results: dict[str, Any] = {name: {} for name in SHIPPED}
+    results: dict[str, Any] = {name: {} for name in WEIGHTS}
     for threads, clock in ((1, time.process_time), (2, time.perf_counter)):
         torch.set_num_threads(threads)
         times = interleaved({"/".join(key): run for key, run in runs.items()}, clock=clock)
@@ -147,7 +91,7 @@ def shipped() -> dict[str, Any]:
 
 
 def camera() -> dict[str, float]:
-    """Seconds for what cameras send, told nothing but where the camera is: the default weights.
+    """Seconds for what cameras send, given only the camera's position: the default weights.
 
     The demo's own scene; each image of SHARED, where it is; and the same enlarged to 1280 x 720.
     """
@@ -191,7 +135,7 @@ def server_footprint() -> dict[str, float]:
     with served() as server:
         ready = time.perf_counter() - start
         at_rest = server.memory()
-        seen = observe(views=1, table="auto")
+        seen = observe(table="auto")
         viewpoint = tuple(seen.camera_position.tolist())
         with GraspClient(server.grpc_address) as client:
             for seed in range(10):
@@ -242,14 +186,12 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
     return results
 
 
-def observe(
-    kind: SceneKind = SceneKind.PILE, views: int = 2, table: TableView = "known"
-) -> Observation:
-    """A scene of the built-in objects; a pile seen from two sides has some 15,000 points."""
+def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Observation:
+    """A view of a scene of the built-in objects."""
     with ClutterSimulation() as simulation:
         simulation.reset(kind, np.random.default_rng(1))
         streams = np.random.default_rng(1), np.random.default_rng(2)
-        return simulation.observe(*streams, num_views=views, table=table)
+        return simulation.observe(*streams, table=table)
 
 
 def detector(config: NetworkConfig) -> GraspDetector:
@@ -272,7 +214,7 @@ def request(
 
 def _sampled_poses(observation: Observation) -> np.ndarray:
     options = request(observation, num_candidates=LABELLED_GRASPS)
-    prepared = detector(EDGEGRASP_SMALL).prepare(observation.cloud, options)
+    prepared = detector(recipe("edgegrasp-small").network).prepare(observation.cloud, options)
     assert prepared.sample is not None
     assert prepared.scene is not None
     return prepared.scene.frame.poses_in_cloud(prepared.sample.candidates.T_cloud_hand)
@@ -309,19 +251,7 @@ def camera_table(results: dict[str, Any]) -> str:
 
 def table(results: dict[str, Any]) -> str:
     """All the others, and what they were measured on."""
-    rows = ["| | ours | textbook | times faster |", "| --- | --- | --- | --- |"]
-    for name, paper in results["paper"].items():
-        for part, words in (("network", "network"), ("end_to_end", "cloud to ranked grasps")):
-            seconds, faster = paper[part]["seconds"], paper[part]["times_faster"]
-            rows.append(
-                f"| {name}, {words} | {seconds['ours']:.2f} s "
-                f"| {seconds['textbook']:.2f} s | {faster:.1f} |"
-            )
-    rows += [
-        "",
-        "| the table given | scene | one thread | two threads |",
-        "| --- | --- | --- | --- |",
-    ]
+    rows = ["| the table given | scene | one thread | two threads |", "| --- | --- | --- | --- |"]
     for name, scenes in results["shipped"].items():
         for scene, of in scenes.items():
             one, two = 1000 * of["seconds_1"], 1000 * of["seconds_2"]
@@ -341,9 +271,8 @@ def table(results: dict[str, Any]) -> str:
             "",
             f"Processor seconds on one thread of an {machine['processor']} with "
             f"{machine['capability']} ({machine['gflops']:.0f} GFLOP/s in float32), on two "
-            f"threads seconds of the clock; medians of {paper['network']['rounds']} interleaved "
-            f"runs, 32 approach points, at most 2,000 candidates in the last two tables: a cloud "
-            f"of two views, {results['cloud_points']:,} points, and one view of each kind. "
+            f"threads seconds of the clock; medians of {RUNS} interleaved runs, 32 approach "
+            f"points, at most 2,000 candidates, one view. "
             f"The server is ready after {server['ready_seconds']:.1f} s and takes "
             f"{server['rest_mb']:.0f} MB at rest, {server['used_mb']:.0f} MB after ten "
             f"requests. A label or a round of the simulator includes its scene and images.",

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from pydantic import BaseModel, Field
 
 from edgegrasp_cli.flags import (
     CONNECTION,
+    given_flags,
+    model_flags,
     option_flags,
     parse_option_flags,
     takes_flags,
@@ -23,25 +26,6 @@ if TYPE_CHECKING:
     from edgegrasp_sim.trial import Round
 
 Option = typer.Option
-
-# Flags that other commands have too.
-Seeds = Annotated[
-    list[int] | None, Option("--seed", help="Seed of scenes, views and noise; may be repeated.")
-]
-Objects = Annotated[
-    Path | None,
-    Option(help="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects."),
-]
-Engine = Annotated[
-    str | None, Option(help="pybullet or mujoco; else the protocol's, or the one that is there.")
-]
-Hand = Annotated[
-    str | None,
-    Option("--gripper", help="Hand to grasp with: a gripper's name or .toml file; else the Panda."),
-]
-Split = Annotated[str, Option(help="Which of its objects: test or train.")]
-Workers = Annotated[int | None, Option(help="Processes; else one for each core. Same results.")]
-Ray = Annotated[str | None, Option(help="Address of a Ray cluster to run on; local: this machine.")]
 # Options of a detection that the simulation, the protocol or another flag decides.
 DECIDED = (
     *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
@@ -49,114 +33,141 @@ DECIDED = (
 )
 
 
-@takes_flags(connection=CONNECTION, options=option_flags(*DECIDED, defaults=False))
+class Cluster(BaseModel):
+    """The flags that say where simulation runs."""
+
+    engine: str | None = Field(
+        None, description="pybullet or mujoco; else the protocol's, or the one that is installed"
+    )
+    workers: int | None = Field(None, description="Processes; else one for each core. Same results")
+    ray: str | None = Field(
+        None, description="Address of a Ray cluster to run on; local: this machine"
+    )
+
+
+class BenchmarkFlags(Cluster):
+    """The flags of `edgegrasp benchmark`."""
+
+    scene: str = Field("pile", description="packed, pile, bin, bin-full, table or shelf")
+    protocol: str = Field(
+        "edgegrasp",
+        description="edgegrasp, giga, vgn, bin, table, shelf, or a .toml file of the same kind",
+    )
+    planner: str = Field(
+        "server", description="server, in-process, an installed one, or module:callable"
+    )
+    rounds: int | None = Field(None, description="Rounds for each seed; else the protocol's")
+    seed: tuple[int, ...] = Field(
+        (), description="Seed of scenes, views and noise; may be repeated"
+    )
+    objects: Path | None = Field(
+        None,
+        description="Folder of SCENE/SPLIT/*.urdf, *.obj or *.stl; else the built-in objects",
+    )
+    split: str = Field("test", description="Which of its objects: test or train")
+    gripper: str | None = Field(
+        None,
+        description="Hand to grasp with: a gripper's name or .toml file; else the Panda",
+    )
+    server: str | None = Field(
+        None, description="host:port (gRPC) or http://host:port; else one is started"
+    )
+    weights: tuple[Path, ...] = Field((), description="Weights besides those that ship")
+    model: str = Field(
+        "", description="Weights to use: a name or a .safetensors file; empty: the default"
+    )
+    patience: float = Field(300.0, description="Seconds to keep asking a server that is away")
+    output: Path | None = Field(
+        None,
+        description="Folder for manifest, attempts, figures, report. The same again resumes",
+    )
+    report: bool = Field(True, description="Write report.html, which takes a while")
+    gate: Path | None = Field(
+        None, description="summary.json of a result that this one must not fall below"
+    )
+
+
+@takes_flags(
+    flags=model_flags(BenchmarkFlags),
+    connection=CONNECTION,
+    options=option_flags(*DECIDED, defaults=False),
+)
 def benchmark(
-    scene: Annotated[str, Option(help="packed, pile, bin, bin-full, table or shelf.")] = "pile",
-    protocol: Annotated[
-        str, Option(help="edgegrasp, giga, vgn, robot, or a .toml file of the same kind.")
-    ] = "edgegrasp",
-    planner: Annotated[
-        str,
-        Option(
-            help="server, in-process, edge-sample, oracle, oracle-own, an installed one, "
-            "module:callable."
-        ),
-    ] = "server",
-    rounds: Annotated[int | None, Option(help="Rounds for each seed; else the protocol's.")] = None,
-    seeds: Seeds = None,
-    objects: Objects = None,
-    split: Split = "test",
-    engine: Engine = None,
-    gripper: Hand = None,
-    server: Annotated[
-        str | None, Option(help="host:port (gRPC) or http://host:port; else one is started.")
-    ] = None,
-    weights: Annotated[list[Path] | None, Option(help="Weights besides those that ship.")] = None,
-    model: Annotated[
-        str, Option(help="Weights to use: a name or a .safetensors file; empty: the default.")
-    ] = "",
-    workers: Workers = None,
-    ray: Ray = None,
-    patience: Annotated[
-        float, Option(help="Seconds to go on asking a server that is away.")
-    ] = 300.0,
-    output: Annotated[
-        Path | None,
-        Option(help="Folder for manifest, attempts, figures, report. The same again resumes."),
-    ] = None,
-    report: Annotated[bool, Option(help="Write report.html, which takes a while.")] = True,
-    gate: Annotated[
-        Path | None, Option(help="summary.json of a result that this one must not fall below.")
-    ] = None,
-    *,
-    connection: dict[str, Any],
-    options: dict[str, Any],
+    *, flags: dict[str, Any], connection: dict[str, Any], options: dict[str, Any]
 ) -> None:
     """Clear simulated clutter with a planner's grasps and count what succeeds.
 
     GSR: successes / attempts. DR: objects removed / present. The protocol says what a round is.
-    Options of the detection are the protocol's, with collision penalise, unless a flag is given.
+    Options of the detection are the protocol's unless a flag is given.
     """
+    from edgegrasp_sim.results import ResultFolder, below_gate, summarise
+
+    asked = given_flags(BenchmarkFlags, flags)
+    with interruptible("benchmark", resumes=asked.output is not None):
+        config, choice = _plan(asked, connection, parse_option_flags(options))
+        folder = ResultFolder(asked.output) if asked.output is not None else None
+        done, title = run_rounds(config, choice, folder, workers=asked.workers, ray=asked.ray)
+    summary = {
+        "scene": asked.scene,
+        "engine": config.engine,
+        "protocol": config.protocol.name,
+        "protocol_version": config.protocol.version,
+        **summarise(done),
+    }
+    if folder is not None:
+        folder.finish(done)
+        if asked.report:
+            from edgegrasp_sim.report import write_report
+
+            print(f"report: {write_report(folder)}")
+    _print_summary(summary, title)
+    if asked.gate is not None:
+        if below := below_gate(summary, asked.gate):
+            sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
+        print("not below the gate")
+
+
+def _plan(
+    asked: BenchmarkFlags, connection: dict[str, Any], options: dict[str, Any]
+) -> "tuple[BenchmarkConfig, PlannerChoice]":
+    """What to run, and with which planner."""
     from edgegrasp_cli.planners.choice import PlannerChoice
     from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
-    from edgegrasp_sim.results import ResultFolder, below_gate, summarise
 
-    with interruptible("benchmark", resumes=output is not None):
-        rules = load_protocol(protocol)
-        chosen = choose_engine(engine, rules.engine)
-        print(chosen)
-        # The Panda's hand has shapes of its own.
-        hand = gripper_fields(gripper) if gripper not in (None, "panda") else None
-        asked = parse_option_flags(options)
-        choice = PlannerChoice(
-            planner,
-            model,
-            tuple(path.resolve() for path in weights or ()),
-            server,
-            connection,
-            asked if hand is None else asked | {"gripper": hand},
+    rules = load_protocol(asked.protocol)
+    chosen = choose_engine(asked.engine, rules.engine)
+    print(chosen)
+    # The Panda's hand has shapes of its own.
+    hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
+    choice = PlannerChoice(
+        asked.planner,
+        asked.model,
+        tuple(path.resolve() for path in asked.weights),
+        asked.server,
+        connection,
+        options if hand is None else options | {"gripper": hand},
+    )
+    config = BenchmarkConfig(
+        SceneKind(asked.scene),
+        rules.rounds if asked.rounds is None else asked.rounds,
+        asked.seed or rules.seeds,
+        rules,
+        asked.objects.resolve() if asked.objects is not None else None,
+        asked.split,
+        asked.patience,
+        chosen.name,
+        hand,
+    )
+    if asked.ray not in (None, "local") and asked.planner == "server" and asked.server is None:
+        raise ValueError(
+            f"ray is {asked.ray!r}; the cluster cannot reach a server of this command's own: pass "
+            "--server, or --planner in-process"
         )
-        config = BenchmarkConfig(
-            SceneKind(scene),
-            rules.rounds if rounds is None else rounds,
-            tuple(seeds or rules.seeds),
-            rules,
-            objects.resolve() if objects is not None else None,
-            split,
-            patience,
-            chosen.name,
-            hand,
-        )
-        own_server = planner == "server" and server is None
-        if ray not in (None, "local") and own_server:
-            raise ValueError(
-                f"ray is {ray!r}; the cluster cannot reach a server of this command's own: pass "
-                "--server, or --planner in-process"
-            )
-        folder = ResultFolder(output) if output is not None else None
-        done, title = run_rounds(config, choice, folder, workers=workers, ray=ray)
-    summary = {
-        "scene": scene,
-        "engine": chosen.name,
-        "protocol": rules.name,
-        "protocol_version": rules.version,
-    }
-    summary |= summarise(done)
-    if folder is not None:
-        folder.finish(done)
-        if report:
-            from edgegrasp_sim.report import write_report
-
-            print(f"report: {write_report(folder)}")
-    _print_summary(summary, title)
-    if gate is not None:
-        if below := below_gate(summary, gate):
-            sys.exit("edgegrasp benchmark: below the gate: " + "; ".join(below))
-        print("not below the gate")
+    return config, choice
 
 
 def compare(

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 import typer
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from edgegrasp_client import GraspClient
 
+Model = TypeVar("Model", bound="BaseModel")
 Flags: TypeAlias = list[inspect.Parameter]
 PLAIN = (bool, int, float, str, Path)  # types that a flag has as they are
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
@@ -81,6 +82,22 @@ def model_flags(
         keyword = inspect.Parameter.KEYWORD_ONLY
         flags.append(inspect.Parameter(name, keyword, default=None, annotation=annotation))
     return flags
+
+
+def given_flags(model: "type[Model]", given: Mapping[str, Any]) -> "Model":
+    """The model that flags of `model_flags` stand for.
+
+    Raises:
+        ValueError: A value is out of range; names flag, value and limit.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return model(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        flag = "-".join(str(first["loc"][0]).split("_"))
+        raise ValueError(f"--{flag}: got {first['input']!r}. {first['msg']}.") from None
 
 
 def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
@@ -161,9 +178,10 @@ def _token(file: Path | None) -> str | None:
 
 def _flag_type(annotation: Any) -> tuple[Any, str | None]:
     """The type that typer reads a field as, and what its help shows for the value, if not that."""
-    if get_origin(annotation) is Literal:
-        return str, "|".join(get_args(annotation))
     parts = [part for part in get_args(annotation) if part is not type(None)]
+    choice = next((one for one in (annotation, *parts) if get_origin(one) is Literal), None)
+    if choice is not None:
+        return str, "|".join(get_args(choice))
     if get_origin(annotation) is tuple and parts[-1] is ... and parts[0] in PLAIN:
         return list[parts[0]], None  # type: ignore[valid-type]
     only = parts[0] if len(parts) == 1 else annotation

@@ -3,49 +3,55 @@
 import shlex
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from pydantic import BaseModel, Field
 
-from edgegrasp_cli.benchmark import Engine, Ray, Workers, interruptible
+from edgegrasp_cli.benchmark import Cluster, interruptible
+from edgegrasp_cli.flags import given_flags, model_flags, takes_flags
+
+if TYPE_CHECKING:
+    from edgegrasp_training.training import Trainer
 
 Option = typer.Option
 
 
+class DataFlags(Cluster):
+    """The flags of `edgegrasp generate-data`."""
+
+    objects: Path | None = Field(
+        None, description="Folder packed/train, pile/train; else the built-in objects"
+    )
+    scenes: int = Field(100, ge=1, description="Scenes")
+    scene: Literal["packed", "pile", "bin", "table"] | None = Field(
+        None, description="Kind of the scenes: packed, pile, bin or table; else all of them"
+    )
+    views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
+    grasps_per_view: int = Field(100, ge=1, description="Grasps tried in each view")
+    seed: int = Field(1, ge=0, description="Seed of everything random")
+    weights: Path | None = Field(
+        None, description="Network that chooses half of the grasps: its best and its least certain"
+    )
+    gripper: str = Field(
+        "panda",
+        description="Hand that tries them: a gripper's name or .toml file; random: one a scene",
+    )
+    household: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the scenes made of random household objects"
+    )
+
+
+@takes_flags(flags=model_flags(DataFlags))
 def generate_data(
     output: Annotated[Path, typer.Argument(help="Folder for the views, one file each.")],
-    objects: Annotated[
-        Path | None, Option(help="Folder packed/train, pile/train; else the built-in objects.")
-    ] = None,
-    scenes: Annotated[int, Option(min=1, help="Scenes.")] = 100,
-    scene: Annotated[
-        Literal["packed", "pile", "bin", "table"] | None,
-        Option(help="Kind of the scenes; else a mixture of them all."),
-    ] = None,
-    views_per_scene: Annotated[int, Option(min=1, help="Cameras in each scene.")] = 2,
-    grasps_per_view: Annotated[int, Option(min=1, help="Grasps tried in each view.")] = 100,
-    seed: Annotated[int, Option(min=0, help="Seed of everything random.")] = 1,
-    weights: Annotated[
-        Path | None,
-        Option(help="Network that chooses half of the grasps: its best, and its least certain."),
-    ] = None,
-    engine: Engine = None,
-    gripper: Annotated[
-        str,
-        Option(help="Hand that tries them: a gripper's name or .toml file; random: one a scene."),
-    ] = "panda",
-    household: Annotated[
-        float,
-        Option(min=0.0, max=1.0, help="Share of the scenes made of random household objects."),
-    ] = 0.0,
-    workers: Workers = None,
-    ray: Ray = None,
+    *,
+    flags: dict[str, Any],
 ) -> None:
     """Make labelled edge grasps: views of random clutter, grasps tried in simulation.
 
-    Views that are there already are kept, so that the same command goes on where it stopped.
+    Views that are there already are kept, so that the same command continues where it stopped.
     """
     from rich.progress import track
 
@@ -54,142 +60,138 @@ def generate_data(
     from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
     from edgegrasp_training.views import find_views, write_data_card
 
-    kind = None if scene is None else SceneKind(scene)
-    chosen = choose_engine(engine)
+    asked = given_flags(DataFlags, flags)
+    chosen = choose_engine(asked.engine)
     print(chosen)
     # Paths as other machines have them.
-    weights, objects = weights and weights.resolve(), objects and objects.resolve()
-    amounts = scenes, views_per_scene, grasps_per_view, seed
-    options = GenerationOptions(*amounts, weights, kind, chosen.name, gripper, household)
+    objects = asked.objects and asked.objects.resolve()
+    options = GenerationOptions(
+        asked.scenes,
+        asked.views_per_scene,
+        asked.grasps_per_view,
+        asked.seed,
+        asked.weights and asked.weights.resolve(),
+        None if asked.scene is None else SceneKind(asked.scene),
+        chosen.name,
+        asked.gripper,
+        asked.household,
+    )
     missing = len(missing_scenes(output, options))
     tried = held = 0
     with interruptible("generate-data", resumes=True):
-        made = generate(output, objects, options, workers, ray)
+        made = generate(output, objects, options, asked.workers, asked.ray)
         for _, grasps, successes in track(made, "scenes", total=missing):
             tried, held = tried + grasps, held + successes
     write_data_card(output, find_views([output]), _command())
     share = f", {100 * held / tried:.1f} % held" if tried else ""
-    print(f"{missing} scenes made, {scenes - missing} kept; {tried} grasps tried{share}.")
+    kept = asked.scenes - missing
+    print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
 
 
+class TrainFlags(BaseModel):
+    """The flags of `edgegrasp train`."""
+
+    model: str = Field(
+        "edgegrasp-plus", description="edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp"
+    )
+    run: Path = Field(
+        Path("runs/edgegrasp-plus"), description="Folder of this run: state, log, weights, card"
+    )
+    steps: int = Field(20_000, ge=1, description="Steps at most")
+    until: int | None = Field(None, description="Pause at this step; the same command continues")
+    views_per_step: int = Field(4, ge=1, description="Views in a step")
+    balls_per_view: int = Field(8, ge=1, description="Balls of each view in a step")
+    learning_rate: float = Field(1e-3, description="At the start")
+    schedule: Literal["plateau", "cosine"] = Field(
+        "plateau", description="Halve the rate on a plateau, or let it fall to 0 at the last step"
+    )
+    rotations: Literal["any", "upright", "none"] = Field(
+        "any",
+        description="Random rotations of training balls: any, about up only, none; edgegrasp "
+        "networks",
+    )
+    teacher: Path | None = Field(
+        None, description="Weights of a hand network that also teaches a network of balls"
+    )
+    start_from: Path | None = Field(
+        None, description="Weights of the same model to start from; use a lower --learning-rate"
+    )
+    outcomes: Path | None = Field(
+        None, description="File of a server's /v1/outcomes: only recalibrate --start-from on it"
+    )
+    keep: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the weights of --start-from in the result"
+    )
+    evaluate_every: int = Field(250, ge=1, description="Steps between evaluations")
+    validation_share: float = Field(0.1, description="Share of the scenes kept apart")
+    seed: int = Field(0, ge=0, description="Seed of weights, split and batches")
+    device: str = Field("cpu", description="cpu or cuda")
+    mixed_precision: bool = Field(False, description="Products in bfloat16: for a GPU")
+
+
+@takes_flags(flags=model_flags(TrainFlags))
 def train(
     data: Annotated[
         list[Path] | None, typer.Argument(help="Folders of views from generate-data.")
     ] = None,
-    model: Annotated[
-        str, Option(help="edgegrasp, edgegrasp-small, edgegrasp-plus or vn-edgegrasp.")
-    ] = "edgegrasp-plus",
-    run: Annotated[Path, Option(help="Folder of this run: state, log, weights, card.")] = Path(
-        "runs/edgegrasp-plus"
-    ),
-    steps: Annotated[int, Option(min=1, help="Steps at most.")] = 20_000,
-    until: Annotated[
-        int | None, Option(help="Pause at this step; the same command goes on.")
-    ] = None,
-    views_per_step: Annotated[int, Option(min=1, help="Views in a step.")] = 4,
-    balls_per_view: Annotated[int, Option(min=1, help="Balls of each view in a step.")] = 8,
-    learning_rate: Annotated[float, Option(help="At the start.")] = 1e-3,
-    schedule: Annotated[
-        Literal["plateau", "cosine"],
-        Option(help="Halve the rate on a plateau, or let it fall to 0 at the last step."),
-    ] = "plateau",
-    rotations: Annotated[
-        Literal["any", "upright", "none"],
-        Option(
-            help="Random rotations of training balls: any, about up only, none; edgegrasp networks."
-        ),
-    ] = "any",
-    teacher: Annotated[
-        Path | None,
-        Option(help="Weights of a hand network whose scores a network of balls learns from too."),
-    ] = None,
-    start_from: Annotated[
-        Path | None,
-        Option(help="Weights to start from, of the same model; use a lower --learning-rate."),
-    ] = None,
-    outcomes: Annotated[
-        Path | None,
-        Option(help="File of a server's /v1/outcomes: recalibrate --start-from on it, no more."),
-    ] = None,
-    keep: Annotated[
-        float, Option(help="Share of the weights of --start-from in the result.", min=0.0, max=1.0)
-    ] = 0.0,
-    crop_radius: Annotated[
-        float | None,
-        Option(
-            min=0.01,
-            max=0.99,
-            help="Radius of the balls, metres; else the recipe's. 0.5: the paper's NoBall.",
-        ),
-    ] = None,
-    evaluate_every: Annotated[int, Option(min=1, help="Steps between evaluations.")] = 250,
-    validation_share: Annotated[float, Option(help="Share of the scenes kept apart.")] = 0.1,
-    training_share: Annotated[
-        float, Option(min=0.0, max=1.0, help="Share of the other scenes to learn from.")
-    ] = 1.0,
-    seed: Annotated[int, Option(min=0, help="Seed of weights, split and batches.")] = 0,
-    device: Annotated[str, Option(help="cpu or cuda.")] = "cpu",
-    mixed_precision: Annotated[
-        bool, Option("--mixed-precision", help="Products in bfloat16: for a GPU.")
-    ] = False,
+    *,
+    flags: dict[str, Any],
 ) -> None:
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again goes on from the last state. The scores of a
-    teacher are kept beside the run folder, in `taught`.
+    done a model card. Running the same command again continues from the last state. The scores of
+    a teacher are kept beside the run folder, in `taught`.
     """
     from rich.progress import Progress
 
     from edgegrasp_training.outcomes import recalibrate
-    from edgegrasp_training.recipes import recipe
-    from edgegrasp_training.teacher import Teacher
-    from edgegrasp_training.training import Trainer, TrainingOptions
-    from edgegrasp_training.views import find_views, part_of, split_by_scene
 
-    if outcomes is not None:
-        if start_from is None or data:
+    asked = given_flags(TrainFlags, flags)
+    if asked.outcomes is not None:
+        if asked.start_from is None or data:
             raise ValueError("--outcomes: name the weights that scored by --start-from, no data.")
-        print(recalibrate(start_from, outcomes, run))
+        print(recalibrate(asked.start_from, asked.outcomes, asked.run))
         return
     if not data:
         raise ValueError("data: got nothing. Name folders of views, or --outcomes.")
-    options = TrainingOptions(
-        steps=steps,
-        views_per_step=views_per_step,
-        balls_per_view=balls_per_view,
-        learning_rate=learning_rate,
-        keep=keep,
-        schedule=schedule,
-        rotations=rotations,
-        evaluate_every=evaluate_every,
-        mixed_precision=mixed_precision,
-        seed=seed,
-    )
-    training_views, validation_views = split_by_scene(find_views(data), validation_share, seed)
-    training_views = part_of(training_views, training_share, seed)
-    metadata = recipe(model)
-    taught = run.parent / "taught"
-    guide = None if teacher is None else Teacher(teacher, metadata.network.crop_radius, taught)
-    if crop_radius is not None:
-        metadata = replace(metadata, network=replace(metadata.network, crop_radius=crop_radius))
-    trainer = Trainer(
-        metadata, training_views, validation_views, run, options, device, guide, start_from
-    )
-    print(f"{len(training_views)} training and {len(validation_views)} validation views")
+    trainer = _trainer(data, asked)
     with Progress() as progress:
-        task = progress.add_task("steps", total=steps, completed=trainer.step)
+        task = progress.add_task("steps", total=asked.steps, completed=trainer.step)
 
         def on_step(step: int, loss: float) -> None:
             progress.update(task, completed=step, description=f"loss {loss:.3f}")
 
-        trainer.run(on_step, until)
+        trainer.run(on_step, asked.until)
     if trainer.finished:
         provenance = {"data": [folder.name for folder in data], "date": time.strftime("%Y-%m-%d")}
         evaluation = trainer.finish(provenance, _command())
-        print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {run}")
+        print(f"validation loss {evaluation.loss:.4f}, AUROC {evaluation.auroc:.4f}: {asked.run}")
     else:
-        print(f"paused at step {trainer.step}; the same command goes on")
+        print(f"paused at step {trainer.step}; the same command continues")
+
+
+def _trainer(data: list[Path], asked: TrainFlags) -> "Trainer":
+    """What trains on the views of these folders."""
+    from dataclasses import fields
+
+    from edgegrasp_training.recipes import recipe
+    from edgegrasp_training.teacher import Teacher
+    from edgegrasp_training.training import Trainer, TrainingOptions
+    from edgegrasp_training.views import find_views, split_by_scene
+
+    names = {field.name for field in fields(TrainingOptions)} & set(TrainFlags.model_fields)
+    options = TrainingOptions(**asked.model_dump(include=names))
+    views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
+    metadata, teacher = recipe(asked.model), None
+    if asked.teacher is not None:
+        taught = asked.run.parent / "taught"
+        teacher = Teacher(asked.teacher, metadata.network.crop_radius, taught)
+    trainer = Trainer(
+        metadata, views, validation, asked.run, options, asked.device, teacher, asked.start_from
+    )
+    print(f"{len(views)} training and {len(validation)} validation views")
+    return trainer
 
 
 def import_checkpoint(

@@ -1,11 +1,6 @@
-"""The depth camera: viewpoints, the way from depth to points, and what planners are shown.
+"""The depth camera: viewpoints, points from depth images, and what a planner receives."""
 
-The surfaces of a depth image may be resampled. Its pixels lie farther apart on a surface seen at a
-slant; a volume of signed distances, from which the reference system takes its clouds, has one point
-wherever the distance changes its sign between two neighbours of a grid.
-"""
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -14,15 +9,9 @@ from numpy.typing import NDArray
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.poses import Matrix
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-
-
-TRUNCATION = 4  # voxels; a point farther from a surface has no signed distance
 CAMERA = Intrinsics()
 FARTHEST = 0.999  # of the camera's range, from which there is nothing
-_NEAR = 0.98  # of the truncation, within which a distance counts as one to a surface
-TableView = Literal["known", "ransac", "seen", "around", "auto"]
+TableView = Literal["known", "seen", "around", "auto"]
 _ALOFT = np.array([[0.0, 0.0, 0.015], [0.0, 0.0, 0.0]])  # metres the table is below the workspace
 _AROUND = np.array([[-0.06], [0.06]])  # metres; wrong depths move points that far out
 Float = TypeVar("Float", bound=np.floating)
@@ -36,14 +25,13 @@ class Observation:
         cloud: (N, 3) float32, world frame, metres; order of the pixels, one image after another.
         workspace: (2, 3) float32, lowest and highest corner of where grasps are looked for; not
             to be used where `table` is `auto`.
-        table_height: metres; not to be used where `table` is `ransac` or `auto`.
+        table_height: metres; not to be used where `table` is `auto`.
         camera_positions: (V, 3) float32, every camera, world frame, metres.
         view_ids: (N,) int32, which camera saw each point.
-        table: whether the cloud is cut off above the table (`known`) or holds it too: to be found
-            (`ransac`), or to correct the depth scale by (`seen`; then the cloud is not cut off at
-            the sides of the workspace either), or with all that is around it (`around`). `auto`:
-            the same, and nothing is to be used but the cloud and the cameras.
-        failed: (F, 4, 4) T_world_hand of the grasps that have failed in this round.
+        table: what the cloud contains. `known`: it is cut off above the table. `seen`: it includes
+            the table, to correct the depth scale by, and is not cut off at the sides of the
+            workspace. `around`: everything that the camera sees. `auto`: the same, and a planner
+            may use nothing but the cloud and the cameras.
         pixels: (N,) the pixel of each point, row-major; None: several images, or cut off.
     """
 
@@ -53,7 +41,6 @@ class Observation:
     camera_positions: NDArray[np.float32]
     view_ids: NDArray[np.int32]
     table: TableView = "known"
-    failed: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4, 4)))
     pixels: NDArray[np.int64] | None = None
 
     @property
@@ -154,8 +141,7 @@ def seen_box(workspace: Matrix, table: TableView) -> Matrix | None:
     """What is kept of a cloud: (2, 3) lowest and highest corner, or None: all of it."""
     if table in ("around", "auto"):
         return None
-    box = workspace if table == "known" else workspace - _ALOFT
-    return np.asarray(box + _AROUND if table == "seen" else box)
+    return workspace if table == "known" else np.asarray(workspace - _ALOFT + _AROUND)
 
 
 def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0) -> NDArray[Float]:
@@ -163,76 +149,3 @@ def crop(points: NDArray[Float], box: NDArray[np.floating], margin: float = 0.0)
     inside = (points >= box[0] - margin) & (points <= box[1] + margin)
     kept: NDArray[Float] = points[inside[:, 0] & inside[:, 1] & inside[:, 2]]
     return kept
-
-
-def resample_surfaces(
-    depth: Float64, T_world_camera: Matrix, intrinsics: Intrinsics, box: Matrix, voxel: float
-) -> Float64:
-    """Points where the signed distance along the line of sight changes its sign.
-
-    Args:
-        depth: (height, width) metres along the line of sight.
-        T_world_camera: (4, 4) pose of the camera.
-        intrinsics: of the camera.
-        box: (2, 3) lowest and highest corner of the grid, world frame, metres.
-        voxel: edge of the grid's cells, metres.
-
-    Returns:
-        (N, 3) metres, world frame, ordered by axis and cell.
-    """
-    first = np.floor(box[0] / voxel).astype(int)
-    shape = np.ceil(box[1] / voxel).astype(int) - first + 1
-    axes = [((first[k] + np.arange(shape[k]) + 0.5) * voxel).astype(np.float32) for k in range(3)]
-    distance = _distances(depth, T_world_camera, intrinsics, axes, TRUNCATION * voxel)
-    points = []
-    for axis in range(3):
-        here = np.moveaxis(distance, axis, 0)[:-1]
-        there = np.moveaxis(distance, axis, 0)[1:]
-        # NaN, the distance far from any surface, compares as false.
-        crossed = np.moveaxis(here * there < 0, 0, axis)
-        cell = np.nonzero(crossed)
-        start = distance[cell]
-        end = distance[tuple(index + (k == axis) for k, index in enumerate(cell))]
-        place = np.stack([axes[k][index] for k, index in enumerate(cell)], axis=1)
-        place[:, axis] += voxel * start / (start - end)
-        points.append(place)
-    return np.concatenate(points)
-
-
-def _distances(
-    depth: Float64,
-    T_world_camera: Matrix,
-    intrinsics: Intrinsics,
-    axes: list[Float32],
-    truncation: float,
-) -> Float32:
-    """Signed distance at each point of a grid, positive before a surface, NaN far from any.
-
-    It is measured along the line of sight, to the depth of the nearest pixel.
-    """
-    k, T_camera_world = intrinsics, np.linalg.inv(T_world_camera).astype(np.float32)
-    x, y, z = (_along(T_camera_world[row], axes) for row in range(3))
-    x /= z
-    y /= z
-    # The renderer samples a pixel at its lower left corner.
-    column = np.rint(x * k.focal_length + k.centre_x).astype(np.int32)
-    row = np.rint(y * k.focal_length + k.centre_y - 1.0).astype(np.int32)
-    height, width = depth.shape
-    outside = (column < 0) | (column >= width) | (row < 0) | (row >= height)
-    column[outside] = row[outside] = 0
-    distance: Float32 = depth.astype(np.float32)[row, column] - z
-    distance *= np.sqrt(1.0 + x * x + y * y)
-    distance[outside | (np.abs(distance) > _NEAR * truncation)] = np.nan
-    return distance
-
-
-def _along(row: Float32, axes: list[Float32]) -> Float32:
-    """One coordinate, in another frame, of every point of a grid.
-
-    Args:
-        row: (4,) of the transform into that frame.
-        axes: the grid's coordinates along each of its axes.
-    """
-    first, second, third = (row[axis] * values for axis, values in enumerate(axes))
-    whole: Float32 = first[:, None, None] + second[:, None] + third + row[3]
-    return whole

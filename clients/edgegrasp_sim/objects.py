@@ -178,7 +178,7 @@ class ObjectSet:
     def builtin(cls, scene: SceneKind) -> "ObjectSet":
         """Graspable objects that need no files: boxes and cans, and for piles random shapes too."""
         folder = _kept_in(f"builtin-{LAYOUT}", _write_builtin)
-        names = [f"{family}-{k}" for family in _STANDING for k in range(len(FAMILIES[family]))]
+        names = [f"{family}-{k}" for family, all_ in STANDING.items() for k in range(len(all_))]
         if scene.objects is SceneKind.PILE:
             names += [f"blob_{number:03d}" for number in range(_BLOBS)]
         models = tuple(ObjectModel(name, folder / f"{name}.urdf") for name in names)
@@ -301,18 +301,6 @@ def as_obj(
     return "\n".join(lines) + "\n"
 
 
-def write_family(name: str, folder: Path) -> Path:
-    """Write the objects of a family into a folder, for `ObjectSet.from_folder`; returns it.
-
-    Args:
-        name: one of `FAMILIES`.
-        folder: created if missing.
-    """
-    for number, shape in enumerate(FAMILIES[name]):
-        write_object(f"{name}-{number}", shape.obj(), folder)
-    return folder
-
-
 @dataclass(frozen=True, slots=True)
 class Prism:
     """A prism with a regular base, which unlike a cylinder does not roll.
@@ -351,33 +339,21 @@ def _cans(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
     return tuple(Prism(10, (diameter, diameter, height)) for diameter, height in sizes)
 
 
-def _rods(*sizes: tuple[float, float]) -> tuple[Prism, ...]:
-    """Lying prisms of a diameter and a length."""
-    return tuple(Prism(6, (length, diameter, diameter), axis=0) for diameter, length in sizes)
-
-
-# Families that common object sets hardly hold, and a regular one. Sizes in metres as they come into
-# a scene, upright as they stand in a packed one. Thin: at most 14 mm across, lying. Flat: 8 to
-# 14 mm high. Large: 60 to 70 mm in a hand that opens 80 mm.
-FAMILIES: dict[str, tuple[Prism, ...]] = {
+# The built-in objects that stand upright, by family; sizes in metres as they come into a scene.
+# Large: 60 to 70 mm in a hand that opens 80 mm.
+STANDING: dict[str, tuple[Prism, ...]] = {
     "regular": _boxes((0.03, 0.03, 0.08), (0.04, 0.04, 0.04), (0.03, 0.05, 0.07))
     + _cans((0.03, 0.08), (0.04, 0.06), (0.05, 0.05)),
-    "thin": _boxes((0.09, 0.008, 0.008), (0.12, 0.012, 0.012), (0.10, 0.014, 0.010))
-    + _rods((0.008, 0.09), (0.010, 0.12), (0.014, 0.10)),
-    "flat": _boxes((0.05, 0.07, 0.008), (0.06, 0.06, 0.011), (0.05, 0.10, 0.014))
-    + _cans((0.06, 0.008), (0.06, 0.011), (0.07, 0.014)),
     "large": _boxes((0.065, 0.065, 0.10), (0.06, 0.09, 0.12), (0.07, 0.07, 0.07))
     + _cans((0.06, 0.12), (0.065, 0.10), (0.07, 0.08)),
 }
-
-
-_STANDING = ("regular", "large")  # families that the built-in sets hold
-_BLOBS = 12  # that those of piles hold besides
+_BLOBS = 12  # random shapes that the sets of piles hold besides
 
 
 def _write_builtin(folder: Path) -> None:
-    for family in _STANDING:
-        write_family(family, folder)
+    for family, shapes in STANDING.items():
+        for number, shape in enumerate(shapes):
+            write_object(f"{family}-{number}", shape.obj(), folder)
     for number in range(_BLOBS):
         blob(number, folder)
 

@@ -18,7 +18,6 @@ from edgegrasp_sim.surroundings import OPEN_THICKNESS, SIZE, TABLE_HEIGHT
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
 RANDOM_SENSOR = "random"
-SELECTIONS = ("best", "highest", "elsewhere")
 Range = tuple[float, float]
 
 
@@ -80,8 +79,6 @@ class CameraRules:
         polar_degrees: from world z.
         azimuth_degrees: from world x.
         target: the point looked at, world frame, metres.
-        surface_voxel: metres between the points of a surface, at whatever slant it is seen; 0:
-            one point for each pixel.
     """
 
     views: int
@@ -89,7 +86,6 @@ class CameraRules:
     polar_degrees: Range
     azimuth_degrees: Range
     target: tuple[float, float, float]
-    surface_voxel: float = 0.0
 
     def view_range(self) -> ViewRange:
         """The same in radians, to sample from."""
@@ -128,31 +124,23 @@ class PlanningRules:
     """What a planner is given, and how many candidates it may score.
 
     Attributes:
-        table: `known`: the cloud is cut off above it and its plane is told; `ransac`: it is in
-            the cloud and has to be found; `seen`: it is in the cloud and its plane is told, so
-            that the depth scale can be corrected; `around`: all that the camera sees is in the
-            cloud, and the plane and where to grasp are told; `auto`: the same, and only the
-            camera's position is told.
-        voxel_size: metres; network weights carry their own.
+        table: `known`: the cloud is cut off above the table, and its plane is given; `seen`: the
+            cloud includes the table, and its plane is given, so that the depth scale can be
+            corrected; `around`: the cloud holds everything that the camera sees, and plane and
+            workspace are given; `auto`: the same, and only the camera's position is given.
         num_approach_points: approach points sampled.
         num_candidates: candidates scored at most.
-        selection: `best` score; the `highest` grasp among those of `min_score` and more; or
-            `elsewhere`, the best score away from grasps that have failed in the round.
-        min_score: for `highest`; with `best`, no grasp is made that scores less.
+        min_score: no grasp is made that scores less.
     """
 
     table: TableView
-    voxel_size: float
     num_approach_points: int
     num_candidates: int
-    selection: str
     min_score: float
 
     def __post_init__(self) -> None:
-        for name, known in (("table", TABLES), ("selection", SELECTIONS)):
-            value = getattr(self, name)
-            if value not in known:
-                raise ValueError(f"{name} is {value!r}; choose one of {', '.join(known)}")
+        if self.table not in TABLES:
+            raise ValueError(f"table is {self.table!r}; choose one of {', '.join(TABLES)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,9 +181,7 @@ class Protocol:
         """All constants but the engine, which a result names by itself; ready for JSON."""
         table = asdict(self)
         del table["engine"]
-        if self.camera.surface_voxel == 0:  # so that earlier results can be resumed
-            del table["camera"]["surface_voxel"]
-        if not self.noise.sensor:
+        if not self.noise.sensor:  # so that earlier results can be resumed
             del table["noise"]["sensor"]
         return table
 

@@ -38,7 +38,6 @@ FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
 BINS = 10  # of the scores
-MIN_IN_TENTH = 10  # attempts; fewer say nothing of a tenth
 
 
 class ResultFolder:
@@ -221,52 +220,6 @@ def round_from_json(table: dict[str, Any]) -> Round:
     names = {key: tuple(table.get(key, ())) for key in ("objects", "too_wide")}
     end = RoundEnd(table["end"])
     return Round(**table | names | {"attempts": tuple(attempts), "end": end})
-
-
-def record_of(folder: ResultFolder) -> dict[str, Any]:
-    """Conditions and figures of a finished benchmark, small enough to commit; ready for JSON."""
-    manifest = folder.manifest()
-    summary = json.loads((folder.path / "summary.json").read_text())
-    run, times = manifest["run"], summary["planning_seconds"]
-    names = ("attempts", "successes", *RATE_LABELS, "too_wide", "failures", "attempts_digest")
-    return {
-        "scene": run["scene"],
-        "engine": run["engine"],
-        "hand": run.get("gripper", {}).get("name", "panda"),
-        "protocol": {name: run["protocol"][name] for name in ("name", "version")},
-        "planner": run["planner"],
-        "objects": {name: run["objects"][name] for name in ("name", "models", "digest")},
-        "rounds": manifest["rounds"],
-        "seeds": manifest["seeds"],
-        "objects_present": summary["objects"],
-        "planning_seconds_median": times["median"] if times else None,
-        "reliability": reliability(folder.rounds()),
-        **{name: summary[name] for name in names},
-    }
-
-
-def reliability(rounds: Sequence[Round]) -> dict[str, Any]:
-    """How far scores are probabilities; ready for JSON.
-
-    Returns:
-        Brier score and mean score of all attempts, None of none; for each tenth of the scores with
-        enough of them their number, mean score and the share that held.
-    """
-    attempts = [attempt for item in rounds for attempt in item.attempts]
-    if not attempts:
-        return {"brier": None, "mean_score": None, "tenths": []}
-    score = np.array([attempt.score for attempt in attempts])
-    held = np.array([attempt.success for attempt in attempts], dtype=float)
-    of = bins_of(score, np.linspace(0.0, 1.0, BINS + 1))
-    groups = [rows for each in range(BINS) if (rows := of == each).sum() >= MIN_IN_TENTH]
-    return {
-        "brier": float(np.mean((score - held) ** 2)),
-        "mean_score": float(score.mean()),
-        "tenths": [
-            {"attempts": int(rows.sum()), "score": score[rows].mean(), "held": held[rows].mean()}
-            for rows in groups
-        ],
-    }
 
 
 def bins_of(scores: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.int64]:

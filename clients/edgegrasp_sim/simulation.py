@@ -18,7 +18,6 @@ from edgegrasp_sim.camera import (
     ViewRange,
     crop,
     points_of,
-    resample_surfaces,
     seen_box,
 )
 from edgegrasp_sim.engine import make_world
@@ -102,15 +101,12 @@ class Seeing(TypedDict, total=False):
         depth_noise: noise of the images.
         sensor: what else the camera gets wrong.
         table: what the cloud holds of the table, see `Observation`; by default `known`.
-        surface_voxel: metres between the points of a surface, at whatever slant it is seen; 0, the
-            default: one point for each pixel.
     """
 
     noise_std: float
     depth_noise: DepthNoise
     sensor: DepthSensor | None
     table: TableView
-    surface_voxel: float
 
 
 class ClutterSimulation:
@@ -150,8 +146,6 @@ class ClutterSimulation:
         self._obstacles: frozenset[int] = frozenset()
         self._gripper: Gripper | None = None
         self._rest_state: int | None = None
-        self._copy: ClutterSimulation | None = None
-        self._copied: list[ObjectPlacement] = []
 
     def __enter__(self) -> Self:
         return self
@@ -160,10 +154,8 @@ class ClutterSimulation:
         self.close()
 
     def close(self) -> None:
-        """Close its worlds. Safe to call twice."""
+        """Close its world. Safe to call twice."""
         self.world.close()
-        if self._copy is not None:
-            self._copy.close()
 
     @property
     def num_objects(self) -> int:
@@ -301,7 +293,7 @@ class ClutterSimulation:
             rng_noise: stream of the noise.
             **seen: see `Seeing`.
         """
-        table, voxel = seen.get("table", "known"), seen.get("surface_voxel", 0.0)
+        table = seen.get("table", "known")
         depth_noise, sensor = seen.get("depth_noise"), seen.get("sensor")
         workspace = np.asarray(self.surroundings.workspace)
         box = seen_box(workspace, table)
@@ -314,18 +306,15 @@ class ClutterSimulation:
                 depth = sensor.apply(depth, CAMERA, rng_noise)
             points = points_of(depth, T_world_camera, CAMERA)
             points = points if box is None else crop(points, box, _CROP_MARGIN)
-            if voxel > 0 and len(points) > 0:
-                around = np.stack((points.min(axis=0), points.max(axis=0)))
-                points = resample_surfaces(depth, T_world_camera, CAMERA, around, voxel)
             std = seen.get("noise_std", NOISE_STD)
             points = points + rng_noise.normal(0.0, std, size=points.shape)
             points = points if box is None else crop(points, box)
             clouds.append(points.astype(np.float32, order="C"))
-        whole = box is None and voxel == 0 and len(clouds) == 1
+        whole = box is None and len(clouds) == 1
         positions = np.stack([T[:3, 3] for T in T_world_cameras]).astype(np.float32)
         return Observation(
             cloud=np.concatenate(clouds),
-            workspace=np.asarray(box if table == "ransac" else workspace, np.float32),
+            workspace=workspace.astype(np.float32),
             table_height=TABLE_HEIGHT,
             camera_positions=positions,
             view_ids=np.repeat(np.arange(len(clouds), dtype=np.int32), [len(c) for c in clouds]),
@@ -384,29 +373,6 @@ class ClutterSimulation:
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()
         return result
-
-    def try_in_copy(self, T_world_hand: ArrayLike) -> GraspResult:
-        """Simulate a grasp in another world with the objects where they are here.
-
-        Unlike after `try_grasp`, not even the engine's hidden state changes here, so that what
-        follows is the same with and without the try. The two may disagree on a close call.
-
-        Args:
-            T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
-
-        Raises:
-            ValueError: `T_world_hand` is no rigid transform.
-        """
-        if self._copy is None:
-            self._copy = ClutterSimulation(
-                self.object_sets, engine=self.world.name, gripper=self.gripper
-            )
-        placements = self.placements
-        if self._copied != placements:
-            self._copy.reset_from_poses(placements, self.surroundings)
-            self._copied = placements
-        self._copy.start_contact_fails = self.start_contact_fails
-        return self._copy.try_grasp(T_world_hand, to_the_end=True)
 
     def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
         """Grasp for real: a held object leaves the scene, and the others come to rest.

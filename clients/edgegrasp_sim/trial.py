@@ -39,8 +39,7 @@ class PlannedGrasp:
 
 
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if
-# there is none. A planner may have a method `use_trial`, which gets a function that tries
-# `T_world_hand` (4, 4) in a copy of the present scene, and `close`, called after the last round.
+# there is none. A planner may have a method `close`, called after the last round.
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
@@ -149,8 +148,6 @@ def run_round(
 
     See `RoundDriver` for the other arguments, and errors.
     """
-    if use_trial := getattr(planner, "use_trial", None):
-        use_trial(simulation.try_in_copy)
     driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
     while driver.end is None:
         observation = driver.look()
@@ -216,7 +213,7 @@ class RoundDriver:
     def look(self) -> Observation:
         """Take the next view; the round ends if it shows almost nothing."""
         rules = self.protocol
-        seen = self.simulation.observe(
+        self._seen = self.simulation.observe(
             self._camera,
             self._noise,
             views=rules.camera.view_range(),
@@ -225,10 +222,7 @@ class RoundDriver:
             depth_noise=rules.noise,
             sensor=rules.noise.depth_sensor(self._noise),
             table=rules.planning.table,
-            surface_voxel=rules.camera.surface_voxel,
         )
-        failed = [each.T_world_hand for each in self._round.attempts if not each.success]
-        self._seen = replace(seen, failed=np.array(failed).reshape(-1, 4, 4))
         self.view += 1
         inside = crop(self._seen.cloud, self._seen.workspace)
         above = inside[:, 2] > self._seen.table_height + 0.005

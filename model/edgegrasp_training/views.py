@@ -197,18 +197,6 @@ def split_by_scene(
     )
 
 
-def part_of(paths: list[Path], share: float, seed: int) -> list[Path]:
-    """The views of a share of the scenes; a larger share has those of a smaller one too.
-
-    Raises:
-        ValueError: No view is left.
-    """
-    part = [p for p in paths if zlib.crc32(f"part {seed} {scene_of(p)}".encode()) < share * 2**32]
-    if not part:
-        raise ValueError(f"training_share: {share:g} of {len(paths)} views leaves none. Use more.")
-    return part
-
-
 def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
     """Count views, scenes, labels and objects of each kind of scene in `card.md`."""
     views = {path: load_view(path) for path in paths}

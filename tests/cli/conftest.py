@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from edgegrasp_cli.main import app
 
 Command = Callable[..., str]
+TOP_DOWN = "edgegrasp_sim.top_down:plan_top_down"
 
 
 @pytest.fixture(scope="session")
@@ -52,15 +53,15 @@ def benchmark(run: Command) -> Callable[..., dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def oracle(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("oracle")
-    benchmark(folder, "oracle", "--num-approach-points", 16, "--num-candidates", 200)
+def in_process(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("in_process")
+    benchmark(folder, "in-process", "--num-approach-points", 16, "--num-candidates", 200)
     return folder
 
 
 @pytest.fixture(scope="session")
-def edge_sample(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without a model, over the same scenes as the oracle, with a report."""
-    folder = tmp_path_factory.mktemp("edge_sample")
-    benchmark(folder, "edge-sample", "--report")
+def top_down(benchmark: Callable[..., dict], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Without a model, over the same scenes, with a report."""
+    folder = tmp_path_factory.mktemp("top_down")
+    benchmark(folder, TOP_DOWN, "--report")
     return folder

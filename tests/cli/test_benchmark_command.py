@@ -16,6 +16,8 @@ import pytest
 
 from edgegrasp_sim.engine import choose_engine
 
+from .conftest import TOP_DOWN
+
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
 OWN_PLANNER = """
 from edgegrasp_sim.top_down import plan_top_down
@@ -35,17 +37,11 @@ def attempts(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_the_oracle_is_above_random_candidates(oracle: Path, edge_sample: Path) -> None:
-    ceiling, baseline = figures(oracle), figures(edge_sample)
-    assert ceiling["grasp_success_rate"]["value"] > 0.9
-    assert ceiling["declutter_rate"]["value"] > baseline["declutter_rate"]["value"]
-
-
 def test_a_planner_of_one_s_own_needs_only_its_name(benchmark, tmp_path, monkeypatch) -> None:
     (tmp_path / "my_planner.py").write_text(OWN_PLANNER)
     monkeypatch.syspath_prepend(tmp_path)
     as_class = benchmark(tmp_path / "class", "my_planner:MyPlanner", rounds=1)
-    as_function = benchmark(tmp_path / "function", "edgegrasp_sim.top_down:plan_top_down", rounds=1)
+    as_function = benchmark(tmp_path / "function", TOP_DOWN, rounds=1)
     assert as_class["attempts_digest"] == as_function["attempts_digest"]
 
 
@@ -70,52 +66,53 @@ def test_another_hand_is_planned_for_and_simulated(benchmark, run, refused, tmp_
     assert manifest["planner"]["options"]["gripper"] == manifest["gripper"]
     assert "the result is the same" in run("replay", "attempt", tmp_path, "--round", 0)
     assert "nothere" in refused("benchmark", "--gripper", "nothere")
-    assert "Panda alone" in refused("benchmark", "--planner", "oracle", "--gripper", "wsg-50")
 
 
-def test_a_result_below_the_gate_fails(edge_sample: Path, oracle: Path, refused, tmp_path) -> None:
-    gate = figures(oracle)
+def test_a_result_below_the_gate_fails(top_down: Path, in_process: Path, refused, tmp_path) -> None:
+    gate = figures(in_process)
     for name in ("grasp_success_rate", "declutter_rate"):
         gate[name] |= {"value": 0.99, "wilson_95": [0.98, 1.0]}
     (tmp_path / "gate.json").write_text(json.dumps(gate))
     where = ("--scene", "packed", "--seed", 0, "--rounds", 2, "--workers", 1, "--no-report")
-    again = ("--planner", "edge-sample", *where, "--output", edge_sample)  # nothing is left to run
+    again = ("--planner", TOP_DOWN, *where, "--output", top_down)  # nothing is left to run
     assert "below the gate: GSR" in refused("benchmark", *again, "--gate", tmp_path / "gate.json")
 
 
-def test_the_report_shows_tables_plots_and_pictures(edge_sample: Path) -> None:
-    page = (edge_sample / "report.html").read_text()
+def test_the_report_shows_tables_plots_and_pictures(top_down: Path) -> None:
+    page = (top_down / "report.html").read_text()
     assert "name=viewport" in page  # a phone shows it as wide as itself
-    failed = sum(bool(row["cause"]) for row in attempts(edge_sample))
+    failed = sum(bool(row["cause"]) for row in attempts(top_down))
     assert "data:image/png" in page  # plots
     assert page.count("data:image/jpeg") == min(failed, 6) > 0
     assert "Edge Grasp Network, ICRA 2023" in page
-    assert all(name in page for name in figures(edge_sample)["objects_by_name"])
+    assert all(name in page for name in figures(top_down)["objects_by_name"])
 
 
-def test_a_recorded_attempt_comes_out_the_same(oracle: Path, run, tmp_path: Path) -> None:
-    last = attempts(oracle)[-1]
+def test_a_recorded_attempt_comes_out_the_same(in_process: Path, run, tmp_path: Path) -> None:
+    last = attempts(in_process)[-1]
     where = ("--round", last["round"], "--attempt", last["attempt"])
     picture = tmp_path / "attempt.png"
-    assert "the same" in run("replay", "attempt", oracle, *where, "--picture", picture)
+    assert "the same" in run("replay", "attempt", in_process, *where, "--picture", picture)
     assert picture.read_bytes()[1:4] == b"PNG"
 
 
-def test_wrong_replays_and_comparisons_end_with_a_sentence(oracle, benchmark, refused, tmp_path):
-    assert "attempt is 99" in refused("replay", "attempt", oracle, "--attempt", 99)
-    assert "round is 7" in refused("replay", "attempt", oracle, "--round", 7)
+def test_wrong_replays_and_comparisons_end_with_a_sentence(
+    in_process, benchmark, refused, tmp_path
+):
+    assert "attempt is 99" in refused("replay", "attempt", in_process, "--attempt", 99)
+    assert "round is 7" in refused("replay", "attempt", in_process, "--round", 7)
     assert "holds no benchmark" in refused("replay", "attempt", tmp_path)
-    assert "holds no benchmark" in refused("compare", oracle, tmp_path)
-    benchmark(tmp_path, "edge-sample", "--protocol", "giga", rounds=1)
-    assert "differ in protocol" in refused("compare", oracle, tmp_path)
+    assert "holds no benchmark" in refused("compare", in_process, tmp_path)
+    benchmark(tmp_path, TOP_DOWN, "--protocol", "giga", rounds=1)
+    assert "differ in protocol" in refused("compare", in_process, tmp_path)
 
 
-def test_two_planners_are_compared_scene_by_scene(oracle, edge_sample, run, tmp_path) -> None:
-    output = run("compare", edge_sample, oracle, "--output", tmp_path / "compared.json")
+def test_two_planners_are_compared_scene_by_scene(in_process, top_down, run, tmp_path) -> None:
+    output = run("compare", top_down, in_process, "--output", tmp_path / "compared.json")
     assert "2 scenes" in output
     compared = json.loads((tmp_path / "compared.json").read_text())
     for name in ("grasp_success_rate", "declutter_rate"):
-        ceiling, base = (figures(folder)[name]["value"] for folder in (oracle, edge_sample))
+        ceiling, base = (figures(folder)[name]["value"] for folder in (in_process, top_down))
         assert compared[name]["difference"] == pytest.approx(ceiling - base)
         low, high = compared[name]["difference_95"]
         assert low <= compared[name]["difference"] <= high

@@ -8,18 +8,13 @@ from edgegrasp_sim.camera import (
     ViewRange,
     look_at,
     points_of,
-    resample_surfaces,
 )
 from edgegrasp_sim.engine import Intrinsics, World
-from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
-from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.surroundings import WORKSPACE
 
 CENTRE = np.array([0.15, 0.12, 0.10])
 HALF = np.array([0.03, 0.04, 0.05])
 CAMERA = Intrinsics()
-VOXEL = 0.002
 
 
 def distance_to_box(points: np.ndarray) -> np.ndarray:
@@ -77,39 +72,6 @@ def test_views_stay_in_their_range_and_look_at_the_target(views: ViewRange) -> N
 def test_a_camera_may_look_straight_down() -> None:
     T_world_camera = look_at(np.array([0.1, 0.2, 1.0]), np.array([0.1, 0.2, 0.0]))
     np.testing.assert_allclose(T_world_camera[:3, :3], np.diag([1.0, -1.0, -1.0]))
-
-
-def test_resampled_surfaces_are_as_dense_at_a_slant_as_face_to_face(world: World) -> None:
-    world.add_box(2 * HALF, CENTRE, friction=0.5)
-    T_world_camera = look_at(np.array([0.15, -0.55, 0.30]), CENTRE)  # the top is seen at a slant
-    depth = world.render_depth(T_world_camera, CAMERA)
-    box = np.stack((CENTRE - HALF, CENTRE + HALF))
-    resampled = resample_surfaces(depth, T_world_camera, CAMERA, box, VOXEL)
-
-    def per_square_millimetre(points: np.ndarray) -> tuple[float, float]:
-        inner = np.abs(points - CENTRE) < HALF - 0.01  # away from the edges
-        front = inner[:, 0] & inner[:, 2] & (points[:, 1] < CENTRE[1] - HALF[1] + 0.005)
-        top = inner[:, 0] & inner[:, 1] & (points[:, 2] > CENTRE[2] + HALF[2] - 0.005)
-        return front.sum() / (40 * 80), top.sum() / (40 * 60)
-
-    front, top = per_square_millimetre(points_of(depth, T_world_camera, CAMERA))
-    assert front > 2.5 * top > 0
-    for density in per_square_millimetre(resampled):
-        assert density == pytest.approx(1 / (1000 * VOXEL) ** 2, rel=0.2)
-    assert np.quantile(np.abs(distance_to_box(resampled)), 0.95) < 0.5 * VOXEL
-    assert abs(np.median(distance_to_box(resampled))) < 0.2 * VOXEL
-
-
-def test_an_observation_may_be_resampled(simulation: ClutterSimulation) -> None:
-    simulation.reset(SceneKind.PACKED, np.random.default_rng(0), 3)
-    (plain, again, resampled) = (
-        simulation.observe(np.random.default_rng(1), np.random.default_rng(2), surface_voxel=voxel)
-        for voxel in (0.0, VOXEL, VOXEL)
-    )
-    np.testing.assert_array_equal(again.cloud, resampled.cloud)
-    assert len(resampled.cloud) != len(plain.cloud)
-    assert ((resampled.cloud >= WORKSPACE[0]) & (resampled.cloud <= WORKSPACE[1])).all()
-    assert len(resampled.view_ids) == len(resampled.cloud)
 
 
 def test_depth_noise_has_the_strength_asked_for() -> None:

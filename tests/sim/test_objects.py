@@ -1,4 +1,4 @@
-"""Object sets: built-in ones, folders of URDF files, plain meshes and families."""
+"""Object sets: built-in ones, folders of URDF files and plain meshes."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.objects import (
-    FAMILIES,
     LONGEST_SIDE,
     OBJECT_MASS,
     SHORTEST_SIDE,
@@ -17,7 +16,6 @@ from edgegrasp_sim.objects import (
     SceneKind,
     cache_folder,
     prepare_mesh,
-    write_family,
 )
 from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.surroundings import OPEN_TABLE
@@ -40,18 +38,6 @@ def test_builtin_objects_fit_between_the_fingers(world: World, scene: SceneKind)
         extent = np.sort(extents(world, model, 0.8))
         assert extent[0] < 0.075, model.name
         assert extent[2] < 0.25, model.name
-
-
-def test_families_are_what_they_are_called(world: World, tmp_path: Path) -> None:
-    for name, shapes in FAMILIES.items():
-        objects = ObjectSet.from_folder(write_family(name, tmp_path / name), SceneKind.PACKED)
-        for model, shape in zip(objects.models, shapes, strict=True):
-            np.testing.assert_allclose(
-                extents(world, model) + MARGIN[world.name] / 2, shape.size, atol=0.0035
-            )
-    assert max(sorted(shape.size)[1] for shape in FAMILIES["thin"]) <= 0.014
-    assert max(shape.size[2] for shape in FAMILIES["flat"]) <= 0.014
-    assert min(min(shape.size) for shape in FAMILIES["large"]) >= 0.06
 
 
 def test_folders_are_read_in_order_of_names(tmp_path: Path) -> None:

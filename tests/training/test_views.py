@@ -12,7 +12,6 @@ from edgegrasp_training.views import (
     LabelledView,
     find_views,
     load_view,
-    part_of,
     scene_of,
     split_by_scene,
 )
@@ -70,18 +69,6 @@ def test_scenes_never_fall_on_both_sides_and_keep_theirs_as_data_grows() -> None
     assert set(fewer) <= set(validation)
     _, others = split_by_scene(paths, 0.2, seed=1)
     assert set(others) != set(validation)
-
-
-def test_a_larger_part_holds_the_smaller_one_and_whole_scenes() -> None:
-    paths = [Path(f"pile_{scene}_{view}.npz") for scene in range(200) for view in range(2)]
-    small, large = part_of(paths, 0.1, seed=0), part_of(paths, 0.4, seed=0)
-    assert set(small) < set(large) < set(paths)
-    assert 0.05 < len(small) / len(paths) < 0.2
-    assert len(large) == 2 * len({scene_of(path) for path in large})
-    assert part_of(paths, 1.0, seed=0) == paths
-    assert set(part_of(paths, 0.1, seed=1)) != set(small)
-    with pytest.raises(ValueError, match="training_share"):
-        part_of(paths, 0.0, seed=0)
 
 
 def test_no_views_is_an_error_with_the_way_out(tmp_path: Path) -> None:

@@ -17,10 +17,9 @@ from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trial import Planner
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
-SHIPPED = ("server", "in-process", "edge-sample", "oracle", "oracle-own")
+SHIPPED = ("server", "in-process")
 CONNECT_SECONDS = 30.0
 SUFFIX = ".safetensors"
-SAMPLING = ("num_approach_points", "num_candidates")  # options that planners without a network have
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,6 @@ class PlannerChoice:
     connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
     # Of each request, in place of the protocol's.
     options: dict[str, Any] = field(default_factory=dict)
-    voxel_size: float | None = None  # metres, in place of the weights' own; `in-process` only
-    flipped_normals: float = 0.0  # share turned around at random; `in-process` only
 
     def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
         """The weights to load, and the name to ask for.
@@ -73,11 +70,6 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
         EdgeGraspError: weights that cannot be used.
         GraspClientError: the server does not answer.
     """
-    only_in_process = choice.voxel_size is not None or choice.flipped_normals > 0
-    if only_in_process and choice.name != "in-process":
-        raise ValueError(
-            f"planner is {choice.name!r}; voxel_size and flipped_normals need in-process"
-        )
     if choice.name == "server":
         with _server(choice, rules) as planner:
             yield planner
@@ -143,42 +135,15 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
 
 
 def _in_this_process(choice: PlannerChoice, rules: PlanningRules) -> ChosenPlanner:
-    """A planner with the detector, or of random candidates: the paper's or our own."""
-    from edgegrasp_cli.planners.baselines import (
-        MAX_TRIES,
-        EdgeSamplePlanner,
-        OraclePlanner,
-        OwnCandidates,
-        PaperCandidates,
-    )
     from edgegrasp_cli.planners.detection import InProcessPlanner
     from edgegrasp_model.detector import ModelCatalogue
 
-    facts: dict[str, Any] = {"name": choice.name}
-    sampling = {name: choice.options[name] for name in SAMPLING if name in choice.options}
-    hand = {name: choice.options[name] for name in ("gripper",) if name in choice.options}
-    if choice.name in ("edge-sample", "oracle"):
-        if hand:
-            raise ValueError(f"planner is {choice.name!r}; its candidates are for the Panda alone")
-        numbers = {name: getattr(rules, name) for name in SAMPLING} | sampling
-        sampler = PaperCandidates(**numbers, voxel_size=rules.voxel_size)
-        facts |= {"candidates": "paper", **sampling}
-        if choice.name == "edge-sample":
-            return ChosenPlanner(partial(EdgeSamplePlanner, sampler), facts)
-        return ChosenPlanner(partial(OraclePlanner, sampler), facts | {"max_tries": MAX_TRIES})
     weights, model = choice.weights_and_model()
     used = ModelCatalogue.load(weights).get(model).metadata
-    if choice.name == "oracle-own":
-        options = {"collision": "avoid", **sampling, **hand}
-        own = OwnCandidates(rules, options, weights, model)
-        facts |= {"candidates": "own", "voxel_size": used.voxel_size, "max_tries": MAX_TRIES}
-        return ChosenPlanner(partial(OraclePlanner, own), facts | {"options": options})
-    changes: dict[str, Any] = {}
-    if choice.voxel_size is not None:
-        changes["voxel_size"] = choice.voxel_size
-    if choice.flipped_normals > 0:
-        changes["flipped_normals"] = choice.flipped_normals
-    facts |= {"model": used.name, "digest": used.digest, "options": choice.options, **changes}
-    return ChosenPlanner(
-        partial(InProcessPlanner, weights, model, rules, choice.options, **changes), facts
-    )
+    facts = {
+        "name": choice.name,
+        "model": used.name,
+        "digest": used.digest,
+        "options": choice.options,
+    }
+    return ChosenPlanner(partial(InProcessPlanner, weights, model, rules, choice.options), facts)

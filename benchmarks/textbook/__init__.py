@@ -1,1 +1,0 @@
-"""A straightforward implementation of the paper, to measure ours beside: formulas as printed."""
