@@ -37,7 +37,6 @@ GATED = ("scene", "engine", "protocol", "protocol_version")
 FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
 Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
-BINS = 10  # of the scores
 
 
 class ResultFolder:
@@ -220,11 +219,6 @@ def round_from_json(table: dict[str, Any]) -> Round:
     names = {key: tuple(table.get(key, ())) for key in ("objects", "too_wide")}
     end = RoundEnd(table["end"])
     return Round(**table | names | {"attempts": tuple(attempts), "end": end})
-
-
-def bins_of(scores: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The bin (N,) between edges (BINS + 1,) that each score is in; the outer ones are open."""
-    return np.clip(np.digitize(scores, edges) - 1, 0, BINS - 1)
 
 
 def planner_title(planner: dict[str, Any]) -> str:

@@ -78,13 +78,11 @@ def test_a_result_below_the_gate_fails(top_down: Path, in_process: Path, refused
     assert "below the gate: GSR" in refused("benchmark", *again, "--gate", tmp_path / "gate.json")
 
 
-def test_the_report_shows_tables_plots_and_pictures(top_down: Path) -> None:
+def test_the_report_shows_tables_and_pictures(top_down: Path) -> None:
     page = (top_down / "report.html").read_text()
     assert "name=viewport" in page  # a phone shows it as wide as itself
     failed = sum(bool(row["cause"]) for row in attempts(top_down))
-    assert "data:image/png" in page  # plots
     assert page.count("data:image/jpeg") == min(failed, 6) > 0
-    assert "Edge Grasp Network, ICRA 2023" in page
     assert all(name in page for name in figures(top_down)["objects_by_name"])
 
 
