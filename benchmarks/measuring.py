@@ -15,9 +15,9 @@ from typing import Any
 import psutil
 
 from edgegrasp_client.local_server import local_server
+from edgegrasp_service.settings import MIB
 
 RESULTS = Path(__file__).parent / "results"
-MIB = 2**20
 RUNS = 5
 STOP_SECONDS = 30.0
 SERVE = ("-c", "from edgegrasp_cli.main import main; main()")

@@ -31,12 +31,11 @@ from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import run_round
-from edgegrasp_training.recipes import recipe
+from edgegrasp_training.recipes import VOXEL_SIZE, recipe
 
 WEIGHTS = ("edgegrasp-plus", "edgegrasp-small", "edgegrasp", "vn-edgegrasp")
 LABELLED_GRASPS = 240  # candidates in each scene; some hundred differ and are tried
 SIMULATED = 4  # scenes and rounds
-VOXEL_SIZE = 0.0045  # metres
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "real_scenes"
 IMAGE = 480, 640  # rows and columns

@@ -84,7 +84,7 @@ def _of_enum(name: str, enum: Any) -> dict[str, str]:
 
 
 def _said(part: Any) -> str:
-    """The properties of a field or method, but for its number and its options."""
+    """The properties of a field or method, except its number and options."""
     properties = ((field.name, value) for field, value in part.ListFields())
     skipped = ("number", "oneof_index", "options")
     return ", ".join(f"{name} {value}" for name, value in properties if name not in skipped)

@@ -145,7 +145,7 @@ def _null_is_a_value(name: str, options: Schema) -> bool:
 
 
 def _oneof(union: str, options: Schema) -> str:
-    """A message of which one field is set, for objects told apart by their kind."""
+    """A message of which one field is set, for objects distinguished by their kind."""
     places = [
         part
         for owner in options["$defs"].values()
@@ -184,7 +184,7 @@ class _Numbers:
 
 
 def _label(schema: Schema) -> str:
-    """`repeated`; `optional` where presence must be told; nothing for messages, which tell it."""
+    """`repeated`; `optional` for scalars, whose presence matters; nothing for messages."""
     kinds = alternatives(schema)
     if any(one.get("type") == "array" and not is_vector(one) for one in kinds):
         return "repeated "

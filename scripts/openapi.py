@@ -1,6 +1,6 @@
 """Fill the OpenAPI document with what follows from the models that check requests.
 
-proto/edgegrasp/v1/openapi.json is written by hand, but for the options and clouds of a request:
+proto/edgegrasp/v1/openapi.json is written by hand, except the options and clouds of a request:
 their schemas, and a query parameter for each option, come from the models.
 
 usage: scripts/openapi.py [FOLDER]    writes edgegrasp/v1/openapi.json there, or into proto/

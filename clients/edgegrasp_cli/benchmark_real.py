@@ -19,6 +19,7 @@ from edgegrasp_cli.flags import (
     parse_option_flags,
     takes_flags,
 )
+from edgegrasp_model.results import SUPPORT, UNLABELLED
 
 if TYPE_CHECKING:
     from edgegrasp_cli.real_scenes import Int64, RealScene, SceneFigures
@@ -29,8 +30,7 @@ Option = typer.Option
 DECIDED = ("viewpoint", "debug")  # options that the scene decides, or this command
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
-SUPPORT, UNLABELLED = -2, -3  # labels of a detector, as in `DebugInfo`
-ON_SUPPORT, OBSTACLE, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # their colours
+ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # colours
 CAPTION = "\nwhite: labelled objects    green: labelled plane    pink: the plane found"
 
 
@@ -294,7 +294,7 @@ def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
 
     def painted(number: "Int64", support: Any) -> Any:
         color = 255 * paints[(2 * number - 2 + (number > 10)) % len(paints)]
-        color[number == 0] = OBSTACLE
+        color[number == 0] = BACKGROUND
         color[(number == 0) & support] = ON_SUPPORT
         return np.where((row >= 0)[..., None], color[row], NO_READING)
 

@@ -29,7 +29,6 @@ FIRST_OBJECT = 2  # lower labels: 0 anything else, 1 the support plane
 BELOW = 0.1  # sine of the angle over the level; the detector's own limit, 6 degrees
 NOISE = 0.003  # metres; 98 % of the points of a depth camera's plane lie within it at 0.6 to 0.9 m
 MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
-MAX_PINHOLE_ERROR = 1.0  # pixels; an organised cloud that is further off has no such camera
 
 
 @dataclass(frozen=True)
@@ -286,16 +285,10 @@ def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
 
 
 def _camera(intrinsics: Array | None, points: Float32) -> View | None:
-    """The camera of an image; of an organised cloud by least squares; None where there is none."""
+    """The camera of an image or an organised cloud; None without one."""
     if points.ndim != 3:
         return None
     shape = points.shape[0], points.shape[1]
     if intrinsics is not None:
         return View(shape, *intrinsics.tolist())
-    seen = np.isfinite(points).all(axis=2) & (points[..., 2] != 0.0)
-    row, column = np.nonzero(seen)
-    x, y, z = points[seen].T.astype(np.float64)
-    (fx, cx), (fy, cy) = np.polyfit(x / z, column, 1), np.polyfit(y / z, row, 1)
-    view = View(shape, fx, fy, cx, cy)
-    off = np.abs(view.project(points[seen])[0] - np.stack([column, row], axis=1)).max()
-    return view if off < MAX_PINHOLE_ERROR else None
+    return View.of_image(points)

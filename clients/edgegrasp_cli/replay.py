@@ -97,7 +97,7 @@ def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer
 
 
 def _without_times(job: Any, body: bytes) -> Any:
-    """An answer but for the seconds it took; None for an error, whose body is empty."""
+    """An answer without the seconds it took; None for an error, whose body is empty."""
     from google.protobuf import json_format
 
     from edgegrasp.v1 import grasp_pb2

@@ -28,7 +28,7 @@ def serve(
     EDGEGRASP_* environment variables, such as EDGEGRASP_HTTP_PORT, then from the file of --config,
     or else from the defaults. Tokens come from files.
     """
-    # gRPC's own lines are no JSON, and a pipe that nobody reads would stop it: no lines.
+    # gRPC's own log lines are not JSON, and a pipe that is not read would block it.
     os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     from edgegrasp_service.settings import load_settings
 

@@ -7,32 +7,31 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeAlias
 
-from edgegrasp_sim import hand, objects, scene, surroundings, trial
 from edgegrasp_sim.engine import choose_engine, engine_constants
-from edgegrasp_sim.objects import ObjectSet, SceneKind
+from edgegrasp_sim.hand import (
+    CLOSE_SECONDS,
+    MIN_OPENING,
+    PREGRASP_DISTANCE,
+    RETREAT_DISTANCE,
+    SIDE_GRASP_ANGLE,
+    STEP_LENGTH,
+    panda,
+)
+from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import ResultFolder
+from edgegrasp_sim.scene import PACKED, PILE, REST
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import PATIENCE, Planner, Round, run_round
+from edgegrasp_sim.surroundings import TABLE_FRICTION
+from edgegrasp_sim.trial import MIN_POINTS, PATIENCE, Planner, Round, run_round
 from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
 PlannerFactory: TypeAlias = Callable[[], Planner]
 Task: TypeAlias = tuple[int, int]  # seed and index of a round
 PACKAGES = ("edgegrasp", "numpy", "scipy", "pybullet", "mujoco", "torch", "open3d-cpu")
-CONSTANTS: tuple[tuple[ModuleType, tuple[str, ...]], ...] = (  # of each module, for the manifest
-    (surroundings, ("table_friction",)),
-    (scene, ("packed_attempts", "pile_drop_height", "rest_speed")),
-    (objects, ("object_mass", "object_friction")),
-    (hand, ("max_opening", "hand_mass", "finger_friction")),
-    (hand, ("finger_force", "tool_force", "close_seconds")),
-    (hand, ("pregrasp_distance", "retreat_distance", "side_grasp_angle", "step_length")),
-    (hand, ("min_opening",)),
-    (trial, ("min_points",)),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,8 +164,26 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 
 def constants(engine: str) -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
+    hand = panda()
     return engine_constants(engine) | {
-        name: getattr(module, name.upper()) for module, names in CONSTANTS for name in names
+        "table_friction": TABLE_FRICTION,
+        "packed_attempts": PACKED.attempts,
+        "pile_drop_height": PILE.drop_height,
+        "rest_speed": REST.speed,
+        "object_mass": OBJECT_MASS,
+        "object_friction": OBJECT_FRICTION,
+        "max_opening": hand.max_opening,
+        "hand_mass": hand.mass,
+        "finger_friction": hand.finger_friction,
+        "finger_force": hand.finger_force,
+        "tool_force": hand.tool_force,
+        "close_seconds": CLOSE_SECONDS,
+        "pregrasp_distance": PREGRASP_DISTANCE,
+        "retreat_distance": RETREAT_DISTANCE,
+        "side_grasp_angle": SIDE_GRASP_ANGLE,
+        "step_length": STEP_LENGTH,
+        "min_opening": MIN_OPENING,
+        "min_points": MIN_POINTS,
     }
 
 

@@ -1,7 +1,7 @@
 """A floating hand, and a grasp with it: approach, close, retreat, and the outcome."""
 
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cache
 from pathlib import Path
@@ -21,13 +21,6 @@ FINGER_BASE = 0.0584
 CENTRE = 0.04  # of mass
 T_HANDCOM_HAND = translation(0.0, 0.0, -CENTRE)
 
-# Of every hand: a gripper file says nothing of them.
-HAND_MASS = 0.5  # kg
-HAND_FRICTION = 1.0
-FINGER_MASS = 0.1  # kg
-FINGER_FRICTION = 0.75
-FINGER_FORCE = 20.0  # N
-TOOL_FORCE = 300.0  # N
 CLOSE_SECONDS = 0.5
 
 # Far above the table and out of the cameras' sight.
@@ -128,17 +121,17 @@ def run_grasp(
         outcome, cause = GraspOutcome.PREGRASP, FailureCause.START_COLLISION
         return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
 
-    def blocked(cause: FailureCause) -> GraspResult:
+    def failed(cause: FailureCause) -> GraspResult:
         outcome = GraspOutcome.AFTER
         return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
 
     if _cut_into(gripper) & obstacles:
-        return blocked(FailureCause.START_COLLISION)
+        return failed(FailureCause.START_COLLISION)
     collided = False
     for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
         cut = _cut_into(gripper)
         if cut & obstacles:
-            return blocked(FailureCause.APPROACH_COLLISION)
+            return failed(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
     missed = gripper.opening <= MIN_OPENING
@@ -146,10 +139,11 @@ def run_grasp(
     if not missed or to_the_end:
         held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
         if held is not None and gripper.opening > MIN_OPENING:
-            opening = gripper.opening
-            still = _holds_when_shaken(gripper, T_world_hand, held, objects) if shake else None
-            success = GraspOutcome.SUCCESS
-            return GraspResult(success, opening, start_contact, held, target, None, still)
+            result = GraspResult(GraspOutcome.SUCCESS, gripper.opening, start_contact, held, target)
+            if not shake:
+                return result
+            still = _holds_when_shaken(gripper, T_world_hand, held, objects)
+            return replace(result, held_after_shaking=still)
     applies = {
         FailureCause.START_COLLISION: start_contact,
         FailureCause.APPROACH_COLLISION: collided,
@@ -157,8 +151,7 @@ def run_grasp(
         FailureCause.WRONG_OBJECT: target is not None and target not in caught,
         FailureCause.SLIPPED: True,
     }
-    cause = next(cause for cause, holds in applies.items() if holds)
-    return GraspResult(GraspOutcome.AFTER, gripper.opening, start_contact, None, target, cause)
+    return failed(next(cause for cause, holds in applies.items() if holds))
 
 
 def retreat_pose(T_world_hand: Matrix) -> Matrix:
@@ -238,7 +231,6 @@ def panda() -> HandModel:
         centre=(0.0, 0.0, CENTRE),
         max_opening=MAX_OPENING,
         meshes=("hand.obj", "finger.obj"),
-        **_OF_EVERY_HAND,
     )
 
 
@@ -265,7 +257,6 @@ def hand_of(gripper: Mapping[str, Any]) -> HandModel:
         centre=centre,
         max_opening=opening,
         advance=advance,
-        **_OF_EVERY_HAND,
     )
 
 
@@ -279,16 +270,6 @@ def swing_of(gripper: Mapping[str, Any]) -> tuple[float, ...] | None:
     ahead = np.sqrt(radius**2 - (reach - shut + half) ** 2) - np.sqrt(radius**2 - reach**2)
     fit = np.polynomial.Polynomial.fit(half, ahead, 4).convert()
     return tuple(fit.coef.tolist())
-
-
-_OF_EVERY_HAND: dict[str, Any] = {
-    "mass": HAND_MASS,
-    "friction": HAND_FRICTION,
-    "finger_mass": FINGER_MASS,
-    "finger_friction": FINGER_FRICTION,
-    "finger_force": FINGER_FORCE,
-    "tool_force": TOOL_FORCE,
-}
 
 
 def _corners(boxes: Matrix) -> Parts:

@@ -43,7 +43,7 @@ class SceneKind(StrEnum):
     """How a scene is made.
 
     Objects stood upright one by one (packed), dropped on a heap (pile) or into a bin, some or until
-    it is full, put on a table among larger things, or into a compartment of a shelf.
+    it is full, put on a table among larger ones, or into a compartment of a shelf.
     """
 
     PACKED = "packed"

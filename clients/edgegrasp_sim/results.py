@@ -174,7 +174,7 @@ def count(rounds: Iterable[Round]) -> NDArray[np.int64]:
 
 
 def without_too_wide(item: Round) -> Round:
-    """A round but for the objects that are too wide for the hand, and the grasps of them."""
+    """A round without the objects that are too wide for the hand, and without their grasps."""
     left = Counter(item.objects) - Counter(item.too_wide)
     attempts = tuple(a for a in item.attempts if not {a.object, a.target} & {*item.too_wide})
     return replace(item, objects=tuple(left.elements()), attempts=attempts)

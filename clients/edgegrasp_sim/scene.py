@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,40 +12,67 @@ from edgegrasp_sim.objects import OBJECT_FRICTION, OBJECT_MASS, ObjectModel, Obj
 from edgegrasp_sim.poses import Matrix
 from edgegrasp_sim.surroundings import (
     MIDDLE,
-    OPEN_TABLE,
     SIZE,
     TABLE_HEIGHT,
     Box,
     Surroundings,
 )
 
-PACKED_ATTEMPTS = 12
-PACKED_RANGE = (0.08, 0.22)  # metres, for x and y
 PACKED_SCALE = (0.7, 0.8)
-PACKED_CLEARANCE = 0.002  # metres above the table
-
 PILE_SCALE = (0.8, 1.0)
-PILE_DROP_HEIGHT = 0.2  # metres above the table
-PILE_BOX_CORNER = 0.02  # metres, x and y
-PILE_BOX_EXTENT = (0.26, 0.26, 0.13)  # metres
-PILE_BOX_WALL = 0.0039  # metres
 
-BIN_DROP_HEIGHT = 0.08  # metres above the walls
-BIN_DROP_SHARE = 0.25  # of a bin's length and width, beside which nothing is dropped: as poured in
-FULL_DROP_SHARE = 0.12  # the same of a bin that gets full
-BIN_DROP_SECONDS = 0.5
 
-POUR = 4  # objects at a time into a bin that gets full
-COVERED = 0.85  # of a bin's floor that objects hide from above, where it is full
-RAYS = 24  # along each side of it, that tell
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """How objects are stood upright on a table."""
 
-TABLE_ATTEMPTS = 4  # for each object
-LYING_SHARE = 0.4  # of the objects on a table, which are dropped in any pose
+    attempts: int = 12  # objects drawn
+    range: tuple[float, float] = (0.08, 0.22)  # metres, of x and y
+    clearance: float = 0.002  # metres above the table
 
-REST_SPEED = 0.01
-REST_CHECK_STEPS = 60
-REST_SECONDS = 2.0
-DROP_SECONDS = 1.0
+
+@dataclass(frozen=True, slots=True)
+class Pile:
+    """The open box that a pile is dropped into, which is taken away afterwards."""
+
+    drop_height: float = 0.2  # metres above the table
+    corner: float = 0.02  # metres, x and y
+    extent: tuple[float, float, float] = (0.26, 0.26, 0.13)  # metres
+    wall: float = 0.0039  # metres
+    seconds: float = 1.0  # given to each object to come to rest
+
+
+@dataclass(frozen=True, slots=True)
+class Pour:
+    """How objects are poured into a bin."""
+
+    drop_height: float = 0.08  # metres above the walls
+    margin: float = 0.25  # of a bin's length and width, along each side, where nothing is dropped
+    full_margin: float = 0.12  # the same of a bin that gets full
+    seconds: float = 0.5  # given to each object to come to rest
+    at_once: int = 4  # objects poured into a bin that gets full before it is looked at
+    covered: float = 0.85  # share of its floor that objects hide from above when it is full
+    rays: int = 24  # along each side of the floor, which measure that
+
+
+@dataclass(frozen=True, slots=True)
+class Crowd:
+    """How objects are put on a table or a shelf."""
+
+    attempts: int = 4  # for each object
+    lying_share: float = 0.4  # of the objects, which are dropped in any pose
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """When objects are at rest."""
+
+    speed: float = 0.01  # m/s and rad/s together
+    check_steps: int = 60  # time steps between two looks
+    seconds: float = 2.0  # waited at most
+
+
+PACKED, PILE, POUR, CROWD, REST = Packed(), Pile(), Pour(), Crowd(), Rest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,24 +110,25 @@ def load_object(
 
 def make_packed(
     world: World,
+    surroundings: Surroundings,
     objects: ObjectSet,
     rng: np.random.Generator,
     num_objects: int,
-    scales: tuple[float, float] = PACKED_SCALE,
+    scales: tuple[float, float],
 ) -> list[SceneObject]:
     """Stand objects upright on the table, each where it touches no other.
 
-    Up to `PACKED_ATTEMPTS` objects are drawn, so that a scene may hold fewer than asked for.
+    `PACKED.attempts` objects are drawn, so that a scene may hold fewer than asked for.
     """
     placed: list[SceneObject] = []
-    for _ in range(PACKED_ATTEMPTS):
+    for _ in range(PACKED.attempts):
         if len(placed) >= num_objects:
             break
         model = objects.sample(rng)
-        x, y = rng.uniform(*PACKED_RANGE, size=2)
+        x, y = rng.uniform(*PACKED.range, size=2)
         quaternion = _upright(rng)
         scale = float(rng.uniform(*scales))
-        placed = _place(world, OPEN_TABLE, placed, model, (x, y), quaternion, scale)
+        placed = _place(world, surroundings, placed, model, (x, y), quaternion, scale)
     return placed
 
 
@@ -109,20 +138,20 @@ def make_table(
     objects: ObjectSet,
     rng: np.random.Generator,
     num_objects: int,
-    scales: tuple[float, float] = PACKED_SCALE,
+    scales: tuple[float, float],
 ) -> list[SceneObject]:
     """Put objects on a table or a shelf beside what is there: most upright, some as they fall.
 
-    Up to `TABLE_ATTEMPTS` objects are drawn for each, so that there may be fewer than asked for.
+    `CROWD.attempts` objects are drawn for each, so that there may be fewer than asked for.
     """
     placed: list[SceneObject] = []
-    for _ in range(TABLE_ATTEMPTS * num_objects):
+    for _ in range(CROWD.attempts * num_objects):
         if len(placed) >= num_objects:
             break
         model = objects.sample(rng)
         reach = np.array(surroundings.reach)
         x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
-        lying = rng.random() < LYING_SHARE
+        lying = rng.random() < CROWD.lying_share
         quaternion = Rotation.random(rng=rng).as_quat().tolist() if lying else _upright(rng)
         scale = float(rng.uniform(*scales))
         placed = _place(world, surroundings, placed, model, (x, y), quaternion, scale)
@@ -135,11 +164,11 @@ def make_bin(
     objects: ObjectSet,
     rng: np.random.Generator,
     num_objects: int,
-    scales: tuple[float, float] = PILE_SCALE,
+    scales: tuple[float, float],
 ) -> list[SceneObject]:
     """Drop objects into a bin one after another; those that do not fit in it are taken away."""
-    dropped = _pour(world, surroundings, objects, rng, num_objects, scales, BIN_DROP_SHARE)
-    return settle(world, dropped, surroundings)
+    drop = _over_bin(surroundings, scales, POUR.margin)
+    return settle(world, _drop(world, objects, rng, num_objects, drop), surroundings)
 
 
 def make_full_bin(
@@ -148,69 +177,43 @@ def make_full_bin(
     objects: ObjectSet,
     rng: np.random.Generator,
     num_objects: int,
-    scales: tuple[float, float] = PILE_SCALE,
+    scales: tuple[float, float],
 ) -> list[SceneObject]:
     """Pour objects into a bin, all over it, until they hide its floor, or are as many as asked."""
     placed: list[SceneObject] = []
-    while len(placed) < num_objects and _covered(world, surroundings, placed) < COVERED:
-        number = min(POUR, num_objects - len(placed))
-        new = _pour(world, surroundings, objects, rng, number, scales, FULL_DROP_SHARE)
+    drop = _over_bin(surroundings, scales, POUR.full_margin)
+    while len(placed) < num_objects and _covered(world, surroundings, placed) < POUR.covered:
+        number = min(POUR.at_once, num_objects - len(placed))
+        new = _drop(world, objects, rng, number, drop)
         placed = settle(world, [*placed, *new], surroundings)
     return placed
 
 
-def _pour(
+def make_pile(
     world: World,
     surroundings: Surroundings,
     objects: ObjectSet,
     rng: np.random.Generator,
     num_objects: int,
     scales: tuple[float, float],
-    share: float,
-) -> list[SceneObject]:
-    """Drop objects into a bin, but for a share of its length and width along each side."""
-    low, high = np.asarray(surroundings.bounds)[:, :2]
-    margin = share * (high - low)
-    walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
-    where = low + margin, high - margin
-    height = walls + BIN_DROP_HEIGHT
-    return _drop(world, objects, rng, num_objects, scales, where, height, BIN_DROP_SECONDS)
-
-
-def _covered(world: World, surroundings: Surroundings, placed: Sequence[SceneObject]) -> float:
-    """The share of a bin's floor that objects hide from above."""
-    low, high = np.asarray(surroundings.bounds)[:, :2]
-    steps = (np.arange(RAYS) + 0.5) / RAYS
-    place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
-    starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
-    hits = world.first_hits(starts, ends)
-    return float(np.isin(hits, [item.body.uid for item in placed]).mean())
-
-
-def make_pile(
-    world: World,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float] = PILE_SCALE,
 ) -> list[SceneObject]:
     """Drop objects into an open box one after another, then take the box away."""
     walls = [box.add_to(world) for box in _pile_box()]
-    middle = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
-    height = TABLE_HEIGHT + PILE_DROP_HEIGHT
-    dropped = _drop(world, objects, rng, num_objects, scales, middle, height, DROP_SECONDS)
+    where = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
+    drop = Drop(scales, where, TABLE_HEIGHT + PILE.drop_height, PILE.seconds)
+    dropped = _drop(world, objects, rng, num_objects, drop)
     for wall in walls:
         wall.remove()
-    return settle(world, dropped, OPEN_TABLE)
+    return settle(world, dropped, surroundings)
 
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
     """Simulate until all objects rest, for at most `seconds`."""
     elapsed = 0.0
     while elapsed < seconds:
-        world.step(REST_CHECK_STEPS)
-        elapsed += REST_CHECK_STEPS * TIME_STEP
-        if all(item.body.speed <= REST_SPEED for item in objects):
+        world.step(REST.check_steps)
+        elapsed += REST.check_steps * TIME_STEP
+        if all(item.body.speed <= REST.speed for item in objects):
             return
 
 
@@ -224,7 +227,7 @@ def settle(
     """
     remaining = list(objects)
     while True:
-        wait_for_rest(world, remaining, REST_SECONDS)
+        wait_for_rest(world, remaining, REST.seconds)
         outside = [item for item in remaining if not surroundings.contain(item.body)]
         if not outside:
             return remaining
@@ -233,36 +236,45 @@ def settle(
         remaining = [item for item in remaining if item not in outside]
 
 
-def _drop(
-    world: World,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-    where: tuple[Matrix, Matrix],
-    height: float,
-    seconds: float,
-) -> list[SceneObject]:
-    """Drop objects, turned any way, one after another.
+class Drop(NamedTuple):
+    """How objects are dropped."""
 
-    Args:
-        world: gets them.
-        objects: to draw from.
-        rng: source of the draws.
-        num_objects: how many.
-        scales: range of the factor on their size.
-        where: lowest and highest x and y, (2,) each, metres.
-        height: z that they are dropped from, metres.
-        seconds: given to each to come to rest.
-    """
+    scales: tuple[float, float]  # range of the factor on their size
+    where: tuple[Matrix, Matrix]  # lowest and highest x and y, (2,) each, metres
+    height: float  # z that they are dropped from, metres
+    seconds: float  # given to each to come to rest
+
+
+def _over_bin(surroundings: Surroundings, scales: tuple[float, float], share: float) -> Drop:
+    """Over a bin, except for a share of its length and width along each side."""
+    low, high = np.asarray(surroundings.bounds)[:, :2]
+    margin = share * (high - low)
+    walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
+    return Drop(scales, (low + margin, high - margin), walls + POUR.drop_height, POUR.seconds)
+
+
+def _covered(world: World, surroundings: Surroundings, placed: Sequence[SceneObject]) -> float:
+    """The share of a bin's floor that objects hide from above."""
+    low, high = np.asarray(surroundings.bounds)[:, :2]
+    steps = (np.arange(POUR.rays) + 0.5) / POUR.rays
+    place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
+    starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
+    hits = world.first_hits(starts, ends)
+    return float(np.isin(hits, [item.body.uid for item in placed]).mean())
+
+
+def _drop(
+    world: World, objects: ObjectSet, rng: np.random.Generator, num_objects: int, drop: Drop
+) -> list[SceneObject]:
+    """Drop objects, turned any way, one after another."""
     dropped: list[SceneObject] = []
     for _ in range(num_objects):
         model = objects.sample(rng)
         quaternion = Rotation.random(rng=rng).as_quat().tolist()
-        x, y = rng.uniform(*where)
-        scale = float(rng.uniform(*scales))
-        dropped.append(load_object(world, model, (x, y, height), quaternion, scale))
-        wait_for_rest(world, dropped, seconds)
+        x, y = rng.uniform(*drop.where)
+        scale = float(rng.uniform(*drop.scales))
+        dropped.append(load_object(world, model, (x, y, drop.height), quaternion, scale))
+        wait_for_rest(world, dropped, drop.seconds)
     return dropped
 
 
@@ -286,7 +298,7 @@ def _place(
     new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)
     x, y, z = new.body.position
     lowest = new.body.bounds[0, 2]
-    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + PACKED_CLEARANCE), quaternion_xyzw)
+    new.body.set_pose((x, y, z - lowest + TABLE_HEIGHT + PACKED.clearance), quaternion_xyzw)
     world.step()
     if new.body.contacts():
         new.body.remove()
@@ -299,14 +311,14 @@ def _place(
 
 def _pile_box() -> list[Box]:
     """The walls that a pile is dropped into."""
-    length, width, height = PILE_BOX_EXTENT
-    low = PILE_BOX_CORNER
-    half = PILE_BOX_WALL / 2
+    length, width, height = PILE.extent
+    low = PILE.corner
+    half = PILE.wall / 2
     z = TABLE_HEIGHT + height / 2
     middle = low + length / 2
     return [
-        Box((PILE_BOX_WALL, width, height), (low + half, middle, z)),
-        Box((PILE_BOX_WALL, width, height), (low + length - half, middle, z)),
-        Box((length, PILE_BOX_WALL, height), (middle, low + half, z)),
-        Box((length, PILE_BOX_WALL, height), (middle, low + width - half, z)),
+        Box((PILE.wall, width, height), (low + half, middle, z)),
+        Box((PILE.wall, width, height), (low + length - half, middle, z)),
+        Box((length, PILE.wall, height), (middle, low + half, z)),
+        Box((length, PILE.wall, height), (middle, low + width - half, z)),
     ]

@@ -19,7 +19,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-EDGE = 0.015  # metres between neighbouring pixels from which on they show different things
+EDGE = 0.015  # metres between neighbouring pixels from which on they show different surfaces
 SAME_SURFACE = 0.004  # metres by which a pixel may lie behind what hides it
 WARP_PIXELS = 96  # between the independent values of the warp
 PATCH_PIXELS = 12  # between those of what is missing

@@ -42,7 +42,6 @@ from edgegrasp_sim.sensor import DepthNoise, DepthSensor
 from edgegrasp_sim.surroundings import (
     OPEN_TABLE,
     OPEN_THICKNESS,
-    SMALL_BIN,
     TABLE_HEIGHT,
     Surroundings,
     open_table,
@@ -52,10 +51,14 @@ from edgegrasp_sim.surroundings import (
 )
 
 NOISE_STD = 0.001  # metres
-# What objects stand in, the usual range of their scales, and how they are put there.
-STANDING_IN: dict[SceneKind, tuple[Callable[..., Any], tuple[float, float], Callable[..., Any]]] = {
+# What objects stand in (None: an open table), the usual range of their scales, how they are placed.
+STANDING_IN: dict[
+    SceneKind, tuple[Callable[..., Surroundings] | None, tuple[float, float], Callable[..., Any]]
+] = {
+    SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
+    SceneKind.PILE: (None, PILE_SCALE, make_pile),
     SceneKind.BIN: (random_bin, PILE_SCALE, make_bin),
-    SceneKind.FULL_BIN: (partial(random_bin, extents=SMALL_BIN), PILE_SCALE, make_full_bin),
+    SceneKind.FULL_BIN: (partial(random_bin, small=True), PILE_SCALE, make_full_bin),
     SceneKind.TABLE: (random_table, PACKED_SCALE, make_table),
     SceneKind.SHELF: (random_shelf, PACKED_SCALE, make_table),
 }
@@ -224,17 +227,9 @@ class ClutterSimulation:
         objects = self.object_sets.get(kind)
         if objects is None:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
-        match kind:
-            case SceneKind.PACKED:
-                self._clear(open_table(table_thickness))
-                made = make_packed(self.world, objects, rng, num_objects, scales or PACKED_SCALE)
-            case SceneKind.PILE:
-                self._clear(open_table(table_thickness))
-                made = make_pile(self.world, objects, rng, num_objects, scales or PILE_SCALE)
-            case _:
-                surround, usual, make = STANDING_IN[kind]
-                around = self._clear(surround(rng))
-                made = make(self.world, around, objects, rng, num_objects, scales or usual)
+        surround, usual, make = STANDING_IN[kind]
+        around = self._clear(open_table(table_thickness) if surround is None else surround(rng))
+        made = make(self.world, around, objects, rng, num_objects, scales or usual)
         self._objects = made
         self._gripper = self._add_gripper()
         return self.num_objects

@@ -1,4 +1,4 @@
-"""A planner without a network: grasp the highest thing from above, across its narrow side."""
+"""A planner without a network: grasp the highest object from above, across its narrow side."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FINGERTIP, MAX_OPENING
 from edgegrasp_sim.trial import PlannedGrasp
 
-REACH = 0.04  # metres around the highest point that count as the thing to grasp
+REACH = 0.04  # metres around the highest point that count as the object to grasp
 DEPTH = 0.025  # metres that the fingertips go below its top
 TABLE_CLEARANCE = 0.004  # metres
 MIN_POINTS = 10

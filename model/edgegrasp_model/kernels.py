@@ -103,7 +103,7 @@ def level_spread(
     Args:
         points: (N, 3) of the cloud.
         rows: (M,) of the points to look at.
-        toward: (M, 3) unit, to who looks.
+        toward: (M, 3) unit, toward the viewpoint.
         radius: Metres around each point in which others count,
         drop: unless they lie further below it, metres.
 

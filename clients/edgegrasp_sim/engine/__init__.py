@@ -17,6 +17,7 @@ from edgegrasp_sim.poses import Matrix
 
 TIME_STEP = 1.0 / 80.0  # seconds
 GRAVITY = 9.81  # m/s²
+SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
 
@@ -131,6 +132,8 @@ Parts: TypeAlias = tuple[Matrix, ...]  # convex ones, each by its points, (P, 3)
 class HandModel:
     """A floating hand with two coupled fingers that slide apart along y.
 
+    Fields that no gripper file gives have a default, the same for every hand.
+
     Attributes:
         palm: in the hand's frame.
         fingers: that at y > 0 and the other, shut, each in its own frame.
@@ -138,12 +141,12 @@ class HandModel:
         finger_centre: centre of mass of the finger at y > 0, in its frame, metres.
         tip: fingertips as they hold something, metres along z.
         centre: the palm's centre of mass, hand frame, metres.
+        max_opening: metres between the fingers.
         mass: of the palm, kg.
         friction: of the palm.
         finger_mass: kg.
         finger_friction: lateral.
         finger_force: with which each finger closes and opens, N.
-        max_opening: metres between the fingers.
         tool_force: with which the hand is moved at most, N.
         advance: how far the fingers are ahead of where they are in the open hand, metres: the
             coefficients of 1, q, ..., q^4, where q is half the opening; None: they never are.
@@ -156,13 +159,13 @@ class HandModel:
     finger_centre: tuple[float, float, float]
     tip: float
     centre: tuple[float, float, float]
-    mass: float
-    friction: float
-    finger_mass: float
-    finger_friction: float
-    finger_force: float
     max_opening: float
-    tool_force: float
+    mass: float = 0.5
+    friction: float = 1.0
+    finger_mass: float = 0.1
+    finger_friction: float = 0.75
+    finger_force: float = 20.0
+    tool_force: float = 300.0
     advance: tuple[float, ...] | None = None
     meshes: tuple[str, str] | None = None
 

@@ -1,4 +1,4 @@
-"""MuJoCo: maintained, with wheels for every current Python, and an image in milliseconds."""
+"""MuJoCo: wheels for every current Python, and an image in milliseconds."""
 
 import os
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_sim.engine import (
     GRAVITY,
+    SLIDE_MASS,
     TIME_STEP,
     Body,
     Contact,
@@ -41,7 +42,6 @@ FINGER_SPINNING_FRICTION = 0.005
 FINGER_SPEED = 0.2  # m/s, at which a finger moves where nothing stops it
 FINGER_INERTIA = 0.3  # kg, of a finger's drive
 FINGER_DAMPING = 400.0  # N s/m, with which the drive keeps to its speed
-SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 CONSTANTS = {
     "time_step": TIME_STEP,
     "substeps": SUBSTEPS,
@@ -474,7 +474,7 @@ class _Images:
 def _gl_context(width: int, height: int) -> Any:
     """What this process draws with; made once."""
     try:
-        # Not MuJoCo's own choice: who imported it before us made that before MUJOCO_GL was set.
+        # MuJoCo chooses on import, which may have been before MUJOCO_GL was set.
         drawing = import_module(f"mujoco.{os.environ['MUJOCO_GL'].lower()}")
         context = drawing.GLContext(width, height)
         context.make_current()

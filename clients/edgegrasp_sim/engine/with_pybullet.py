@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_sim.engine import (
     GRAVITY,
+    SLIDE_MASS,
     TIME_STEP,
     Body,
     Contact,
@@ -30,7 +31,6 @@ FINGER_STIFFNESS = 30000.0  # N/m at a contact
 FINGER_DAMPING = 1000.0  # N s/m at a contact
 GEAR_FORCE = 30.0  # N, which keeps the fingers at one opening
 GEAR_ERP = 0.1
-SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 CONSTANTS = {
     "time_step": TIME_STEP,
     "solver_iterations": SOLVER_ITERATIONS,

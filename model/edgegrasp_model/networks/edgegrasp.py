@@ -67,7 +67,7 @@ class EdgeGraspNet(nn.Module):
         return torch.cat(logits).squeeze(1)[: len(grasp)]
 
     def _grasp_features(self, batch: BallBatch) -> Tensor:
-        """What is told of each grasp itself, (E, 10)."""
+        """Features of each grasp itself, (E, 10)."""
         contact = batch.contact
         parts = (
             batch.points[contact],

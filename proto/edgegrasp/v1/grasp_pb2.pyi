@@ -121,7 +121,7 @@ class DetectGraspsStreamRequest(_message.Message):
     request_id: _builtins.str
     """The caller's own name for it; comes back with the answer."""
     timeout: _builtins.float
-    """Seconds from its arrival at the server until nobody wants the answer any more."""
+    """Seconds from its arrival at the server after which the answer is not wanted any more."""
     @_builtins.property
     def request(self) -> Global___DetectGraspsRequest: ...
     def __init__(
@@ -1760,7 +1760,7 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def support(self) -> Global___FoundSupport:
-        """The plane that things stand on, given or found; absent (null in JSON): none."""
+        """The plane that objects stand on, given or found; absent (null in JSON): none."""
 
     @_builtins.property
     def up(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -1768,7 +1768,7 @@ class DetectGraspsResponse(_message.Message):
 
     @_builtins.property
     def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___DetectedObject]:
-        """The things that grasps are for, the largest first."""
+        """The objects that grasps are for, the largest first."""
 
     @_builtins.property
     def gripper(self) -> Global___GripperOutline:
@@ -1827,7 +1827,7 @@ Global___GripperOutline: _TypeAlias = GripperOutline  # noqa: Y015
 
 @_typing.final
 class FoundSupport(_message.Message):
-    """The plane that things stand on: the points x with normal . x = offset; cloud frame."""
+    """The plane that objects stand on: the points x with normal . x = offset; cloud frame."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -1947,7 +1947,7 @@ class Grasp(_message.Message):
     collision_free: _builtins.bool
     """Whether the open hand meets nothing at the grasp and on its ways."""
     clearance: _builtins.float
-    """Metres from the open hand at the grasp to the nearest thing; 0 or less: within it."""
+    """Metres from the open hand at the grasp to the nearest surface; 0 or less: within it."""
     object: _builtins.int
     """Number of the object that the contact point is on; absent (null in JSON): of none."""
     @_builtins.property
