@@ -213,10 +213,11 @@ def request(
 
 def _sampled_poses(observation: Observation) -> np.ndarray:
     options = request(observation, num_candidates=LABELLED_GRASPS)
-    prepared = detector(recipe("edgegrasp-small").network).prepare(observation.cloud, options)
-    assert prepared.sample is not None
+    ours = detector(recipe("edgegrasp-small").network)
+    prepared = ours.prepare(observation.cloud, options)
     assert prepared.scene is not None
-    return prepared.scene.frame.poses_in_cloud(prepared.sample.candidates.T_cloud_hand)
+    sample = ours.sampler(prepared).all()
+    return prepared.scene.frame.poses_in_cloud(sample.candidates.T_cloud_hand)
 
 
 def write_table(page: Path, written: str) -> None:
