@@ -25,6 +25,7 @@ from edgegrasp_model.results import (
     GripperOutline,
     NoGrasp,
     Outcome,
+    Pace,
     Scoring,
 )
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud, check_edges, check_hand_poses
@@ -57,7 +58,7 @@ class DummyDetector:
     def __init__(self, seconds: float = 0.0) -> None:
         self._seconds = seconds
 
-    def prepare(self, cloud: CloudInput, options: DetectOptions) -> DummyPrepared:
+    def prepare(self, cloud: CloudInput, options: DetectOptions, *_: int) -> DummyPrepared:
         """Draw approach points, the same ones for the same cloud and options."""
         points = check_cloud(cloud, options.num_approach_points or 1).points
         random = np.random.default_rng(options.seed)
@@ -131,6 +132,8 @@ class DummyDetector:
 
 class DummyCatalogue:
     """The dummy detector as the only weights."""
+
+    pace = Pace()
 
     def __init__(self, seconds: float = 0.0) -> None:
         self._detector = DummyDetector(seconds)

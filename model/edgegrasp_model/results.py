@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,3 +137,10 @@ class Scoring:
     seconds: dict[str, float]
     model: str
     warnings: list[str] = field(default_factory=list)
+
+
+class Pace(NamedTuple):
+    """Processor time that a detection takes at least, seconds; 0: not measured."""
+
+    point: float = 0.0  # for each point of the cloud
+    voxel: float = 0.0  # for each voxel in which grasps are searched

@@ -14,9 +14,10 @@ from edgegrasp_cli import main
 from edgegrasp_client import GraspClient
 from edgegrasp_model.detector import ModelCatalogue
 from edgegrasp_model.options import parse_options
+from edgegrasp_model.results import Pace
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.answer import answer, load_catalogue
+from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.job import Job
 
 
@@ -162,13 +163,28 @@ def test_scores_are_the_same_everywhere(
             assert list(scoring.counts.items()) == list(expected.counts.items())
 
 
-def test_too_many_voxels_are_named() -> None:
+@pytest.mark.parametrize(
+    ("pace", "kind", "named"),
+    [
+        (Pace(voxel=1e-2), "invalid-request", "voxels"),
+        (Pace(point=1e-2), "deadline-exceeded", "50000 points"),
+        (Pace(1e-6, 1e-6), "invalid-request", "20000"),
+    ],
+)
+def test_clouds_that_take_too_long_are_refused(
+    catalogue: ModelCatalogue, monkeypatch: pytest.MonkeyPatch, pace: Pace, kind: str, named: str
+) -> None:
+    monkeypatch.setattr(catalogue, "pace", pace)
     room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
     np.save(file, room)
-    few = Settings(max_voxels=20_000)
     whole = "objects=off&support=null"
     job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy", whole)
-    error = answer(job, load_catalogue(few), few).error
+    error = answer(job, catalogue, Settings(max_voxels=20_000)).error
     assert error is not None
-    assert "voxels" in error.value
-    assert "workspace" in error.fix
+    assert error.kind == kind
+    assert named in error.detail
+
+
+def test_the_pace_is_measured(catalogue: ModelCatalogue) -> None:
+    catalogue.warm_up()
+    assert 0 < catalogue.pace.point < catalogue.pace.voxel < 1e-3

@@ -315,7 +315,8 @@ def _too_many_voxels(
     return InvalidRequest(
         "options.workspace",
         f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
-        f"Send a workspace around the objects, or a support plane: at most {most} are accepted.",
+        "Send a workspace around the objects, or a support plane: at most "
+        f"{most} are accepted, fewer where the deadline is near.",
     )
 
 

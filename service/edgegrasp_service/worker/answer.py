@@ -51,6 +51,9 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
 def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
     """Decode a job, detect, and encode the answer; nothing of it is kept for the next.
 
+    A cloud that takes longer than its deadline allows, at the pace that the catalogue measured
+    when it was loaded, is refused before the work.
+
     Returns:
         The answer; or, for a request that cannot be answered, an empty one with its Problem.
 
@@ -101,7 +104,8 @@ class _Work:
         with self._stage("decode"):
             detector, cloud, options, _ = self._decode()
         with self._stage("prepare"):
-            prepared = detector.prepare(cloud, options)
+            most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
+            prepared = detector.prepare(cloud, options, most)
             self.facts.counts = dict(prepared.counts)
         with self._stage("network"):
             logits = detector.evaluate(prepared)
@@ -135,10 +139,22 @@ class _Work:
         self.options = options = parse_options(fields["options"])
         detector, most = self._catalogue.get(options.model), self._settings.max_points
         given = {} if self._job.method == "DetectGrasps" else _given(fields, most)
-        cloud, options = decode_cloud(fields, options, most)
+        in_time = self._within_deadline(most, self._catalogue.pace.point)
+        try:
+            cloud, options = decode_cloud(fields, options, in_time)
+        except PayloadTooLarge as error:
+            if in_time == most:
+                raise
+            why = f"{error.value} take longer than the deadline allows. Send fewer, or allow more."
+            raise DeadlineExceeded(f"{error.field}: {why}") from None
         points = cloud.points
         self.facts.points = points.size // 3 if isinstance(points, np.ndarray) else 0
         return detector, cloud, options, given
+
+    def _within_deadline(self, most: int, seconds: float) -> int:
+        """Of `most` points or voxels that take so long each, those that can be done in time."""
+        remaining = max(self._deadline - time.monotonic(), 0.0)
+        return int(min(most, remaining / seconds)) if seconds else most
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
