@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
 KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
+HEALTH_PLACES = 16  # connections beside max_connections, which no request but for health holds
 BACKLOG = 128  # connections that wait to be accepted
 REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble with sockets
 
@@ -161,7 +162,7 @@ class Server:
             access_log=False,
             lifespan="off",
             http=partial(  # type: ignore[arg-type]  # made alike
-                HttpProtocol, self._settings, Places(self._settings.max_connections)
+                HttpProtocol, self._settings, Places(self._settings.max_connections, spare=HEALTH_PLACES)
             ),
             ws="none",
             backlog=BACKLOG,

@@ -24,6 +24,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
+from edgegrasp_service.server import HEALTH_PLACES
 
 PATIENCE = 30
 MIB = 2**20
@@ -286,11 +287,11 @@ async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> N
     """Of HTTP: silent ones, and ones that ask for a page and read nothing."""
     running = await serve(max_connections=3)
     url = running.server.http_url
-    held = [http_socket(url) for _ in range(9)]
+    held = [http_socket(url) for _ in range(3 * (3 + HEALTH_PLACES))]
     for connection in held[3:]:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         connection.sendall(b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n")
-    for connection in held[:6]:  # they were ended: to be read to the end, or reset
+    for connection in held[: 2 * (3 + HEALTH_PLACES)]:  # they were ended: to be read to the end, or reset
         with contextlib.suppress(ConnectionResetError):
             while await asyncio.to_thread(connection.recv, 2**20):
                 pass
@@ -298,6 +299,25 @@ async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> N
         assert (await http.get("/health/live")).status_code == 200
     for connection in held:
         connection.close()
+
+
+async def test_health_is_answered_while_every_connection_has_a_request(serve, cloud) -> None:
+    running = await serve(max_connections=2, workers=1)
+    running.stages.shut("evaluate")
+    url, body = running.server.http_url, npy(cloud)
+    async with httpx.AsyncClient(base_url=url, timeout=PATIENCE) as http:
+        kind = {"content-type": "application/x-npy"}
+
+        def ask() -> asyncio.Task[httpx.Response]:
+            return asyncio.create_task(http.post("/v1/grasps", content=body, headers=kind))
+
+        held = [ask(), ask()]
+        await running.until(lambda: running.server.service.admission.tickets == 2)
+        assert (await ask()).status_code == 429
+        for path in ("/health/live", "/health/ready"):
+            assert (await http.get(path)).status_code == 200
+        running.stages.open("evaluate")
+        assert [(await one).status_code for one in held] == [200, 200]
 
 
 async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> None:

@@ -210,11 +210,12 @@ class Places:
     """So many connections, streams or reads at a time.
 
     Where all are taken, a newcomer ends one that was idle for `grace` seconds: of whoever has most
-    of those, the one that was idle for longest.
+    of those, the one that was idle for longest. `spare` places are never busy, so that there is
+    always one for a newcomer.
     """
 
-    def __init__(self, most: int, grace: float = 0.0) -> None:
-        self._most, self._grace = most, grace
+    def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
+        self._most, self._grace, self._spare = most + spare, grace, spare
         self._taken: dict[Place, None] = {}  # the latest used at the end
 
     def take(self, owner: str, lose: Callable[[], None]) -> Place:
@@ -233,7 +234,11 @@ class Places:
         return place
 
     def use(self, place: Place, idle: bool = True) -> None:
-        """Something happens at a place, which is idle then or not."""
+        """Something happens at a place, which is idle then or not; raises Overloaded."""
+        if place.idle and not idle and self._spare:
+            busy = sum(not other.idle for other in self._taken)
+            if busy >= self._most - self._spare:
+                raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
         place.idle, place.used = idle, time.monotonic()
         if place in self._taken:
             self._taken[place] = self._taken.pop(place)

@@ -29,7 +29,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._header_bytes = 0
         self._in_headers = self._receiving = True
         self._pieces = self._body_bytes = 0
-        self._refusal: EdgeGraspError | None = None
+        self._refusal: EdgeGraspError | None = None  # why the parser is ended
         self._place = Place("", lambda: None)
 
     def connection_made(self, transport: Any) -> None:
@@ -71,7 +71,11 @@ class HttpProtocol(HttpToolsProtocol):
         self._in_headers = False
         self._stop_timer()
         # How many of these there are is bounded elsewhere, and somebody waits for each.
-        self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
+        try:
+            self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
+        except Overloaded as error:
+            self._refusal = error
+            raise  # ends the parser too
         super().on_headers_complete()
 
     def on_response_complete(self) -> None:
