@@ -156,14 +156,13 @@ class Server:
     def _http_server(self) -> "_HttpServer":
         tls = self._tls
         app = create_app(self.service, self.metrics, self.reloader)
+        places = Places(self._settings.max_connections, spare=HEALTH_PLACES)
         config = uvicorn.Config(
             HttpMiddleware(app, self.service),
             log_config=None,
             access_log=False,
             lifespan="off",
-            http=partial(  # type: ignore[arg-type]  # made alike
-                HttpProtocol, self._settings, Places(self._settings.max_connections, spare=HEALTH_PLACES)
-            ),
+            http=partial(HttpProtocol, self._settings, places),  # type: ignore[arg-type]
             ws="none",
             backlog=BACKLOG,
             server_header=False,

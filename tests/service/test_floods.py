@@ -291,7 +291,7 @@ async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> N
     for connection in held[3:]:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         connection.sendall(b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n")
-    for connection in held[: 2 * (3 + HEALTH_PLACES)]:  # they were ended: to be read to the end, or reset
+    for connection in held[: 2 * (3 + HEALTH_PLACES)]:  # they were ended, some of them reset
         with contextlib.suppress(ConnectionResetError):
             while await asyncio.to_thread(connection.recv, 2**20):
                 pass
