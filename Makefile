@@ -42,7 +42,7 @@ lint: $(TOOLS) ## style, types, import boundaries, generated code
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy $(wildcard examples/*.py)
-	$(BIN)/mypy --python-version 3.10 --package edgegrasp_client --module edgegrasp_bridge.bridge
+	$(BIN)/mypy --python-version 3.10 --package edgegrasp_camera --package edgegrasp_client --module edgegrasp_bridge.bridge
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_service.worker.request_cloud import DepthImage, PointCloud2
+from edgegrasp_model.request_cloud import DepthImage, PointCloud2
 
 ROOT = Path(__file__).parents[1]
 DOCUMENT = Path("edgegrasp/v1/openapi.json")

@@ -1,7 +1,7 @@
 """Read point cloud files from memory: .npy, .npz, .ply, .pcd and .xyz; and .png images.
 
-The bytes are a stranger's. Nothing is unpickled, and no count in a header is trusted before it is
-compared with the bytes at hand: a short file cannot make a worker allocate a large array.
+The bytes may be a stranger's. Nothing is unpickled, and no count in a header is trusted before it
+is compared with the bytes at hand: a short file cannot make a worker allocate a large array.
 """
 
 import io
@@ -18,16 +18,22 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
-from PIL import Image
-from pydantic import ValidationError
 
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, invalid_fields
-from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
-from edgegrasp_service.errors import PayloadTooLarge, UnsupportedMediaType
-
-Array = NDArray[Any]
-Records = NDArray[np.void]
+from edgegrasp_camera.clouds import (
+    PCL_FIELDS,
+    Array,
+    CloudInput,
+    Records,
+    cloud_of_records,
+    too_many,
+)
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.errors import (
+    EdgeGraspError,
+    InvalidRequest,
+    PayloadTooLarge,
+    UnsupportedMediaType,
+)
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
 MAX_NPY_HEADER = 1024  # bytes; Python's parser runs out of memory where brackets or signs nest
@@ -68,12 +74,6 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
         raise UnsupportedMediaType("format", repr(file_format), fix)
     with _reading("cloud", file_format, len(data), FIXES[file_format]):
         return _READERS[file_format](data, max_points)
-
-
-def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLarge:
-    """The error for more than `max_points` points."""
-    fix = f"Send at most {max_points} points, e.g. downsampled."
-    return PayloadTooLarge(field, f"{count} points", fix)
 
 
 @contextmanager
@@ -148,11 +148,11 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
     rgb, unread = arrays.pop("rgb", None), sorted(members.keys() - known)
     said = (f"arrays of the file that are not read: {', '.join(unread[:5])}.",) if unread else ()
     if "depth" in arrays:
-        fields = {"intrinsics": np.ravel(arrays["intrinsics"]).tolist()}
         try:
-            view = CameraView.model_validate(fields)
-        except ValidationError as error:
-            raise invalid_fields(error, fields, "cloud") from None
+            view = DepthView(intrinsics_of(np.ravel(arrays["intrinsics"])))
+        except ValueError as error:
+            value = f"{arrays['intrinsics'].size} numbers that {error}"
+            raise InvalidRequest("cloud.intrinsics", value, FIXES["npz"]) from None
         cloud, _ = fuse_depth_images([arrays["depth"]], [view])
     else:
         cloud = CloudInput(**arrays)
@@ -186,6 +186,8 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
         InvalidRequest: The file is truncated, or no PNG.
         PayloadTooLarge: More than `max_points` pixels.
     """
+    from PIL import Image  # not in the base install
+
     fix = "Send a whole PNG file, of 16-bit greyscale for depths."
     with _reading(field, "png", len(data), fix), warnings.catch_warnings():
         warnings.simplefilter("error")  # that the image is huge
@@ -201,33 +203,6 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
 
 
 # Records of numbers, in binary or as text: the points of PLY and PCD files and of PointCloud2
-
-PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # that are read
-
-
-def cloud_of_records(rows: Records) -> CloudInput:
-    """A cloud of points whose fields are named as PCL and ROS name them.
-
-    Args:
-        rows: (N,) or (H, W) with fields x, y, z; normal_x, normal_y, normal_z, and rgb or rgba
-            (packed in 4 bytes) or red, green, blue, where there are any.
-    """
-    colors = _stacked(rows, "red", "green", "blue")
-    for name in ("rgb", "rgba"):
-        if colors is None and name in (rows.dtype.names or ()) and rows.dtype[name].itemsize == 4:
-            # 0x00RRGGBB, kept in a float32 or uint32
-            packed = np.ascontiguousarray(rows[name]).view(np.uint32)
-            colors = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1)
-            colors = colors.astype(np.uint8)
-    normals = _stacked(rows, "normal_x", "normal_y", "normal_z")
-    return CloudInput(points=_stacked(rows, "x", "y", "z"), normals=normals, colors=colors)
-
-
-def _stacked(rows: Records, *names: str) -> Array | None:
-    """Fields of the rows side by side; None where one of them is missing."""
-    if not {*names} <= {*(rows.dtype.names or ())}:
-        return None
-    return np.stack([rows[name] for name in names], axis=-1)
 
 
 def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]], re.Match[bytes]]:

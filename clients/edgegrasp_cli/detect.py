@@ -189,7 +189,7 @@ def decode(cloud: Any, depth_images: Any, colors: Any, options: Mapping[str, Any
     """What a server makes of a request: a CloudInput and DetectOptions; raises as it does."""
     from edgegrasp_client.clouds import depth_image_fields, npy_bytes
     from edgegrasp_model.options import parse_options
-    from edgegrasp_service.worker.request_cloud import File, decode_cloud
+    from edgegrasp_model.request_cloud import File, decode_cloud
 
     fields: dict[str, Any] = {}
     if colors is not None:
@@ -286,7 +286,7 @@ def _depth_images(
 
 def _pixels(file: Path) -> NDArray[Any]:
     """The values of an image file: (H, W), or (H, W, C) of several channels."""
-    from edgegrasp_service.worker.request_cloud import File, decode_array
+    from edgegrasp_model.request_cloud import File, decode_array
 
     return decode_array(str(file), File(file.suffix[1:].lower(), file.read_bytes()), sys.maxsize)
 

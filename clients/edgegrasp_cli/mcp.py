@@ -18,6 +18,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.poses import quaternion_from_matrix
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
 if TYPE_CHECKING:
@@ -263,7 +265,8 @@ class _Inputs:
         elif path.suffix == ".npy":
             arrays = {"points": np.load(path, allow_pickle=False)}
         if "depth" in arrays:
-            arrays["points"] = _points_of_depth(arrays["depth"], arrays["intrinsics"], scale)
+            depth = metres(arrays["depth"], scale)
+            arrays["points"] = unproject(depth, intrinsics_of(np.ravel(arrays["intrinsics"])))
         if "points" not in arrays:
             return None, None
         points = arrays["points"].reshape(-1, 3)
@@ -313,8 +316,6 @@ def _with_sentences(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _short(found: "Detection") -> str:
     """What an agent needs of a detection, as JSON in few digits."""
-    from edgegrasp_client.conversions import quaternion_from_matrix
-
     grasps = [
         {
             "score": round(grasp.score, 3),
@@ -354,18 +355,6 @@ def _pixels(path: Path) -> NDArray[Any]:
         loaded: NDArray[Any] = np.load(path, allow_pickle=False)
         return loaded
     return np.asarray(Image.open(path))
-
-
-def _points_of_depth(
-    depth: NDArray[Any], intrinsics: Any, scale: float | None
-) -> NDArray[np.float64]:
-    """Points (H, W, 3) of depths (H, W), camera frame; NaN where there is no reading."""
-    numbers = np.ravel(intrinsics)
-    fx, fy, cx, cy = numbers if len(numbers) == 4 else numbers[[0, 4, 2, 5]]
-    z = depth * (scale or (0.001 if depth.dtype.kind == "u" else 1.0))
-    z = np.where(z > 0, z, np.nan)
-    rows, columns = np.indices(depth.shape)
-    return np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=-1)
 
 
 def _picture(

@@ -267,12 +267,12 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
 
 def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
     """What a detector gets; and the points (H, W, 3) or (N, 3), NaN where there is no reading."""
-    from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
+    from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 
     if "depth" in arrays.arrays:
         depth = arrays.get("depth", "u", "(H, W) uint16 millimetres")
         values = arrays.get("intrinsics", "f", "fx, fy, cx, cy beside depth", (4,)).tolist()
-        view = CameraView.model_validate({"intrinsics": values})
+        view = DepthView(intrinsics_of(values))
         cloud, _ = fuse_depth_images([depth], [view])
         return {"depth_images": [{"depth": depth, "intrinsics": values}]}, np.asarray(
             cloud.points, dtype=np.float32

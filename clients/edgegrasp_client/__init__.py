@@ -7,12 +7,12 @@ with GraspClient("127.0.0.1:50051") as client:  # or "http://127.0.0.1:8000"
 best = detection.grasps[0]
 """
 
+from edgegrasp_camera.clouds import PointCloud2 as PointCloud2
+from edgegrasp_camera.clouds import PointField as PointField
 from edgegrasp_client.async_client import AsyncGraspClient as AsyncGraspClient
 from edgegrasp_client.client import GraspClient as GraspClient
 from edgegrasp_client.clouds import DepthImage as DepthImage
 from edgegrasp_client.clouds import Intrinsics as Intrinsics
-from edgegrasp_client.clouds import PointCloud2 as PointCloud2
-from edgegrasp_client.clouds import PointField as PointField
 from edgegrasp_client.connection import Tls as Tls
 from edgegrasp_client.errors import AccessDeniedError as AccessDeniedError
 from edgegrasp_client.errors import DeadlineError as DeadlineError

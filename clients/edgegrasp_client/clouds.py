@@ -5,37 +5,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Protocol, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import NotRequired, TypedDict
 
+from edgegrasp_camera.clouds import PointCloud2
+from edgegrasp_camera.depth import intrinsics_of
 from edgegrasp_client.errors import invalid
 
 FILE_FORMATS = ("npy", "npz", "ply", "pcd", "xyz")
 DEPTH_ENCODINGS = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}
-
-
-class PointField(Protocol):
-    """The attributes of sensor_msgs/PointField."""
-
-    name: str
-    offset: int
-    datatype: int
-    count: int
-
-
-class PointCloud2(Protocol):
-    """The attributes of sensor_msgs/PointCloud2, metres; ROS itself is not needed."""
-
-    height: int
-    width: int
-    fields: Sequence[PointField]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: Any  # bytes, or a sequence of their values
 
 
 class Intrinsics(TypedDict):
@@ -177,17 +158,11 @@ def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
 
 def _intrinsics_fields(intrinsics: object, path: str) -> dict[str, float]:
     """fx, fy, cx and cy of a mapping, of four numbers or of a matrix (3, 3) or (9,)."""
-    names = tuple(Intrinsics.__annotations__)
-    if isinstance(intrinsics, Mapping) and set(intrinsics) == set(names):
-        intrinsics = [intrinsics[name] for name in names]
     try:
-        numbers = np.asarray(intrinsics, dtype=np.float64)
+        numbers = intrinsics_of(intrinsics)._asdict()
+        return {name: float(number) for name, number in numbers.items()}
     except (TypeError, ValueError):
-        numbers = np.empty(0)
-    rows: Any = (numbers.reshape(3, 3) if numbers.size == 9 else numbers).tolist()
-    match rows:
-        case [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]] | [float(fx), fy, cx, cy]:
-            return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        pass
     fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
     raise invalid(path, repr(intrinsics)[:80], fix)
 

@@ -15,25 +15,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-
-class EdgeGraspError(Exception):
-    """Base of every error this package raises on purpose."""
-
-
-class InvalidRequest(EdgeGraspError):  # noqa: N818
-    """The caller's input is wrong.
-
-    Args:
-        field: Name of the request field, as it is spelled on the wire (`cloud`, `options.seed`).
-        value: What was received, short enough to print.
-        fix: What to send instead, as an imperative sentence.
-    """
-
-    def __init__(self, field: str, value: str, fix: str) -> None:
-        self.field = field
-        self.value = value
-        self.fix = fix
-        super().__init__(f"{field}: got {value}. {fix}")
+from edgegrasp_camera.errors import EdgeGraspError as EdgeGraspError
+from edgegrasp_camera.errors import InvalidRequest as InvalidRequest
 
 
 def invalid_fields(

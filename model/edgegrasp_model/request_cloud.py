@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     Field,
@@ -21,17 +22,18 @@ from pydantic import (
     ValidationError,
 )
 
+from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
+from edgegrasp_camera.depth import Position, fuse_depth_images, intrinsics_of
+from edgegrasp_camera.files import read_file, read_npy, read_png
 from edgegrasp_model.errors import InvalidRequest, brief, invalid_fields
-from edgegrasp_model.options import MAX_VIEWS, DetectOptions, Integer, Strict, numeric
-from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_model.scene.depth import CameraView, Position, fuse_depth_images
-from edgegrasp_service.worker.formats import (
-    PCL_FIELDS,
-    cloud_of_records,
-    read_file,
-    read_npy,
-    read_png,
-    too_many,
+from edgegrasp_model.options import (
+    FARTHEST,
+    MAX_VIEWS,
+    DetectOptions,
+    Finite,
+    Integer,
+    Strict,
+    numeric,
 )
 
 Array = NDArray[Any]
@@ -84,7 +86,8 @@ def decode_cloud(
         viewpoint = cameras[0] if len(cameras) == 1 else tuple(cameras)
         options = options.model_copy(update={"viewpoint": viewpoint})
     elif source == "point_cloud2":
-        cloud = read_point_cloud2(fields[source], max_points)
+        layout = parse(PointCloud2, fields[source], "point_cloud2")
+        cloud = read_point_cloud2(layout, max_points)
     elif source == "cloud":
         file: File = fields[source]
         cloud = read_file(file.format, file.data, max_points)
@@ -219,6 +222,54 @@ class PointCloud2(Strict):
     data: Bytes = Field(description="height * row_step bytes, as base64 in JSON")
 
 
+FocalLength = Annotated[float, Field(gt=0.0, le=FARTHEST), numeric]
+PoseRow = tuple[Finite, Finite, Finite, Finite]
+
+
+def _by_name(value: object) -> object:
+    """Intrinsics by name, of four numbers or of a matrix."""
+    return intrinsics_of(value)._asdict() if isinstance(value, list) else value
+
+
+def _rigid(pose: tuple[PoseRow, ...]) -> tuple[PoseRow, ...]:
+    matrix = np.array(pose)
+    rotation = matrix[:3, :3]
+    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
+    return pose
+
+
+class Intrinsics(Strict):
+    """A pinhole camera without distortion; the centre of the top left pixel is (0, 0)."""
+
+    fx: FocalLength = Field(description="pixels")
+    fy: FocalLength = Field(description="pixels")
+    cx: Finite = Field(description="pixels")
+    cy: Finite = Field(description="pixels")
+
+
+class CameraView(Strict):
+    """How a camera saw an image of depths. Camera frame: x right, y down, z forward."""
+
+    intrinsics: Annotated[
+        Intrinsics,
+        BeforeValidator(
+            _by_name, json_schema_input_type=Intrinsics | list[float] | list[list[float]]
+        ),
+    ] = Field(description="by name, or fx, fy, cx, cy, or the 3 x 3 matrix")
+    T_cloud_camera: Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(_rigid)] = (
+        Field(
+            default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+            description="maps camera coordinates to cloud coordinates, metres",
+        )
+    )
+    depth_scale: Annotated[float, Field(gt=0.0, le=1.0), numeric] | None = Field(
+        default=None,
+        description="metres for one unit of depth; null: 0.001 of whole numbers, 1 of floats",
+    )
+
+
 class Depth(Strict):
     """An image of depths, row by row from the top left pixel; 0 or NaN: no reading."""
 
@@ -252,73 +303,13 @@ def parse(schema: type[Schema], fields: object, name: str) -> Schema:
         raise problem from None
 
 
-# sensor_msgs/PointCloud2
-
-POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-
-
-def read_point_cloud2(fields: object, max_points: int) -> CloudInput:
-    """Read x, y, z of a cloud, and normals and colours where there are any.
-
-    Returns:
-        Points (N, 3), or (H, W, 3) where the height is 2 or more.
-
-    Raises:
-        InvalidRequest: A field is missing, unknown or wrong, or they contradict each other.
-        PayloadTooLarge: More than `max_points` points.
-    """
-    layout = parse(PointCloud2, fields, "point_cloud2")
-    if layout.height * layout.width > max_points:
-        raise too_many(layout.height * layout.width, max_points, "point_cloud2")
-    record = _record(layout)
-    if layout.row_step < layout.width * layout.point_step:
-        value = f"{layout.row_step} for {layout.width} points of {layout.point_step} bytes"
-        raise InvalidRequest("point_cloud2.row_step", value, "Send width * point_step or more.")
-    expected = layout.height * layout.row_step
-    if len(layout.data) != expected:
-        value = f"{len(layout.data)} bytes where height * row_step is {expected}"
-        raise InvalidRequest("point_cloud2.data", value, "Send the whole cloud.")
-    shape, strides = (layout.height, layout.width), (layout.row_step, layout.point_step)
-    if 0 in shape:
-        return CloudInput(np.empty((0, 3), np.float32))
-    rows = np.ndarray(shape, record, layout.data, strides=strides).astype(record.newbyteorder("="))
-    return cloud_of_records(rows[0] if layout.height == 1 else rows)
-
-
-def _record(layout: PointCloud2) -> np.dtype[Any]:
-    """The layout of a point, with the fields that are read."""
-    fix = f"Send each field once, within point_step = {layout.point_step}."
-    order = ">" if layout.is_bigendian else "<"
-    found = [field for field in layout.fields if field.name in PCL_FIELDS and field.count <= 1]
-    kinds = {field.name: field.datatype for field in found}
-    if missing := [axis for axis in "xyz" if kinds.get(axis) not in (7, 8)]:
-        value = ", ".join(f"{field.name} of type {field.datatype}" for field in layout.fields)
-        wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
-        raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
-    for field in found:  # NumPy adds them up in 32 bits
-        end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
-        if end > layout.point_step:
-            raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)
-    try:
-        return np.dtype(
-            {
-                "names": [field.name for field in found],
-                "formats": [order + POINT_TYPES[field.datatype] for field in found],
-                "offsets": [field.offset for field in found],
-                "itemsize": layout.point_step,
-            }
-        )
-    except ValueError as error:  # a name that is there twice
-        raise InvalidRequest("point_cloud2.fields", str(error), fix) from None
-
-
 # Depth images
 
 DEPTH_ENCODINGS = {"32FC1": "<f4", "64FC1": "<f8", "16UC1": "<u2"}
 
 
 def read_depth_images(images: object, max_points: int) -> tuple[CloudInput, list[Position]]:
-    """Read views, and fuse them; as `edgegrasp_model.scene.depth` says.
+    """Read views, and fuse them; as `edgegrasp_camera.depth` says.
 
     `images` is a list of DepthImage, as plain values; their `depth` may also be a File.
 

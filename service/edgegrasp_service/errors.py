@@ -3,6 +3,8 @@
 import re
 from dataclasses import dataclass
 
+from edgegrasp_camera.errors import PayloadTooLarge as PayloadTooLarge
+from edgegrasp_camera.errors import UnsupportedMediaType as UnsupportedMediaType
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
 
 STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
@@ -10,14 +12,6 @@ STOPPING = "The server is stopping. Try another one."  # the message of a NotRea
 
 class ServiceError(EdgeGraspError):
     """Base of the service's own errors."""
-
-
-class PayloadTooLarge(InvalidRequest):
-    """A body or a cloud is over the server's limits."""
-
-
-class UnsupportedMediaType(InvalidRequest):
-    """A body is in a format the server does not read."""
 
 
 class Unauthenticated(InvalidRequest):

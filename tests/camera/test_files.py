@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from edgegrasp_camera.files import read_file, read_png
 from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.request_cloud import decode_points
 from edgegrasp_service.errors import PayloadTooLarge
-from edgegrasp_service.worker.formats import read_file, read_png
-from edgegrasp_service.worker.request_cloud import decode_points
 
 POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 MANY = 1000

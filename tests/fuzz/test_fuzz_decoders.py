@@ -13,11 +13,11 @@ from PIL import Image
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 from edgegrasp_model.scene.cloud import check_cloud
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import GIVEN, PER_POINT, File, decode_cloud
 
 from .conftest import (
     DEPTH_IMAGE,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Outcome
-from edgegrasp_model.scene.depth import CameraView, fuse_depth_images
 
 from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, camera, render, table, things
 from .scenes import PANDA, box_on_table, detector
@@ -44,8 +44,8 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
 
 def test_several_depth_images_give_grasps_with_the_defaults() -> None:
     boxes, poses = [table(), *things(1)], [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
-    intrinsics = [FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2]
-    views = [CameraView(intrinsics=intrinsics, T_cloud_camera=pose.tolist()) for pose in poses]
+    intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
+    views = [DepthView(intrinsics, pose) for pose in poses]
     depths = [render(boxes, pose)[..., 2] for pose in poses]
     network = ModelCatalogue.load().get("edgegrasp-plus")
     found = []

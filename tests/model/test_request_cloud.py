@@ -9,19 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from edgegrasp_camera.clouds import POINT_TYPES, CloudInput, read_point_cloud2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
-from edgegrasp_model.scene.cloud import check_cloud
-from edgegrasp_service.errors import PayloadTooLarge
-from edgegrasp_service.worker.request_cloud import (
-    POINT_TYPES,
+from edgegrasp_model.request_cloud import (
     File,
+    PointCloud2,
     decode_array,
     decode_cloud,
     decode_points,
+    parse,
     read_depth_images,
-    read_point_cloud2,
 )
+from edgegrasp_model.scene.cloud import check_cloud
+from edgegrasp_service.errors import PayloadTooLarge
 
 MANY = 100_000
 FX, FY, CX, CY = 60.0, 50.0, 15.5, 11.5
@@ -197,6 +198,11 @@ def test_bad_images(images: object, field: str, value: str) -> None:
 
 # sensor_msgs/PointCloud2
 
+
+def read(fields: dict[str, Any]) -> CloudInput:
+    return read_point_cloud2(parse(PointCloud2, fields, "point_cloud2"), MANY)
+
+
 CODES = {kind: code for code, kind in POINT_TYPES.items()}
 
 
@@ -256,7 +262,7 @@ def test_every_layout_gives_the_points(
     fields = layout(rows, padding, big)
     if text:
         fields["data"] = base64.b64encode(fields["data"]).decode()
-    cloud = read_point_cloud2(fields, MANY)
+    cloud = read(fields)
     expected = xyz(rows) if height > 1 else xyz(rows)[0]
     np.testing.assert_array_equal(cloud.points, expected)
     assert cloud.points.dtype == np.dtype(kind)
@@ -270,7 +276,7 @@ def test_normals_and_colours(kind: str) -> None:
     packed = np.arange(12, dtype=np.uint32).reshape(3, 4) + 0x112200
     rows["rgb"] = packed.view(kind)
     for big in (False, True):
-        cloud = read_point_cloud2(layout(rows, big=big), MANY)
+        cloud = read(layout(rows, big=big))
         np.testing.assert_array_equal(cloud.normals, xyz(rows, names))
         np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
 
@@ -300,7 +306,7 @@ FAR_FIELDS = [
 )
 def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        read_point_cloud2(layout(cloud_of((1, 4))) | changes, MANY)
+        read(layout(cloud_of((1, 4))) | changes)
     assert caught.value.field == field
     assert caught.value.fix
 

@@ -14,14 +14,15 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_camera.clouds import read_point_cloud2
+from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.poses import matrix_from_quaternion, quaternion_from_matrix
 from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_in_scene, on_mask
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
     Float64,
-    matrix_from_quaternion,
     moveit_grasp,
-    quaternion_from_matrix,
 )
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_sim.picture import fork
@@ -40,7 +41,6 @@ ENCODINGS = {  # of sensor_msgs/Image: type of a value, channels
     "32SC1": ("i4", 1),
     "32FC1": ("f4", 1),
 }
-FLOATS = {7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 DELETE_ALL, LINE_LIST = 3, 5  # of visualization_msgs/Marker
 LINE_WIDTH = 0.003  # metres
 KEPT = 30  # images or clouds that a mask may still be of
@@ -188,6 +188,7 @@ def detect(
     Raises:
         GraspClientError: As of the client.
         ValueError: There is no message to detect in, or one that cannot be read.
+        InvalidRequest: A cloud or an image is not what its fields say.
     """
     header = scene.header
     if header is None and object_cloud is not None:
@@ -363,23 +364,9 @@ def cloud_points(cloud: Any) -> Float64:
     """Points (N, 3) of a sensor_msgs/PointCloud2, NaN where there is no reading.
 
     Raises:
-        ValueError: It has no x, y, z of floats.
+        InvalidRequest: It has no x, y, z of floats, or is not whole.
     """
-    known = {field.name: field for field in cloud.fields}
-    xyz = [known.get(name) for name in "xyz"]
-    if any(field is None or field.datatype not in FLOATS for field in xyz):
-        raise ValueError(f"fields: got {', '.join(known) or 'none'}. Send x, y, z of floats.")
-    order = ">" if cloud.is_bigendian else "<"
-    layout = {
-        "names": list("xyz"),
-        "formats": [order + FLOATS[cast("Any", field).datatype] for field in xyz],
-        "offsets": [cast("Any", field).offset for field in xyz],
-        "itemsize": cloud.point_step,
-    }
-    data = np.frombuffer(cloud.data, np.uint8).reshape(cloud.height, cloud.row_step)
-    used = np.ascontiguousarray(data[:, : cloud.width * cloud.point_step])
-    table = used.view(np.dtype(cast("Any", layout))).ravel()
-    return np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
+    return np.reshape(read_point_cloud2(cloud).points, (-1, 3)).astype(np.float64)
 
 
 def matrix_of(transform: Any) -> Float64:
@@ -406,13 +393,8 @@ def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, 
 
 def _depth_points(scene: Scene) -> Float64:
     """Points (N, 3) of the scene's depth image, camera frame; NaN where there is no reading."""
-    depth = depth_array(scene.depth)
-    matrix = camera_matrix(scene.camera)
-    z = depth * (0.001 if depth.dtype.kind == "u" else 1.0)
-    z = np.where(z > 0, z, np.nan)
-    rows, columns = np.indices(depth.shape)
-    x, y = (columns - matrix[0, 2]) / matrix[0, 0], (rows - matrix[1, 2]) / matrix[1, 1]
-    return np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3)
+    intrinsics = intrinsics_of(camera_matrix(scene.camera))
+    return unproject(metres(depth_array(scene.depth)), intrinsics).reshape(-1, 3)
 
 
 def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:

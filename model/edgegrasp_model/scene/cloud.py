@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import least_spread
 from edgegrasp_model.options import MAX_CANDIDATES
@@ -26,21 +27,6 @@ CUBE = 8  # voxels along the edge of a cube whose points follow one another
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
-
-
-@dataclass(frozen=True)
-class CloudInput:
-    """A cloud as a caller sends it; rows are counted row-major where it is organised.
-
-    Per-point arrays have one entry for each point, in the shape of the cloud or flat.
-    """
-
-    points: object  # (N, 3), or (H, W, 3) with NaN where there is no point; float32/64, metres
-    normals: object | None = None  # like points, outward, any length; used as they are
-    colors: object | None = None  # like points; checked, and not used by any network so far
-    segment_ids: object | None = None  # (N,) or (H, W) integers
-    view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
-    warnings: tuple[str, ...] = ()  # what was doubtful when it was read, for the answer
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
@@ -22,7 +23,6 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker import http_bodies, messages, outcomes
 from edgegrasp_service.worker.job import Answer, Facts, Job
 from edgegrasp_service.worker.process import limited_memory
-from edgegrasp_service.worker.request_cloud import GIVEN, decode_array, decode_cloud
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue

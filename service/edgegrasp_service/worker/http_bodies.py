@@ -18,13 +18,13 @@ from werkzeug.exceptions import HTTPException
 from werkzeug.formparser import MultiPartParser
 from werkzeug.http import parse_options_header
 
+from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.request_cloud import CAMERA, GIVEN, PER_POINT, File
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
-from edgegrasp_service.worker.formats import FILE_FORMATS
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import CAMERA, GIVEN, PER_POINT, File
 
 JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}

@@ -15,9 +15,9 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import MAX_CANDIDATES, MAX_ROWS
+from edgegrasp_model.request_cloud import PER_POINT, File
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import PER_POINT, File
 
 MAX_PARTS = 64  # messages in a repeated field; no option takes more
 MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}

@@ -6,11 +6,11 @@ from typing import Any
 import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
+from edgegrasp_model.request_cloud import parse
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.recording import append_line
 from edgegrasp_service.worker.http_bodies import JSON, read_json
 from edgegrasp_service.worker.job import Job
-from edgegrasp_service.worker.request_cloud import parse
 
 
 class TriedGrasp(BaseModel):

@@ -8,11 +8,9 @@ import pytest
 
 import edgegrasp_client as client
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_model import results
-from edgegrasp_model.scene import depth
+from edgegrasp_model import request_cloud, results
 from edgegrasp_service.errors import STATUS
 from edgegrasp_service.front.http import DOCUMENT
-from edgegrasp_service.worker import request_cloud
 
 SCHEMAS = DOCUMENT["components"]["schemas"]
 
@@ -23,8 +21,7 @@ def fields(message: str) -> list[str]:
 
 @pytest.mark.parametrize("name", ["PointCloud2", "PointField", "DepthImage", "Intrinsics", "Depth"])
 def test_clouds(name: str) -> None:
-    where = depth if name == "Intrinsics" else request_cloud
-    assert set(fields(name)) == set(getattr(where, name).model_fields)
+    assert set(fields(name)) == set(getattr(request_cloud, name).model_fields)
     if name != "Depth":
         assert fields(name) == list(getattr(client, name).__annotations__)
 

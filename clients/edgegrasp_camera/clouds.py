@@ -1,0 +1,147 @@
+"""Clouds as arrays: of records whose fields are named, and of sensor_msgs/PointCloud2."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edgegrasp_camera.errors import InvalidRequest, PayloadTooLarge
+
+Array = NDArray[Any]
+Records = NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class CloudInput:
+    """A cloud as a caller sends it; rows are counted row-major where it is organised.
+
+    Per-point arrays have one entry for each point, in the shape of the cloud or flat.
+    """
+
+    points: object  # (N, 3), or (H, W, 3) with NaN where there is no point; float32/64, metres
+    normals: object | None = None  # like points, outward, any length; used as they are
+    colors: object | None = None  # like points; checked, and not used by any network so far
+    segment_ids: object | None = None  # (N,) or (H, W) integers
+    view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
+    warnings: tuple[str, ...] = ()  # what was doubtful when it was read, for the answer
+
+
+class PointField(Protocol):
+    """The attributes of sensor_msgs/PointField."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int
+
+
+class PointCloud2(Protocol):
+    """The attributes of sensor_msgs/PointCloud2, metres; ROS itself is not needed."""
+
+    height: int
+    width: int
+    fields: Sequence[PointField]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: Any  # bytes, or a sequence of their values
+
+
+def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLarge:
+    """The error for more than `max_points` points."""
+    fix = f"Send at most {max_points} points, e.g. downsampled."
+    return PayloadTooLarge(field, f"{count} points", fix)
+
+
+# Records of numbers: the points of PLY and PCD files and of PointCloud2
+
+PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # that are read
+
+
+def cloud_of_records(rows: Records) -> CloudInput:
+    """A cloud of points whose fields are named as PCL and ROS name them.
+
+    Args:
+        rows: (N,) or (H, W) with fields x, y, z; normal_x, normal_y, normal_z, and rgb or rgba
+            (packed in 4 bytes) or red, green, blue, where there are any.
+    """
+    colors = _stacked(rows, "red", "green", "blue")
+    for name in ("rgb", "rgba"):
+        if colors is None and name in (rows.dtype.names or ()) and rows.dtype[name].itemsize == 4:
+            # 0x00RRGGBB, kept in a float32 or uint32
+            packed = np.ascontiguousarray(rows[name]).view(np.uint32)
+            colors = np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1)
+            colors = colors.astype(np.uint8)
+    normals = _stacked(rows, "normal_x", "normal_y", "normal_z")
+    return CloudInput(points=_stacked(rows, "x", "y", "z"), normals=normals, colors=colors)
+
+
+def _stacked(rows: Records, *names: str) -> Array | None:
+    """Fields of the rows side by side; None where one of them is missing."""
+    if not {*names} <= {*(rows.dtype.names or ())}:
+        return None
+    return np.stack([rows[name] for name in names], axis=-1)
+
+
+# sensor_msgs/PointCloud2
+
+POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> CloudInput:
+    """Read x, y, z of a cloud, and normals and colours where there are any.
+
+    Sizes are checked before anything is allocated: the message may be a stranger's.
+
+    Returns:
+        Points (N, 3), or (H, W, 3) where the height is 2 or more.
+
+    Raises:
+        InvalidRequest: A field is missing, unknown or wrong, or they contradict each other.
+        PayloadTooLarge: More than `max_points` points.
+    """
+    if cloud.height * cloud.width > max_points:
+        raise too_many(cloud.height * cloud.width, max_points, "point_cloud2")
+    record = _record(cloud)
+    if cloud.row_step < cloud.width * cloud.point_step:
+        value = f"{cloud.row_step} for {cloud.width} points of {cloud.point_step} bytes"
+        raise InvalidRequest("point_cloud2.row_step", value, "Send width * point_step or more.")
+    expected = cloud.height * cloud.row_step
+    if len(cloud.data) != expected:
+        value = f"{len(cloud.data)} bytes where height * row_step is {expected}"
+        raise InvalidRequest("point_cloud2.data", value, "Send the whole cloud.")
+    shape, strides = (cloud.height, cloud.width), (cloud.row_step, cloud.point_step)
+    if 0 in shape:
+        return CloudInput(np.empty((0, 3), np.float32))
+    rows = np.ndarray(shape, record, cloud.data, strides=strides).astype(record.newbyteorder("="))
+    return cloud_of_records(rows[0] if cloud.height == 1 else rows)
+
+
+def _record(cloud: PointCloud2) -> np.dtype[Any]:
+    """The layout of a point, with the fields that are read."""
+    fix = f"Send each field once, within point_step = {cloud.point_step}."
+    order = ">" if cloud.is_bigendian else "<"
+    found = [field for field in cloud.fields if field.name in PCL_FIELDS and field.count <= 1]
+    kinds = {field.name: field.datatype for field in found}
+    if missing := [axis for axis in "xyz" if kinds.get(axis) not in (7, 8)]:
+        value = ", ".join(f"{field.name} of type {field.datatype}" for field in cloud.fields)
+        wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
+        raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
+    for field in found:  # NumPy adds them up in 32 bits
+        end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
+        if end > cloud.point_step:
+            raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)
+    try:
+        return np.dtype(
+            {
+                "names": [field.name for field in found],
+                "formats": [order + POINT_TYPES[field.datatype] for field in found],
+                "offsets": [field.offset for field in found],
+                "itemsize": cloud.point_step,
+            }
+        )
+    except ValueError as error:  # a name that is there twice
+        raise InvalidRequest("point_cloud2.fields", str(error), fix) from None
