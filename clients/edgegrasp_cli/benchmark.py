@@ -76,7 +76,6 @@ class BenchmarkFlags(Cluster):
     model: str = Field(
         "", description="Weights to use: a name or a .safetensors file; empty: the default"
     )
-    patience: float = Field(300.0, description="Seconds to keep asking a server that is away")
     output: Path | None = Field(
         None,
         description="Folder for manifest, attempts, figures, report. The same again resumes",
@@ -158,7 +157,6 @@ def _plan(
         rules,
         asked.objects.resolve() if asked.objects is not None else None,
         asked.split,
-        asked.patience,
         chosen.name,
         hand,
     )
@@ -267,8 +265,6 @@ def _progress(
             came.append(done)
             successes, attempts, objects = count(came).sum(axis=1)
             text = f"{config.scene.value} GSR {successes}/{attempts} DR {successes}/{objects}"
-            if retries := sum(each.retries for each in came):
-                text += f" asked again {retries} times"
             progress.update(bar, advance=1, description=text)
 
         yield on_round
@@ -299,8 +295,3 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")
-    if summary["planner_retries"]:
-        console.print(
-            f"the planner was unavailable and asked again {summary['planner_retries']} times, "
-            f"waiting {summary['planner_waited_seconds']:.1f} s"
-        )

@@ -25,7 +25,7 @@ from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.scene import PACKED, PILE, REST
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import TABLE_FRICTION
-from edgegrasp_sim.trial import MIN_POINTS, PATIENCE, Planner, Round, run_round
+from edgegrasp_sim.trial import MIN_POINTS, Planner, Round, run_round
 from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
@@ -45,7 +45,6 @@ class BenchmarkConfig:
         seeds: with a round's number, a seed gives the round's scene, views and noise.
         objects: folder in the layout `<scene>/<split>/*.urdf`; the built-in set if None.
         split: of that folder.
-        patience: seconds to keep asking a planner that is unavailable.
         engine: to simulate with; by default see `choose_engine`, with the protocol's.
         gripper: the fields of a gripper file; by default the Panda's hand.
     """
@@ -56,7 +55,6 @@ class BenchmarkConfig:
     protocol: Protocol = field(default_factory=lambda: load_protocol("edgegrasp"))
     objects: Path | None = None
     split: str = "test"
-    patience: float = PATIENCE
     engine: str = ""
     gripper: dict[str, Any] | None = None
 
@@ -110,7 +108,6 @@ def run_benchmark(
     Raises:
         ValueError: `workers` below 1, or the planner's pose is no rigid transform.
         FileNotFoundError: the object folder does not hold the scene.
-        PlannerUnavailableError: the planner stayed away for longer than the patience.
         RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """
     digest = config.object_set().digest  # fails here on a wrong folder, not in every worker
@@ -219,7 +216,6 @@ class RoundRunner:
             config.protocol,
             seed=seed,
             index=index,
-            patience=config.patience,
         )
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from edgegrasp_sim.camera import TableView, ViewRange
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.sensor import SENSORS, DepthNoise, DepthSensor, random_sensor
-from edgegrasp_sim.surroundings import OPEN_THICKNESS, SIZE, TABLE_HEIGHT
+from edgegrasp_sim.surroundings import OPEN_THICKNESS
 
 FOLDER = Path(__file__).parent / "protocols"
 TABLES = get_args(TableView)
@@ -26,28 +26,16 @@ class SceneRules:
     """What stands on the table.
 
     Attributes:
-        workspace_size: edge of the cube of packed and pile scenes, metres.
-        table_height: metres.
         num_objects: how many objects to try to place, in turn from round to round.
         packed_scale: range of the factor on the objects' size in packed scenes and on tables.
         pile_scale: the same for piles and bins.
         table_thickness: of packed and pile scenes, metres.
     """
 
-    workspace_size: float
-    table_height: float
     num_objects: tuple[int, ...]
     packed_scale: Range
     pile_scale: Range
     table_thickness: float = OPEN_THICKNESS
-
-    def __post_init__(self) -> None:
-        # The simulated workspace has a fixed size; a protocol only records it.
-        if (self.workspace_size, self.table_height) != (SIZE, TABLE_HEIGHT):
-            raise ValueError(
-                f"workspace_size is {self.workspace_size} and table_height {self.table_height}; "
-                f"the simulator has {SIZE} and {TABLE_HEIGHT}"
-            )
 
     def scale(self, kind: SceneKind) -> Range:
         """The range of scales of a kind of scene."""

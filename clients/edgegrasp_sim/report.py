@@ -75,7 +75,6 @@ def _key_figures(summary: dict[str, Any]) -> list[Row]:
         ("of those another object than the one aimed at", summary["wrong_object_successes"]),
         ("objects", summary["objects"]),
         ("planning, median", f"{times['median']:.2f} s" if times else "-"),
-        ("planner asked again", f"{summary['planner_retries']} times"),
     ]
 
 

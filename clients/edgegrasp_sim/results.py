@@ -160,8 +160,6 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         }
         if planning
         else None,
-        "planner_retries": sum(item.retries for item in rounds),
-        "planner_waited_seconds": sum(item.waited_seconds for item in rounds),
         "objects_by_name": by_object(rounds),
         "attempts_digest": attempts_digest(rounds),
     }
@@ -202,7 +200,7 @@ def attempts_digest(rounds: Sequence[Round]) -> str:
     """SHA-256 of all but wall-clock times and the objects' widths; equal for equal attempts."""
     tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
     for table in tables:
-        del table["retries"], table["waited_seconds"], table["too_wide"]
+        del table["too_wide"]
         for attempt in table["attempts"]:
             del attempt["planning_seconds"]
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()

@@ -19,8 +19,6 @@ from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
 
 MIN_POINTS = 100
-FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0  # seconds between tries of a planner that is unavailable
-PATIENCE = 300.0  # seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +39,6 @@ class PlannedGrasp:
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if
 # there is none. A planner may have a method `close`, called after the last round.
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
-
-
-class PlannerUnavailableError(Exception):
-    """Raised by planners when asking again may help, as when a server restarts."""
 
 
 class RoundEnd(StrEnum):
@@ -113,8 +107,6 @@ class Round:
         no_grasp: how often the planner found no grasp; not counted as attempts, as in the
             reference.
         end: why the round ended.
-        retries: how often the planner had to be asked again because it was unavailable.
-        waited_seconds: spent on that.
         too_wide: names of the objects that no grasp can hold: the hand does not open that far.
     """
 
@@ -124,8 +116,6 @@ class Round:
     attempts: tuple[Attempt, ...]
     no_grasp: int
     end: RoundEnd
-    retries: int = 0
-    waited_seconds: float = 0.0
     too_wide: tuple[str, ...] = ()
 
     @property
@@ -142,13 +132,12 @@ def run_round(
     *,
     seed: int,
     index: int,
-    patience: float = PATIENCE,
 ) -> Round:
     """Run one round with a planner.
 
     See `RoundDriver` for the other arguments, and errors.
     """
-    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index, patience=patience)
+    driver = RoundDriver(simulation, scene, protocol, seed=seed, index=index)
     while driver.end is None:
         observation = driver.look()
         if driver.end is not None:
@@ -170,7 +159,6 @@ class RoundDriver:
         protocol: objects, camera, noise and what ends the round.
         seed: not negative.
         index: number of the round, not negative.
-        patience: seconds to keep asking a planner that is unavailable.
 
     Raises:
         ValueError: unknown scene, or a negative seed or index.
@@ -184,11 +172,10 @@ class RoundDriver:
         *,
         seed: int,
         index: int,
-        patience: float = PATIENCE,
     ) -> None:
         if seed < 0 or index < 0:
             raise ValueError(f"seed is {seed} and index {index}; pass numbers of 0 or more")
-        self.simulation, self.protocol, self.patience = simulation, protocol, patience
+        self.simulation, self.protocol = simulation, protocol
         self._camera = random_stream(seed, index, Stream.CAMERA)
         self._noise = random_stream(seed, index, Stream.NOISE)
         self._policy = random_stream(seed, index, Stream.POLICY)
@@ -231,29 +218,10 @@ class RoundDriver:
         return self._seen
 
     def plan(self, planner: Planner, observation: Observation) -> PlannedGrasp | None:
-        """Ask the planner, repeatedly while it is unavailable; None if it finds no grasp.
-
-        Raises:
-            PlannerUnavailableError: it was unavailable for longer than `patience`.
-        """
+        """Ask the planner; None if it finds no grasp."""
         seed = int(self._policy.integers(2**31))
-        waited, pause = 0.0, FIRST_WAIT
-        while True:
-            started = time.perf_counter()
-            try:
-                grasp = planner(observation, seed)
-                break
-            except PlannerUnavailableError:
-                if waited >= self.patience:
-                    raise
-            time.sleep(pause)
-            seconds, pause = time.perf_counter() - started, min(2 * pause, LONGEST_WAIT)
-            waited += seconds
-            self._round = replace(
-                self._round,
-                retries=self._round.retries + 1,
-                waited_seconds=self._round.waited_seconds + seconds,
-            )
+        started = time.perf_counter()
+        grasp = planner(observation, seed)
         self._planning_seconds = time.perf_counter() - started
         if grasp is None:
             self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)

@@ -139,7 +139,6 @@ def test_a_server_killed_and_restarted_changes_nothing(
         again = benchmark(shaken, "server", "--server", first.grpc_address, rounds=3)
         thread.join()
     assert again["attempts_digest"] == calm["attempts_digest"]
-    assert again["planner_retries"] > 0 == calm["planner_retries"]
 
 
 def test_a_server_that_asks_for_a_token_gets_it(

@@ -20,7 +20,6 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.results import ResultFolder, attempts_digest
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trial import PlannerUnavailableError
 
 PAPER = load_protocol("edgegrasp")
 TWO_OBJECTS = replace(PAPER, scene=replace(PAPER.scene, num_objects=(2,)))
@@ -33,7 +32,6 @@ DIES_ONCE = """
 import os, signal
 from pathlib import Path
 from edgegrasp_sim.top_down import plan_top_down
-from edgegrasp_sim.trial import PlannerUnavailableError
 
 MARK = Path(__file__).with_suffix(".died")
 
@@ -118,7 +116,7 @@ def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
 # Starting a Ray cluster leaves sockets and processes to the garbage collector.
 @pytest.mark.parametrize(
     ("error", "expected", "message"),
-    [("RayTaskError", PlannerUnavailableError, "gone"), ("NodeDiedError", RuntimeError, "again")],
+    [("RayTaskError", ConnectionError, "gone"), ("NodeDiedError", RuntimeError, "again")],
 )
 def test_errors_on_a_cluster_are_those_of_a_process_here(
     alone: tuple[BenchmarkConfig, str],
@@ -129,7 +127,7 @@ def test_errors_on_a_cluster_are_those_of_a_process_here(
 ) -> None:
     ray = pytest.importorskip("ray", reason="the extra `ray` is not installed")
     kind = getattr(ray.exceptions, error)
-    cause = PlannerUnavailableError("gone for good")
+    cause = ConnectionError("gone for good")
     fake = MagicMock(exceptions=ray.exceptions)
     fake.cluster_resources.return_value = {"CPU": 1.0}
     failed = kind("run", "traceback", cause) if error == "RayTaskError" else kind("its machine")

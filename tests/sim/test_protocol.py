@@ -39,7 +39,6 @@ def test_the_side_view_is_where_giga_has_it() -> None:
             'table = "guess"',
             "table is 'guess'; choose one of known, seen, around",
         ),
-        ("workspace_size = 0.30", "workspace_size = 0.5", "workspace_size is 0.5"),
         ("version = 2", "version = ", "protocol .*toml"),
     ],
 )

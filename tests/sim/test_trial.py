@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim import trial
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause, GraspOutcome
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
@@ -17,7 +16,6 @@ from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import (
     PlannedGrasp,
     Planner,
-    PlannerUnavailableError,
     Round,
     RoundDriver,
     RoundEnd,
@@ -107,33 +105,6 @@ def test_a_round_repeats_exactly(run: Callable[..., Round]) -> None:
     assert attempts_digest([first]) == attempts_digest([again]) != attempts_digest([other])
     with pytest.raises(ValueError, match="seed is -1"):
         run(plan_top_down, PILE, 3, seed=-1)
-
-
-def test_an_unavailable_planner_is_asked_again_and_changes_nothing(run, monkeypatch) -> None:
-    monkeypatch.setattr(trial, "FIRST_WAIT", 0.001)
-    asked = 0
-
-    def away_at_times(seen: Observation, seed: int) -> PlannedGrasp | None:
-        nonlocal asked
-        asked += 1
-        if asked % 3:
-            raise PlannerUnavailableError("restarting")
-        return plan_top_down(seen, seed)
-
-    calm = run(plan_top_down, PACKED, 2)
-    interrupted = run(away_at_times, PACKED, 2)
-    assert attempts_digest([calm]) == attempts_digest([interrupted])
-    assert calm.retries == 0
-    assert interrupted.retries == 2 * len(interrupted.attempts)
-    assert interrupted.waited_seconds > 0
-
-
-def test_patience_with_an_unavailable_planner_ends(run: Callable[..., Round]) -> None:
-    def away(seen: Observation, seed: int) -> None:
-        raise PlannerUnavailableError("gone for good")
-
-    with pytest.raises(PlannerUnavailableError, match="gone for good"):
-        run(away, PACKED, 1, patience=0.0)
 
 
 @pytest.mark.parametrize("name", ["giga", "vgn", "table"])

@@ -123,7 +123,7 @@ def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlann
             used = model_used(client, model)
         asked = {"model": model, **choice.options}
         yield ChosenPlanner(
-            partial(ServerPlanner, address, rules, asked, used.digest, choice.connection),
+            partial(ServerPlanner, address, rules, asked, choice.connection),
             {
                 "name": "server",
                 "model": used.name,
