@@ -117,14 +117,12 @@ def run_grasp(
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
+
+    def failed(cause: FailureCause, outcome: GraspOutcome = GraspOutcome.AFTER) -> GraspResult:
+        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
+
     if start_contact and start_contact_fails:
-        outcome, cause = GraspOutcome.PREGRASP, FailureCause.START_COLLISION
-        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
-
-    def failed(cause: FailureCause) -> GraspResult:
-        outcome = GraspOutcome.AFTER
-        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
-
+        return failed(FailureCause.START_COLLISION, GraspOutcome.PREGRASP)
     if _cut_into(gripper) & obstacles:
         return failed(FailureCause.START_COLLISION)
     collided = False
@@ -144,14 +142,14 @@ def run_grasp(
                 return result
             still = _holds_when_shaken(gripper, T_world_hand, held, objects)
             return replace(result, held_after_shaking=still)
-    applies = {
-        FailureCause.START_COLLISION: start_contact,
-        FailureCause.APPROACH_COLLISION: collided,
-        FailureCause.MISSED: missed or not caught,
-        FailureCause.WRONG_OBJECT: target is not None and target not in caught,
-        FailureCause.SLIPPED: True,
-    }
-    return failed(next(cause for cause, holds in applies.items() if holds))
+    if start_contact:
+        return failed(FailureCause.START_COLLISION)
+    if collided:
+        return failed(FailureCause.APPROACH_COLLISION)
+    if missed or not caught:
+        return failed(FailureCause.MISSED)
+    wrong = target is not None and target not in caught
+    return failed(FailureCause.WRONG_OBJECT if wrong else FailureCause.SLIPPED)
 
 
 def retreat_pose(T_world_hand: Matrix) -> Matrix:

@@ -33,7 +33,7 @@ def table(half_width: float = 0.5, half_depth: float = 0.4) -> SolidBox:
     return box((0, 0, -0.015), (half_width, half_depth, 0.015))
 
 
-FURNITURE = {
+BACKGROUND = {
     "floor": [box((0, 0, -0.75), (4, 4, 0.05))],
     "wall": [box((0, 0.5, 0.4), (3, 0.05, 1.6))],
     "monitor": [box((-0.38, 0.05, 0.2), (0.03, 0.25, 0.2))],
@@ -52,7 +52,7 @@ def bin_walls(length: float, width: float, height: float, wall: float = 0.005) -
     ]
 
 
-def things(seed: int, count: int = 4) -> list[SolidBox]:
+def boxes_on_table(seed: int, count: int = 4) -> list[SolidBox]:
     """Boxes a hand can grasp, standing apart from each other on z = 0."""
     rng = np.random.default_rng(seed)
     placed: list[SolidBox] = []

@@ -123,7 +123,7 @@ class BulletScene:
         return self.world.createMultiBody(0, shape)
 
     def distance(self, T_world_hand: np.ndarray, within: float) -> float:
-        """Signed distance of the hand to the nearest thing, at most `within`."""
+        """Signed distance of the hand to the nearest surface, at most `within`."""
         quaternion = Rotation.from_matrix(T_world_hand[:3, :3]).as_quat()
         found = [within]
         for part in self.hand:

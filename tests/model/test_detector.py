@@ -15,7 +15,7 @@ from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import Detection, Outcome
 
-from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, camera, render, table, things
+from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, boxes_on_table, camera, render, table
 from .scenes import PANDA, box_on_table, detector
 
 CLOUD = box_on_table()
@@ -43,7 +43,8 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
 
 
 def test_several_depth_images_give_grasps_with_the_defaults() -> None:
-    boxes, poses = [table(), *things(1)], [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
+    boxes = [table(), *boxes_on_table(1)]
+    poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
     intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
     views = [DepthView(intrinsics, pose) for pose in poses]
     depths = [render(boxes, pose)[..., 2] for pose in poses]
@@ -59,7 +60,7 @@ def test_several_depth_images_give_grasps_with_the_defaults() -> None:
 
 
 def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:
-    cloud = render([table(), *things(1)], camera(0.7, 0.0, 0.9)).reshape(-1, 3)
+    cloud = render([table(), *boxes_on_table(1)], camera(0.7, 0.0, 0.9)).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     network = ModelCatalogue.load().get("edgegrasp-plus")
     told = network.detect(cloud, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
@@ -70,7 +71,7 @@ def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:
 
 
 def test_one_of_the_objects_by_number_by_pixel_or_by_place() -> None:
-    boxes, pose = things(1), camera(0.7, 0.0, 0.9)
+    boxes, pose = boxes_on_table(1), camera(0.7, 0.0, 0.9)
     image = render([table(), *boxes], pose)
     network = ModelCatalogue.load().get("edgegrasp-plus")
 

@@ -1,4 +1,4 @@
-"""What holds for every scene, however its objects are told from what is around them."""
+"""What holds for every scene, however its objects are distinguished from the background."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,13 @@ from edgegrasp_model.results import SUPPORT, Detection
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_sim.segmentation import Segmentation, compare
 
-from .rendered import FURNITURE, SolidBox, box, camera, render, table, things
+from .rendered import BACKGROUND, SolidBox, box, boxes_on_table, camera, render, table
 from .scenes import detector
 
 ORIGIN = (0.0, 0.0, 0.0)
 CARTON = box((0.02, 0.36, 0.12), (0.28, 0.11, 0.12), 0.2)
 PANEL = box((0.0, 0.22, 0.06), (0.3, 0.015, 0.06))  # too long for an object, thin enough for a hand
-ADDED = {"wall": FURNITURE["wall"], "floor": FURNITURE["floor"], "carton": [CARTON]}
+ADDED = {"wall": BACKGROUND["wall"], "floor": BACKGROUND["floor"], "carton": [CARTON]}
 
 
 def ask(cloud: object, **fields: object) -> Detection:
@@ -41,7 +41,7 @@ def told_apart(
 @pytest.mark.parametrize("added", sorted(ADDED))
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_wall_a_floor_or_a_carton_changes_no_object(seed: int, added: str) -> None:
-    objects, pose = things(seed), camera(0.75, -1.4 + 0.2 * seed, 0.85)
+    objects, pose = boxes_on_table(seed), camera(0.75, -1.4 + 0.2 * seed, 0.85)
     for others in ([table()], [table(), *ADDED[added]]):
         found = ask(render([*objects, *others], pose))
         seen = told_apart(found, objects, others, pose)
@@ -50,7 +50,7 @@ def test_a_wall_a_floor_or_a_carton_changes_no_object(seed: int, added: str) -> 
 
 @pytest.mark.parametrize("roll", [0.5, np.pi])
 def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> None:
-    scene, pose = [table(), *things(4)], camera(0.6, -1.2, 0.9)
+    scene, pose = [table(), *boxes_on_table(4)], camera(0.6, -1.2, 0.9)
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
     places, planes = [], []
@@ -67,12 +67,12 @@ def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> No
 
 
 def test_new_noise_leaves_the_number_of_objects() -> None:
-    scene, pose = [table(), *FURNITURE["wall"], *things(5)], camera(0.7, -1.3, 0.9)
+    scene, pose = [table(), *BACKGROUND["wall"], *boxes_on_table(5)], camera(0.7, -1.3, 0.9)
     assert {len(ask(render(scene, pose, seed)).objects) for seed in range(4)} == {4}
 
 
 def test_stray_readings_are_left_out_and_never_a_reason_to_refuse() -> None:
-    scene, pose = [table(), *things(6)], camera(0.6, -1.2, 0.9)
+    scene, pose = [table(), *boxes_on_table(6)], camera(0.6, -1.2, 0.9)
     cloud = render(scene, pose)
     rng = np.random.default_rng(0)
     rows, columns = rng.integers(0, 240, 60), rng.integers(0, 320, 60)
@@ -81,7 +81,7 @@ def test_stray_readings_are_left_out_and_never_a_reason_to_refuse() -> None:
 
 
 def test_a_mask_of_the_caller_wins() -> None:
-    objects, pose = things(2), camera(0.75, -1.5, 0.9)
+    objects, pose = boxes_on_table(2), camera(0.75, -1.5, 0.9)
     boxes = [PANEL, table(), *objects]
     cloud = render(boxes, pose)
     mask = seen_box(boxes, pose) == 0
@@ -98,7 +98,7 @@ def test_a_mask_of_the_caller_wins() -> None:
 
 
 def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:
-    objects, pose = things(7), camera(0.7, -1.2, 0.85)
+    objects, pose = boxes_on_table(7), camera(0.7, -1.2, 0.85)
     boxes = [table(), *objects]
     found = ask(render(boxes, pose))
     assert found.debug is not None
@@ -123,7 +123,7 @@ def flat(distance: float) -> np.ndarray:
     return (rays * depth[..., None]).astype(np.float32)
 
 
-SCENE = render([table(), *things(3)], camera(0.7, -1.2, 0.85))
+SCENE = render([table(), *boxes_on_table(3)], camera(0.7, -1.2, 0.85))
 NO_SCENES = {
     "one pixel": SCENE[120:121, 160:161],
     "holes": np.full_like(SCENE, np.nan),

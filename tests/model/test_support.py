@@ -19,11 +19,11 @@ CAMERA = np.array([0.0, -0.5, 0.4])
 PLANE = {"normal": (0.0, 0.0, 1.0), "offset": 0.05, "max_depth_error": 0.12}
 
 
-def scene(rng: np.random.Generator, table: int = 2000, things: int = 1000) -> np.ndarray:
+def scene(rng: np.random.Generator, table: int = 2000, on_table: int = 1000) -> np.ndarray:
     """A table at z = 0.05, and on it a box with a level lid 0.06 above."""
     flat = rng.uniform(-0.15, 0.15, (table, 3)) * (1, 1, 0)
-    box = rng.uniform(-0.05, 0.05, (things, 3)) + np.array([0, 0, 0.05])
-    box[: things // 2, 2] = 0.06
+    box = rng.uniform(-0.05, 0.05, (on_table, 3)) + np.array([0, 0, 0.05])
+    box[: on_table // 2, 2] = 0.06
     points = np.concatenate([flat, box]) + np.array([0, 0, 0.05])
     return points + rng.normal(0, 0.001, points.shape)
 
@@ -86,11 +86,11 @@ def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.n
 @given(
     seed=st.integers(0, SEED),
     factor=st.floats(0.9, 1.1),
-    things=st.sampled_from([0, 1000, 4000, 12_000]),
+    on_table=st.sampled_from([0, 1000, 4000, 12_000]),
 )
-def test_the_factor_is_found_in_any_frame(seed: int, factor: float, things: int) -> None:
+def test_the_factor_is_found_in_any_frame(seed: int, factor: float, on_table: int) -> None:
     rng = np.random.default_rng(seed)
-    points = seen(scene(rng, things=things), factor)
+    points = seen(scene(rng, on_table=on_table), factor)
     turn, shift = Rotation.random(rng=rng), rng.uniform(-1, 1, 3)
     x, y, z = turn.apply(PLANE["normal"]).tolist()
     offset = 0.05 + float(np.dot((x, y, z), shift))
@@ -101,7 +101,7 @@ def test_the_factor_is_found_in_any_frame(seed: int, factor: float, things: int)
     assert scale == pytest.approx(1.0 / factor, abs=0.003)
 
 
-SCENE, BARE = scene(np.random.default_rng(0)), scene(np.random.default_rng(0), things=0)
+SCENE, BARE = scene(np.random.default_rng(0)), scene(np.random.default_rng(0), on_table=0)
 
 
 @pytest.mark.parametrize(

@@ -124,8 +124,8 @@ def test_prepared_meshes_are_cached_by_content(meshes: Path, cache: Path, tmp_pa
 )
 def test_a_file_without_a_solid_is_refused(cache, tmp_path, content, message) -> None:
     pytest.importorskip("coacd", reason="the extra `meshes` is not installed")
-    (tmp_path / "thing.obj").write_text(content)
-    with pytest.raises(ValueError, match=rf"thing\.obj.*({message})"):
+    (tmp_path / "shape.obj").write_text(content)
+    with pytest.raises(ValueError, match=rf"shape\.obj.*({message})"):
         ObjectSet.from_folder(tmp_path, SceneKind.PILE)
 
 

@@ -18,7 +18,7 @@ CUBE = Path(__file__).parent / "cube.urdf"  # 0.05 m
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 FRONT = look_at(np.array([0.6, 0.15, 0.6]), np.array([0.15, 0.15, 0.05]))  # T_world_camera
 # The reference agrees with itself in 92 to 100 % of packed and 85 to 95 % of pile labels.
-# MuJoCo differs where a hand runs into things; half of the grasps do.
+# MuJoCo differs where a hand collides; half of the grasps do.
 LEAST_AGREEMENT = {
     ("pybullet", SceneKind.PACKED): 0.90,
     ("pybullet", SceneKind.PILE): 0.82,
