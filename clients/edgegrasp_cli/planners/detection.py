@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_cli.flags import connect
-from edgegrasp_client import GraspClient, GraspClientError, Model
+from edgegrasp_client import GraspClient, GraspClientError, Model, ServerUnavailableError
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
 from edgegrasp_sim.trial import PlannedGrasp
 
-REQUEST_SECONDS = 300.0  # of a request with its repetitions
+REQUEST_SECONDS = 300.0
 MAX_DEPTH_ERROR = 0.12  # of views that show the table; more than any protocol's noise
 
 
 @dataclass
 class ServerPlanner:
-    """Asks a server for the best grasp of each observation.
-
-    The client repeats a request while the server is away, as during a restart.
-    """
+    """Asks a server for the best grasp of each observation; waits for one that restarts."""
 
     address: str  # host:port (gRPC) or http://host:port
     rules: PlanningRules  # of the protocol
@@ -40,8 +38,14 @@ class ServerPlanner:
         if self._client is None:
             self._client = connect(self.address, REQUEST_SECONDS, **self.connection)
         options = request_options(observation, seed, self.rules, self.options)
-        ids = view_ids(observation)
-        return _best(self._client.detect(observation.image, view_ids=ids, **options).grasps)
+        ask = partial(
+            self._client.detect, observation.image, view_ids=view_ids(observation), **options
+        )
+        try:
+            return _best(ask().grasps)
+        except ServerUnavailableError:
+            self._client.wait_until_ready(REQUEST_SECONDS)
+            return _best(ask().grasps)
 
     def close(self) -> None:
         """Close the connection."""
