@@ -108,103 +108,84 @@ def load_object(
     return SceneObject(model, scale, body)
 
 
-def make_packed(
-    world: World,
-    surroundings: Surroundings,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-) -> list[SceneObject]:
+class Layout(NamedTuple):
+    """What a scene is made of.
+
+    Attributes:
+        world: gets the objects; the surroundings are there already.
+        surroundings: what stays as it is.
+        objects: to draw from.
+        rng: source of the draws.
+        num_objects: how many to try to place.
+        scales: range of the factor on their size.
+    """
+
+    world: World
+    surroundings: Surroundings
+    objects: ObjectSet
+    rng: np.random.Generator
+    num_objects: int
+    scales: tuple[float, float]
+
+
+def make_packed(layout: Layout) -> list[SceneObject]:
     """Stand objects upright on the table, each where it touches no other.
 
     `PACKED.attempts` objects are drawn, so that a scene may hold fewer than asked for.
     """
+    rng = layout.rng
     placed: list[SceneObject] = []
     for _ in range(PACKED.attempts):
-        if len(placed) >= num_objects:
+        if len(placed) >= layout.num_objects:
             break
-        model = objects.sample(rng)
+        model = layout.objects.sample(rng)
         x, y = rng.uniform(*PACKED.range, size=2)
-        quaternion = _upright(rng)
-        scale = float(rng.uniform(*scales))
-        placed = _place(world, surroundings, placed, model, (x, y), quaternion, scale)
+        placed = _place(layout, placed, model, (x, y), _upright(rng))
     return placed
 
 
-def make_table(
-    world: World,
-    surroundings: Surroundings,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-) -> list[SceneObject]:
+def make_table(layout: Layout) -> list[SceneObject]:
     """Put objects on a table or a shelf beside what is there: most upright, some as they fall.
 
     `CROWD.attempts` objects are drawn for each, so that there may be fewer than asked for.
     """
+    rng, reach = layout.rng, np.array(layout.surroundings.reach)
     placed: list[SceneObject] = []
-    for _ in range(CROWD.attempts * num_objects):
-        if len(placed) >= num_objects:
+    for _ in range(CROWD.attempts * layout.num_objects):
+        if len(placed) >= layout.num_objects:
             break
-        model = objects.sample(rng)
-        reach = np.array(surroundings.reach)
+        model = layout.objects.sample(rng)
         x, y = MIDDLE + rng.uniform(-reach, reach, size=2)
         lying = rng.random() < CROWD.lying_share
         quaternion = Rotation.random(rng=rng).as_quat().tolist() if lying else _upright(rng)
-        scale = float(rng.uniform(*scales))
-        placed = _place(world, surroundings, placed, model, (x, y), quaternion, scale)
+        placed = _place(layout, placed, model, (x, y), quaternion)
     return placed
 
 
-def make_bin(
-    world: World,
-    surroundings: Surroundings,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-) -> list[SceneObject]:
+def make_bin(layout: Layout) -> list[SceneObject]:
     """Drop objects into a bin one after another; those that do not fit in it are taken away."""
-    drop = _over_bin(surroundings, scales, POUR.margin)
-    return settle(world, _drop(world, objects, rng, num_objects, drop), surroundings)
+    dropped = _pour(layout, layout.num_objects, POUR.margin)
+    return settle(layout.world, dropped, layout.surroundings)
 
 
-def make_full_bin(
-    world: World,
-    surroundings: Surroundings,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-) -> list[SceneObject]:
+def make_full_bin(layout: Layout) -> list[SceneObject]:
     """Pour objects into a bin, all over it, until they hide its floor, or are as many as asked."""
     placed: list[SceneObject] = []
-    drop = _over_bin(surroundings, scales, POUR.full_margin)
-    while len(placed) < num_objects and _covered(world, surroundings, placed) < POUR.covered:
-        number = min(POUR.at_once, num_objects - len(placed))
-        new = _drop(world, objects, rng, number, drop)
-        placed = settle(world, [*placed, *new], surroundings)
+    while len(placed) < layout.num_objects and _covered(layout, placed) < POUR.covered:
+        new = _pour(layout, min(POUR.at_once, layout.num_objects - len(placed)), POUR.full_margin)
+        placed = settle(layout.world, [*placed, *new], layout.surroundings)
     return placed
 
 
-def make_pile(
-    world: World,
-    surroundings: Surroundings,
-    objects: ObjectSet,
-    rng: np.random.Generator,
-    num_objects: int,
-    scales: tuple[float, float],
-) -> list[SceneObject]:
+def make_pile(layout: Layout) -> list[SceneObject]:
     """Drop objects into an open box one after another, then take the box away."""
-    walls = [box.add_to(world) for box in _pile_box()]
+    walls = [box.add_to(layout.world) for box in _pile_box()]
     where = np.full(2, SIZE / 3), np.full(2, 2 * SIZE / 3)
-    drop = Drop(scales, where, TABLE_HEIGHT + PILE.drop_height, PILE.seconds)
-    dropped = _drop(world, objects, rng, num_objects, drop)
+    height = TABLE_HEIGHT + PILE.drop_height
+    dropped = _drop(layout, layout.num_objects, where, height, PILE.seconds)
     for wall in walls:
         wall.remove()
-    return settle(world, dropped, surroundings)
+    return settle(layout.world, dropped, layout.surroundings)
 
 
 def wait_for_rest(world: World, objects: Sequence[SceneObject], seconds: float) -> None:
@@ -236,45 +217,46 @@ def settle(
         remaining = [item for item in remaining if item not in outside]
 
 
-class Drop(NamedTuple):
-    """How objects are dropped."""
-
-    scales: tuple[float, float]  # range of the factor on their size
-    where: tuple[Matrix, Matrix]  # lowest and highest x and y, (2,) each, metres
-    height: float  # z that they are dropped from, metres
-    seconds: float  # given to each to come to rest
-
-
-def _over_bin(surroundings: Surroundings, scales: tuple[float, float], share: float) -> Drop:
-    """Over a bin, except for a share of its length and width along each side."""
-    low, high = np.asarray(surroundings.bounds)[:, :2]
+def _pour(layout: Layout, number: int, share: float) -> list[SceneObject]:
+    """Drop objects into a bin, except for a share of its length and width along each side."""
+    low, high = np.asarray(layout.surroundings.bounds)[:, :2]
     margin = share * (high - low)
-    walls = max(box.centre[2] + box.size[2] / 2 for box in surroundings.boxes)
-    return Drop(scales, (low + margin, high - margin), walls + POUR.drop_height, POUR.seconds)
+    walls = max(box.centre[2] + box.size[2] / 2 for box in layout.surroundings.boxes)
+    where = low + margin, high - margin
+    return _drop(layout, number, where, walls + POUR.drop_height, POUR.seconds)
 
 
-def _covered(world: World, surroundings: Surroundings, placed: Sequence[SceneObject]) -> float:
+def _covered(layout: Layout, placed: Sequence[SceneObject]) -> float:
     """The share of a bin's floor that objects hide from above."""
-    low, high = np.asarray(surroundings.bounds)[:, :2]
+    low, high = np.asarray(layout.surroundings.bounds)[:, :2]
     steps = (np.arange(POUR.rays) + 0.5) / POUR.rays
     place = low + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (high - low)
     starts, ends = (np.insert(place, 2, z, axis=1) for z in (1.0, TABLE_HEIGHT - 0.01))
-    hits = world.first_hits(starts, ends)
+    hits = layout.world.first_hits(starts, ends)
     return float(np.isin(hits, [item.body.uid for item in placed]).mean())
 
 
 def _drop(
-    world: World, objects: ObjectSet, rng: np.random.Generator, num_objects: int, drop: Drop
+    layout: Layout, number: int, where: tuple[Matrix, Matrix], height: float, seconds: float
 ) -> list[SceneObject]:
-    """Drop objects, turned any way, one after another."""
+    """Drop objects, turned any way, one after another.
+
+    Args:
+        layout: of the scene.
+        number: how many.
+        where: lowest and highest x and y, (2,) each, metres.
+        height: z that they are dropped from, metres.
+        seconds: given to each to come to rest.
+    """
+    rng = layout.rng
     dropped: list[SceneObject] = []
-    for _ in range(num_objects):
-        model = objects.sample(rng)
+    for _ in range(number):
+        model = layout.objects.sample(rng)
         quaternion = Rotation.random(rng=rng).as_quat().tolist()
-        x, y = rng.uniform(*drop.where)
-        scale = float(rng.uniform(*drop.scales))
-        dropped.append(load_object(world, model, (x, y, drop.height), quaternion, scale))
-        wait_for_rest(world, dropped, drop.seconds)
+        x, y = rng.uniform(*where)
+        scale = float(rng.uniform(*layout.scales))
+        dropped.append(load_object(layout.world, model, (x, y, height), quaternion, scale))
+        wait_for_rest(layout.world, dropped, seconds)
     return dropped
 
 
@@ -285,15 +267,14 @@ def _upright(rng: np.random.Generator) -> list[float]:
 
 
 def _place(
-    world: World,
-    surroundings: Surroundings,
+    layout: Layout,
     placed: list[SceneObject],
     model: ObjectModel,
     place: tuple[float, float],
     quaternion_xyzw: Sequence[float],
-    scale: float,
 ) -> list[SceneObject]:
     """Put an object down where it touches nothing, or nowhere; returns all that are there."""
+    world, scale = layout.world, float(layout.rng.uniform(*layout.scales))
     state = world.save_state()
     new = load_object(world, model, (*place, 1.0), quaternion_xyzw, scale)
     x, y, z = new.body.position
@@ -304,7 +285,7 @@ def _place(
         new.body.remove()
         world.restore_state(state)
     else:
-        placed = settle(world, [*placed, new], surroundings)
+        placed = settle(world, [*placed, new], layout.surroundings)
     world.remove_state(state)
     return placed
 

@@ -29,6 +29,7 @@ from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
     PACKED_SCALE,
     PILE_SCALE,
+    Layout,
     SceneObject,
     load_object,
     make_bin,
@@ -53,7 +54,12 @@ from edgegrasp_sim.surroundings import (
 NOISE_STD = 0.001  # metres
 # What objects stand in (None: an open table), the usual range of their scales, how they are placed.
 STANDING_IN: dict[
-    SceneKind, tuple[Callable[..., Surroundings] | None, tuple[float, float], Callable[..., Any]]
+    SceneKind,
+    tuple[
+        Callable[..., Surroundings] | None,
+        tuple[float, float],
+        Callable[[Layout], list[SceneObject]],
+    ],
 ] = {
     SceneKind.PACKED: (None, PACKED_SCALE, make_packed),
     SceneKind.PILE: (None, PILE_SCALE, make_pile),
@@ -229,8 +235,8 @@ class ClutterSimulation:
             raise ValueError(f"no object set for scene {kind.value!r}; pass one in `objects`")
         surround, usual, make = STANDING_IN[kind]
         around = self._clear(open_table(table_thickness) if surround is None else surround(rng))
-        made = make(self.world, around, objects, rng, num_objects, scales or usual)
-        self._objects = made
+        layout = Layout(self.world, around, objects, rng, num_objects, scales or usual)
+        self._objects = make(layout)
         self._gripper = self._add_gripper()
         return self.num_objects
 
