@@ -120,7 +120,7 @@ def test_a_server_killed_and_restarted_changes_nothing(
     start_dummy: Callable, dummy_server, benchmark: Callable, tmp_path: Path
 ) -> None:
     address = dummy_server.grpc_address
-    calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=3)
+    calm = benchmark(tmp_path / "calm", "server", "--server", address, rounds=2)
     shaken = tmp_path / "shaken"
     with ExitStack() as stack:
         first = stack.enter_context(start_dummy())
@@ -136,7 +136,7 @@ def test_a_server_killed_and_restarted_changes_nothing(
 
         thread = threading.Thread(target=restart)
         thread.start()
-        again = benchmark(shaken, "server", "--server", first.grpc_address, rounds=3)
+        again = benchmark(shaken, "server", "--server", first.grpc_address, rounds=2)
         thread.join()
     assert again["attempts_digest"] == calm["attempts_digest"]
 

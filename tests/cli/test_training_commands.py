@@ -11,7 +11,7 @@ from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_training.recipes import recipe
 
 ONE_ROUND = ("--rounds", 1, "--seed", 0, "--scene", "packed", "--workers", 1)
-VIEWS = ("--scenes", 4, "--views-per-scene", 1, "--grasps-per-view", 10, "--seed", 3)
+VIEWS = ("--scenes", 4, "--scene", "packed", "--views-per-scene", 1, "--grasps-per-view", 8)
 
 
 @pytest.fixture(scope="module")
