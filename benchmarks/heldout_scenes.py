@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 KINDS = ("table", "heap", "tray", "bin", "shelf")
 FIRST, SUPPORT = 2, 0.01  # the first object's label; least share of the support in an image
 SIZES = ((320, 240), (424, 240), (512, 424), (640, 480))
-TOUCHED = 0.015  # metres that a faulty reading may lie off the surface whose label it keeps
+TOUCHED = 0.015  # metres from a surface within which a faulty reading keeps its label
 WINDOW = 4  # pixels around one in which the surface is looked for that a reading lies on
 LEAST = 0.001  # of an image's pixels, below which what is seen of an object is not labelled
 FLAT = 0.004  # metres from the plane within which what carries the objects is the support
@@ -180,7 +180,7 @@ class Maker:
 
 
 def picture(maker: Maker, made: Made) -> dict[str, Array]:
-    """What a random depth camera sees of a scene, and what it is."""
+    """The image of a random depth camera, and its labels."""
     rng = maker.rng
     width, height = SIZES[int(rng.integers(len(SIZES)))]
     focal = width / 2 / np.tan(np.radians(rng.uniform(40, 75)) / 2)

@@ -143,7 +143,7 @@ def server_footprint() -> dict[str, float]:
 
 
 def simulators() -> dict[str, Any]:
-    """The simulator with each kind of scene, in a process of its own, as its workers are."""
+    """The simulator with each kind of scene, in a separate process like its workers."""
     with get_context("spawn").Pool(1) as process:
         return {str(kind): process.apply(simulator, (kind,)) for kind in CLUTTER}
 

@@ -1,4 +1,4 @@
-"""Observed scenes with labels, and what grasps are worth that a detector finds in them.
+"""Recorded scenes with labels, and how a detector's grasps are judged by them.
 
 A scene is an .npz file: docs/benchmark.md has its arrays.
 """
@@ -33,7 +33,7 @@ MAX_ANGLE, MAX_OFFSET = 5.0, 0.010  # degrees, metres: of a plane that is right
 
 @dataclass(frozen=True)
 class RealScene:
-    """What a camera saw, and what it is. Camera frame, metres; R rows."""
+    """A camera's data with labels. Camera frame, metres; R rows."""
 
     name: str
     request: Mapping[str, Any]  # what a detector gets, as arguments of `GraspClient.detect`

@@ -91,7 +91,7 @@ def answer_again(file: Path, settings: "Settings") -> "tuple[Job, Answer, Answer
     with file.open("rb") as stream:
         job, recorded = receive(stream), receive(stream)
     if not isinstance(job, Job) or not isinstance(recorded, Answer):
-        raise ValueError(f"{file} is no recorded request")
+        raise ValueError(f"{file} is not a recorded request")
     job = replace(job, remaining=settings.max_request_seconds)
     return job, recorded, worker.answer(job, worker.load_catalogue(settings), settings)
 

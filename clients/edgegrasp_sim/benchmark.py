@@ -106,7 +106,7 @@ def run_benchmark(
         All rounds of `config`, by seed and index.
 
     Raises:
-        ValueError: `workers` below 1, or the planner's pose is no rigid transform.
+        ValueError: `workers` below 1, or the planner's pose is not a rigid transform.
         FileNotFoundError: the object folder does not hold the scene.
         RuntimeError: worker processes keep dying, or there is no such Ray cluster.
     """

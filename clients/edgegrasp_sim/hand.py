@@ -309,7 +309,7 @@ def _retreat(
 
 
 class _Watch:
-    """Observes a retreating hand after every time step, to tell early what it will hold.
+    """Observes a retreating hand after every time step, to know early what it will hold.
 
     On 1,760 grasps in packed and pile scenes, stopping then changes 1 outcome in 100.
     """
@@ -321,7 +321,7 @@ class _Watch:
         self._offset: Matrix | None = None
 
     def is_clear(self) -> bool:
-        """Whether the fingers hold nothing any more, or one object that rests on nothing else."""
+        """Whether the fingers are empty, or hold one object that rests on nothing else."""
         touched = _touched(self._gripper, self._objects)
         before, self._opening = self._opening, self._gripper.opening
         closing = abs(self._opening - before) >= STILL  # and may yet catch something

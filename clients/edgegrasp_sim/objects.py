@@ -55,7 +55,7 @@ class SceneKind(StrEnum):
 
     @property
     def objects(self) -> "SceneKind":
-        """The kind whose objects it is made of where it has none of its own."""
+        """The kind whose objects it uses unless it has its own."""
         match self:
             case SceneKind.BIN | SceneKind.FULL_BIN:
                 return SceneKind.PILE
@@ -213,7 +213,7 @@ def prepare_mesh(mesh: Path, cache: Path | None = None) -> Path:
         The object's URDF file.
 
     Raises:
-        ValueError: the file holds no solid mesh.
+        ValueError: the file contains no solid mesh.
         RuntimeError: coacd or trimesh is not installed.
     """
     _require_packages()
@@ -256,7 +256,7 @@ def write_parts(
     inertia: NDArray[np.float64],
     folder: Path,
 ) -> Path:
-    """Write an object whose contacts use convex parts, so that its hollows are open.
+    """Write an object whose contacts use convex parts, so that hollow objects stay hollow.
 
     Args:
         name: of the object.
@@ -431,9 +431,11 @@ def _read(mesh: Path) -> Any:
     except Exception as error:  # readers of meshes raise whatever they stumble over
         raise ValueError(f"{mesh} cannot be read as a mesh: {error}") from error
     if len(surface.faces) == 0 or surface.extents is None:
-        raise ValueError(f"{mesh} holds no triangles; export the object as a triangle mesh")
+        raise ValueError(f"{mesh} contains no triangles; export the object as a triangle mesh")
     if not np.isfinite(surface.vertices).all() or min(surface.extents) <= 1e-9:
-        raise ValueError(f"{mesh} is no solid object (its extents are {surface.extents.tolist()})")
+        raise ValueError(
+            f"{mesh} is not a solid object (its extents are {surface.extents.tolist()})"
+        )
     return surface
 
 

@@ -277,7 +277,7 @@ def draw_grasps(
 
 
 def lit(depth: NDArray[np.floating], fx: float, fy: float) -> Points:
-    """How bright a lamp over the camera makes what it sees, from 0 to 1: (H, W).
+    """Brightness of a depth image lit by a lamp over the camera, from 0 to 1: (H, W).
 
     Args:
         depth: (H, W) metres along the line of sight; NaN where there is nothing.

@@ -49,7 +49,7 @@ def require_pose(T: ArrayLike, field: str) -> Matrix:
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > 1e-3 or np.linalg.det(rotation) < 0:
         raise ValueError(
-            f"{field} is no rigid transform (R Rᵀ is off the identity by {error:.3g}, "
+            f"{field} is not a rigid transform (R Rᵀ is off the identity by {error:.3g}, "
             f"det {np.linalg.det(rotation):.3g}); pass a right-handed rotation without scale"
         )
     return matrix

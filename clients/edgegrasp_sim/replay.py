@@ -15,7 +15,7 @@ class Replay:
     """The recorded rounds of a result folder, to be repeated.
 
     Raises:
-        FileNotFoundError: the folder holds no benchmark, or its objects are not there.
+        FileNotFoundError: the folder contains no benchmark, or its objects are not there.
         ValueError: the objects are not those of the benchmark.
     """
 

@@ -21,7 +21,7 @@ def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
     `objects` is where its object folder is now; None: where it was.
 
     Raises:
-        FileNotFoundError: the folder holds no benchmark, or its objects are not there.
+        FileNotFoundError: the folder contains no benchmark, or its objects are not there.
     """
     rounds = folder.rounds()
     facts = folder.manifest()

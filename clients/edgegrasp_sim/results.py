@@ -83,7 +83,7 @@ class ResultFolder:
         """The finished rounds, by seed and index.
 
         Raises:
-            FileNotFoundError: this folder holds no benchmark.
+            FileNotFoundError: this folder contains no benchmark.
         """
         self.manifest()
         files = (self.path / "rounds").glob("*.json")
@@ -94,11 +94,11 @@ class ResultFolder:
         """What was run.
 
         Raises:
-            FileNotFoundError: this folder holds no benchmark.
+            FileNotFoundError: this folder contains no benchmark.
         """
         file = self.path / "manifest.json"
         if not file.is_file():
-            raise FileNotFoundError(f"{self.path} holds no benchmark: manifest.json is missing")
+            raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")
         table: dict[str, Any] = json.loads(file.read_text())
         return table | {"run": FIRST_ENGINE | table["run"]}
 
@@ -232,7 +232,7 @@ def compare(first: ResultFolder, second: ResultFolder) -> dict[str, Any]:
         interval of each and the difference, second minus first, with its paired 95 % interval.
 
     Raises:
-        FileNotFoundError: a folder holds no benchmark.
+        FileNotFoundError: a folder contains no benchmark.
         ValueError: they were run under different conditions or share no scene.
     """
     runs = [folder.manifest()["run"] for folder in (first, second)]
@@ -284,7 +284,7 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
         differing = [name for name in GATED if committed[name] != summary[name]]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{gate} is no summary.json of a benchmark: {error!r}") from error
+        raise ValueError(f"{gate} is not a summary.json of a benchmark: {error!r}") from error
     if differing:
         raise ValueError(
             f"{gate} is of another benchmark: "

@@ -135,7 +135,7 @@ class DepthSensor:
         slope = np.zeros_like(depth)
         for axis in (0, 1):
             step = np.abs(np.diff(depth, axis=axis))
-            # The smaller step to either side: an edge is no slanted surface.
+            # The smaller step to either side: an edge is not a slanted surface.
             lower = np.minimum(np.delete(step, 0, axis), np.delete(step, -1, axis))
             inner = slope[1:-1] if axis == 0 else slope[:, 1:-1]
             inner += lower * lower

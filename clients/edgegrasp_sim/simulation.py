@@ -130,7 +130,7 @@ class ClutterSimulation:
             has looked for any, so that it never fails a grasp for this and lets the engine push
             hand and objects apart; off by default, to agree with it.
         engine: see `choose_engine`.
-        gripper: the fields of a gripper file; by default the Panda's hand, of its own shapes.
+        gripper: the fields of a gripper file; by default the Panda's hand with the vendor's shapes.
     """
 
     def __init__(
@@ -324,7 +324,7 @@ class ClutterSimulation:
         )
 
     def color_image(self, T_world_camera: Matrix) -> NDArray[np.uint8]:
-        """The scene in colour from a pose (4, 4): (H, W, 3), each object of a paint of its own."""
+        """The scene in colour from a pose (4, 4): (H, W, 3), each object in a different colour."""
         depth = self.world.render_depth(T_world_camera, CAMERA)
         seen = depth < FARTHEST * CAMERA.far
         points = points_of(depth, T_world_camera, CAMERA)
@@ -369,7 +369,7 @@ class ClutterSimulation:
                 its outcome is clear: twice as fast, with another outcome for 1 grasp in 100.
 
         Raises:
-            ValueError: `T_world_hand` is no rigid transform.
+            ValueError: `T_world_hand` is not a rigid transform.
         """
         result = self._run(T_world_hand, to_the_end=to_the_end, shake=shake)
         self._restore_rest()
@@ -384,7 +384,7 @@ class ClutterSimulation:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
 
         Raises:
-            ValueError: `T_world_hand` is no rigid transform.
+            ValueError: `T_world_hand` is not a rigid transform.
         """
         result = self._run(T_world_hand, to_the_end=True)
         self._forget_rest_state()

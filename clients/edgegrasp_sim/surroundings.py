@@ -36,7 +36,7 @@ class Bins:
     inside: tuple[Span, Span, Span] = ((0.40, 0.60), (0.30, 0.42), (0.03, 0.08))
     small: tuple[Span, Span, Span] = ((0.30, 0.40), (0.24, 0.30), (0.03, 0.08))
     wall: Span = (0.008, 0.015)  # its floor is as thick; objects are pressed through thinner ones
-    ground: float = 0.2  # that its floor reaches down into what it stands on, for the same reason
+    ground: float = 0.2  # depth of the floor into what it stands on, for the same reason
     stand_share: float = 0.3  # of the bins, which stand off the table: on a stand, a conveyor
     stand: Span = (0.1, 0.4)
     heap: float = 0.10  # that a heap may rise over the walls

@@ -232,7 +232,7 @@ class RoundDriver:
         """Execute a grasp planned in the last view.
 
         Raises:
-            ValueError: its pose is no rigid transform.
+            ValueError: its pose is not a rigid transform.
         """
         result = self.simulation.execute_grasp(grasp.T_world_hand)
         attempt = Attempt(

@@ -32,11 +32,11 @@ def run_tasks(
     workers: int | None = None,
     ray: str | None = None,
 ) -> Iterator[tuple[Task, Result]]:
-    """Do tasks whose results depend on nothing but the task.
+    """Do tasks whose results depend only on the task.
 
     Args:
-        make_runner: called once in every process; what it makes is closed if it is made in this
-            one and can be.
+        make_runner: called once in every process; its result is closed, if it can be, when it was
+            made in this process.
         tasks: what to do.
         workers: how many at a time; with 1 all in this process. By default as many as there are
             cores here, or processors in the cluster. If a worker dies, another does its task

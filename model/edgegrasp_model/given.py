@@ -155,10 +155,10 @@ def from_hand_poses(
 ) -> Given:
     """The edge grasps nearest to hand poses.
 
-    The contact point is what a closing finger touches first, on the side whose normal is closer
-    to the closing direction: of the points within FIRST_TOUCH of the outermost one between the
-    fingers, the one nearest to where the gripper puts its contacts. The approach point is the
-    point around it that is nearest to the hand's approach axis. The pose stays as it is given.
+    The contact point is the first that a closing finger touches, on the side whose normal is
+    closer to the closing direction: of the points within FIRST_TOUCH of the outermost one between
+    the fingers, the one nearest to where the gripper puts its contacts. The approach point is the
+    point around it that is nearest to the hand's approach axis. The pose stays as given.
 
     Args:
         scene: The scene.

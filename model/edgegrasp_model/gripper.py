@@ -159,7 +159,7 @@ def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
     """Load a gripper that ships with the package by name, or a user's own by path.
 
     Raises:
-        InvalidGripper: There is no such file, or it is no gripper's.
+        InvalidGripper: There is no such file, or it does not describe a gripper.
     """
     return gripper_from_fields(gripper_fields(name_or_path))
 
@@ -168,7 +168,7 @@ def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
     """What such a file says, ready for JSON and for a request's option `gripper`.
 
     Raises:
-        InvalidGripper: There is no such file, or it is no gripper's.
+        InvalidGripper: There is no such file, or it does not describe a gripper.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":

@@ -99,8 +99,8 @@ def test_wrong_replays_and_comparisons_end_with_a_sentence(
 ):
     assert "attempt is 99" in refused("replay", "attempt", in_process, "--attempt", 99)
     assert "round is 7" in refused("replay", "attempt", in_process, "--round", 7)
-    assert "holds no benchmark" in refused("replay", "attempt", tmp_path)
-    assert "holds no benchmark" in refused("compare", in_process, tmp_path)
+    assert "contains no benchmark" in refused("replay", "attempt", tmp_path)
+    assert "contains no benchmark" in refused("compare", in_process, tmp_path)
     benchmark(tmp_path, TOP_DOWN, "--protocol", "giga", rounds=1)
     assert "differ in protocol" in refused("compare", in_process, tmp_path)
 

@@ -83,7 +83,7 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
     np.testing.assert_allclose(extents[1:], [(1.0, 0.5, 0.5), (2.0, 1.0, 1.0)])
     assert [len(part.faces) for _, part in read_obj(tmp_path / "two.obj")] == [3, 3]
     (tmp_path / "shapes.urdf").write_text(SHAPES.replace("two.obj", "two.dae"))
-    with pytest.raises(ValueError, match=r"two\.dae is no OBJ file"):
+    with pytest.raises(ValueError, match=r"two\.dae is not an OBJ file"):
         read_urdf(tmp_path / "shapes.urdf", 1.0)
 
 

@@ -75,7 +75,7 @@ def test_a_round_comes_back_from_its_file() -> None:
 
 def test_the_folder_holds_a_row_for_every_attempt(tmp_path: Path) -> None:
     folder = ResultFolder(tmp_path / "new")
-    with pytest.raises(FileNotFoundError, match="holds no benchmark"):
+    with pytest.raises(FileNotFoundError, match="contains no benchmark"):
         folder.rounds()
     protocol = {"name": "edgegrasp", "version": 1}
     folder.open({"run": {"scene": "pile", "protocol": protocol, "planner": {}}})
@@ -155,5 +155,5 @@ def test_the_gate_lets_chance_pass_and_stops_a_fall(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="scene 'pile', not 'packed'"):
         below_gate(summary_with({"value": 0.9}) | {"scene": "packed"}, gate)
     gate.write_text("{}")
-    with pytest.raises(ValueError, match=r"no summary\.json"):
+    with pytest.raises(ValueError, match=r"not a summary\.json"):
         below_gate(summary_with({"value": 0.9}), gate)

@@ -277,7 +277,7 @@ def test_wrong_use_is_refused(simulation: ClutterSimulation) -> None:
     with pytest.raises(FileNotFoundError, match="no object file"):
         simulation.reset_from_poses([ObjectPlacement(Path("gone.urdf"), 1.0, (0, 0, 0), UPRIGHT)])
     simulation.reset_from_poses([cube_at(0.15, 0.15)])
-    with pytest.raises(ValueError, match="T_world_hand is no rigid transform"):
+    with pytest.raises(ValueError, match="T_world_hand is not a rigid transform"):
         simulation.try_grasp(np.zeros((4, 4)))
     with ClutterSimulation({}) as empty:
         with pytest.raises(RuntimeError, match="call reset"):
@@ -317,8 +317,8 @@ def test_outcomes_agree_with_the_reference_simulator(shared_dir, engine, kind, t
     [
         (np.eye(3), r"pose has shape \(3, 3\)"),
         (np.full((4, 4), np.nan), "pose holds values that are not finite"),
-        (2.0 * np.eye(4), "pose is no rigid transform"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "pose is no rigid transform"),
+        (2.0 * np.eye(4), "pose is not a rigid transform"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "pose is not a rigid transform"),
     ],
 )
 def test_only_rigid_transforms_are_poses(T: np.ndarray, message: str) -> None:

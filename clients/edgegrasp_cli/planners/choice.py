@@ -1,7 +1,4 @@
-"""From what the command line names to a planner, and to how a manifest describes it.
-
-A planner of one's own needs nothing from here: see docs/benchmark.md.
-"""
+"""From the planner that the command line names to a planner and its entry in the manifest."""
 
 import importlib
 from collections.abc import Callable, Iterator
@@ -103,7 +100,7 @@ def named_planner(name: str) -> Planner:
         raise ValueError(f"planner {name!r} cannot be loaded: {error}") from error
     planner: Any = found() if isinstance(found, type) else found
     if not callable(planner):
-        raise ValueError(f"planner {name!r} is no callable; name a function or a class")
+        raise ValueError(f"planner {name!r} is not callable; name a function or a class")
     return cast("Planner", planner)
 
 

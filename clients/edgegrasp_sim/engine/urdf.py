@@ -45,8 +45,8 @@ def read_urdf(path: Path, scale: float) -> Shape:
     Each object of an OBJ file is one convex part.
 
     Raises:
-        FileNotFoundError: there is no such file, or none of a mesh.
-        ValueError: it cannot be read, or holds no solid shape.
+        FileNotFoundError: the file or a mesh is missing.
+        ValueError: it cannot be read, or contains no solid shape.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no object file at {path}; check the object folder")
@@ -152,7 +152,7 @@ def _parts(element: ElementTree.Element, urdf: Path) -> list[Surface]:
     if shape.tag == "mesh":
         file = urdf.parent / shape.get("filename", "")
         if file.suffix.lower() != ".obj":
-            raise ValueError(f"its mesh {file.name} is no OBJ file; convert it")
+            raise ValueError(f"its mesh {file.name} is not an OBJ file; convert it")
         parts = [part for _, part in read_obj(file)]
         size = _numbers(shape, "scale", "1 1 1")
     elif shape.tag == "box":

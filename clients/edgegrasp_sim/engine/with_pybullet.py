@@ -39,7 +39,7 @@ CONSTANTS = {
     "finger_spinning_friction": FINGER_SPINNING_FRICTION,
     "gear_force": GEAR_FORCE,
 }
-# The meshes whose corners a hand's model has: what was published came of them, to the last bit.
+# The Panda's collision meshes, which the published figures were measured with.
 _MESHES = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes" / "collision"
 _STRAIGHT, _HALF_TURN = [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]  # xyzw
 
