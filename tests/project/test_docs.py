@@ -1,6 +1,7 @@
 """The pages name what there is, their blocks run, and they make a site that needs no network."""
 
 import contextlib
+import hashlib
 import importlib.util
 import io
 import json
@@ -23,6 +24,7 @@ from PIL import Image
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.errors import STATUS, kind_of
 from edgegrasp_service.settings import Settings
@@ -220,6 +222,18 @@ def test_no_page_installs_cuda_unasked() -> None:
 def test_the_results_begin_with_figures() -> None:
     first = PAGES["results.md"].index("\n| ")
     assert PAGES["results.md"][:first].count("\n") < 12
+
+
+def test_the_results_say_which_weights_they_are_of() -> None:
+    shipped = {
+        path.stem: hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+        for path in WEIGHTS_FOLDER.glob("*.safetensors")
+    }
+    lines = re.findall(r"^Weights: (.*)$", PAGES["results.md"], re.MULTILINE)
+    assert len(lines) >= 3
+    for line in lines:
+        for name, digest in re.findall(r"([\w-]+) `(\w{8})`", line):
+            assert shipped[name] == digest or f"{name} `{digest}` (not those shipped)" in line
 
 
 def test_other_blocks_can_be_read() -> None:
