@@ -455,6 +455,45 @@ class ObjectChoice(Strict):
     )
 
 
+def _row_by_row(value: object) -> object:
+    """The numbers of a matrix in one list, whether it was sent as one or as rows."""
+    nested = isinstance(value, (list, tuple)) and all(isinstance(r, (list, tuple)) for r in value)
+    return [number for row in value for number in row] if nested else value  # type: ignore[attr-defined]
+
+
+def _rigid(value: tuple[float, ...]) -> tuple[float, ...]:
+    pose = np.reshape(value, (4, 4))
+    turn = pose[:3, :3]
+    if (
+        np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3
+        or np.linalg.det(turn) < 0
+        or np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6
+    ):
+        raise ValueError("must be a rotation and a translation, with last row 0, 0, 0, 1")
+    return value
+
+
+class RobotArm(Strict):
+    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+
+    name: str = Field(max_length=100, description="one of the server's robots")
+    T_base_cloud: Annotated[
+        tuple[Finite, ...],
+        Field(min_length=16, max_length=16),
+        AfterValidator(_rigid),
+        BeforeValidator(_row_by_row, json_schema_input_type=tuple[Finite, ...]),
+    ] = Field(
+        description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
+    )
+    joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
+        description="the arm's joints now, radians or metres, in the order of the robot file"
+    )
+    plan: Literal["reach", "motion"] = Field(
+        default="motion",
+        description="reach: joints before and at each grasp; motion: a timed trajectory too",
+    )
+
+
 def _mode_as_object(value: object) -> object:
     return {"mode": value} if isinstance(value, str) else value
 
@@ -593,6 +632,11 @@ class DetectOptions(Strict):
         Collision,
         BeforeValidator(_mode_as_object, json_schema_input_type=CollisionMode | Collision),
     ] = Field(default=Collision(), description="what the hand must not meet; a bare mode will do")
+    robot: RobotArm | None = Field(
+        default=None,
+        description="the arm that is to execute a grasp; grasps within its reach come first; "
+        "null: a hand alone",
+    )
     min_score: Number = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
     top_k: Integer = Field(
         default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"

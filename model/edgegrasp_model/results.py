@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
@@ -40,6 +41,31 @@ class NoGrasp(StrEnum):
 
 
 @dataclass(frozen=True)
+class ArmTrajectory:
+    """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
+
+    The gripper opens before `pregrasp_row` and closes at `grasp_row`; the arm rests at both.
+    """
+
+    joint_names: list[str]  # J
+    times: Float64  # (T,) seconds from the start
+    positions: Float64  # (T, J) radians, metres of sliding joints
+    velocities: Float64  # (T, J) per second
+    pregrasp_row: int
+    grasp_row: int
+
+
+@dataclass(frozen=True)
+class ArmPlan:
+    """How an arm gets to a grasp."""
+
+    reachable: bool  # whether it gets to the pregrasp and straight on to the grasp, touching nothing
+    pregrasp_joints: Float64 | None = None  # (J,) where it is reachable
+    grasp_joints: Float64 | None = None  # (J,) where it is reachable
+    trajectory: ArmTrajectory | None = None  # where it was asked for and found in time
+
+
+@dataclass(frozen=True)
 class Grasp:
     """One grasp to execute: reach `T_cloud_hand` along `approach_direction`, then close."""
 
@@ -53,6 +79,7 @@ class Grasp:
     collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
     object: int | None = None  # number of the object that the contact is on; None: of none
+    arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
 
 
 @dataclass(frozen=True)

