@@ -59,7 +59,7 @@ class ArmTrajectory:
 class ArmPlan:
     """How an arm gets to a grasp."""
 
-    reachable: bool  # whether it gets to the pregrasp and straight on to the grasp, touching nothing
+    reachable: bool  # whether it gets to the pregrasp and straight on, touching nothing
     pregrasp_joints: Float64 | None = None  # (J,) where it is reachable
     grasp_joints: Float64 | None = None  # (J,) where it is reachable
     trajectory: ArmTrajectory | None = None  # where it was asked for and found in time

@@ -3,7 +3,7 @@
 import tempfile
 import tomllib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -111,6 +111,8 @@ class Model:
 
     urdf: str  # of the arm without what is beyond its flange, and with the gripper's boxes
     packages: list[str]
+    links: list[str]  # those that have a shape, from the base on
+    standing: list[str]  # those of them that no joint moves
     allowed: list[tuple[str, str]]  # pairs of links that may touch
     limits: str  # YAML
 
@@ -192,7 +194,9 @@ def _load(path: Path, file: RobotFile) -> Robot:
         allowed = _allowed(srdf, root, beyond)
     limits = _limits(joint_names, file)
     text = ElementTree.tostring(root, encoding="unicode")
-    model = Model(text, packages, allowed, limits)
+    links = [link for link in _links(root) if _has_shape(root, link)]
+    standing = [link for link in links if not _moves(root, link)]
+    model = Model(text, packages, links, standing, allowed, limits)
     scenes = [
         model.scene(path.stem, file.base_frame, file.flange_frame) for _ in ("free", "straight")
     ]
@@ -206,29 +210,26 @@ def _load(path: Path, file: RobotFile) -> Robot:
         lower, upper, np.array(file.max_velocity), np.array(file.max_acceleration), model, *scenes,
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
-        pair = touching(model.scene(path.stem, file.base_frame, file.flange_frame), home, root)
+        pair = touching(scenes[0], model, home)
         fix = "Name other joints, or the pair in the SRDF's disable_collisions"
         raise InvalidRobot(f"{path.name}: home: {pair} touch there. {fix}.")
     return robot
 
 
-def touching(scene: core.Scene, joints: Float64, root: Element, things: Iterable[str] = ()) -> str:
+def touching(scene: core.Scene, model: Model, joints: Float64, things: Sequence[str] = ()) -> str:
     """Two that touch at joints (J,), as words; the scene is of no use afterwards.
 
     Args:
         scene: Of the robot and what is around it.
+        model: The robot's.
         joints: Where it has collisions.
-        root: The robot's URDF.
         things: Names of what is around it.
     """
-    links = [link.get("name", "") for link in root.findall("link") if link.find("collision")]
-    links = [link.get("name", "") for link in root.findall("link") if len(link.findall("collision"))]
-    others = [*things, *links]
-    for row, link in enumerate(links):
-        for other in [name for name in others if name not in links[: row + 1]]:
+    for row, link in enumerate(model.links):
+        for other in (*things, *model.links[row + 1 :]):
             scene.setCollisions(link, other, False)
             if not scene.hasCollisions(joints):
-                return f"{'the hand' if link == HAND else link} and {'the hand' if other == HAND else other}"
+                return f"{link} and {other}".replace(HAND, "the hand")
     return "two of its links"
 
 
@@ -252,6 +253,23 @@ def _read_urdf(file: Path) -> Element:
     return ElementTree.fromstring(text)
 
 
+def _links(root: Element) -> list[str]:
+    return [str(link.get("name")) for link in root.findall("link")]
+
+
+def _has_shape(root: Element, link: str) -> bool:
+    return any(one.get("name") == link and one.find("collision") is not None for one in root)
+
+
+def _moves(root: Element, link: str) -> bool:
+    """Whether a joint between the root and a link moves."""
+    while (joint := _joint(root, link)) is not None:
+        if joint.get("type") in MOVING:
+            return True
+        link = _parent(joint)
+    return False
+
+
 def _joint(root: Element, child: str) -> Element | None:
     """The joint that carries a link."""
     for joint in root.findall("joint"):
@@ -266,10 +284,10 @@ def _parent(joint: Element) -> str:
 
 def _chain(path: Path, root: Element, file: RobotFile) -> list[str]:
     """The moving joints between base and flange, in order."""
-    links = {link.get("name") for link in root.findall("link")}
+    links = _links(root)
     for field in ("base_frame", "flange_frame"):
         if (name := getattr(file, field)) not in links:
-            fix = f"Use a link of the URDF: {', '.join(sorted(map(str, links)))}."
+            fix = f"Use a link of the URDF: {', '.join(links)}."
             raise InvalidRobot(f"{path.name}: {field}: got {name!r}. {fix}")
     joints, link = [], file.flange_frame
     while link != file.base_frame:
@@ -351,7 +369,7 @@ def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
 
 def _allowed(srdf: Element, root: Element, beyond: set[str]) -> list[tuple[str, str]]:
     """Pairs of links that may touch; what is said of links beyond the flange is of the hand."""
-    links = {str(link.get("name")) for link in root.findall("link") if len(link.findall("collision"))}
+    links = {link for link in _links(root) if _has_shape(root, link)}
     pairs = set()
     for one in srdf.findall("disable_collisions"):
         names = [str(one.get(which)) for which in ("link1", "link2")]

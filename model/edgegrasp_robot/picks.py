@@ -1,0 +1,346 @@
+"""Which grasps an arm reaches, and its motion there: inverse kinematics, paths, trajectories."""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from roboplan import core
+from roboplan.rrt import RRT, RRTOptions
+from roboplan.simple_ik import SimpleIk, SimpleIkOptions
+from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import DetectOptions, RobotArm
+from edgegrasp_model.results import ArmPlan, ArmTrajectory, Detection, Grasp
+from edgegrasp_model.scene.scene import Scene
+from edgegrasp_robot.held import can_leave
+from edgegrasp_robot.robot import GROUP, Robot
+from edgegrasp_robot.surroundings import surrounded
+
+Float64 = NDArray[np.float64]
+
+TRIED = 200  # grasps that the arm may be asked for, in their order
+LINE_STEP = 0.01  # metres between the poses of a straight way
+MAX_JUMP = 0.4  # radians that a joint turns between two of them at most
+OFF_LINE = 0.002  # metres that the hand leaves a straight way by at most
+DT = 0.01  # seconds between the rows of a trajectory
+PATH_STEP = 0.03  # radians between the joints that are checked along a path
+CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
+TRAVEL_COST = 0.02  # of a score, for each radian of the joint that turns the most
+NO_REACH = "no grasp is within the arm's reach; see counts."
+
+
+def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
+    """The options of the detection whose grasps `plan_picks` chooses from.
+
+    Raises:
+        InvalidRequest: The joints are not the robot's, or an option does not go with an arm.
+    """
+    asked = options.robot
+    assert asked is not None
+    count = len(robot.joint_names)
+    if len(asked.joints) != count:
+        fix = f"Send {count}: {', '.join(robot.joint_names)}."
+        raise InvalidRequest("options.robot.joints", f"{len(asked.joints)} numbers", fix)
+    joints = np.array(asked.joints)
+    for row in np.flatnonzero((joints < robot.lower) | (joints > robot.upper)):
+        low, high = robot.lower[row], robot.upper[row]
+        fix = f"{robot.joint_names[row]} moves between {low:g} and {high:g}: send where it is."
+        raise InvalidRequest(f"options.robot.joints.{row}", f"{joints[row]:g}", fix)
+    if options.collision.mode == "ignore":
+        fix = "Send avoid or penalise: an arm needs hands that touch nothing."
+        raise InvalidRequest("options.collision.mode", "'ignore' beside a robot", fix)
+    if options.gripper not in (None, robot.gripper.name):
+        fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
+        raise InvalidRequest("options.gripper", "another gripper than the robot's", fix)
+    return options.model_copy(update={"top_k": max(options.top_k, TRIED)})
+
+
+def plan_picks(
+    detection: Detection,
+    scene: Scene | None,
+    points: NDArray[np.floating],
+    options: DetectOptions,
+    robot: Robot,
+    until: float = float("inf"),
+) -> Detection:
+    """Say of grasps how the arm gets there, and put those that it reaches first.
+
+    Args:
+        detection: What the options of `with_robot` gave.
+        scene: That of the detection; None: too little is left of the cloud for one.
+        points: (..., 3) metres, the whole cloud as it was sent; NaN: no reading.
+        options: As they were sent.
+        robot: The one that they name.
+        until: When to stop, on `time.monotonic()`.
+
+    Returns:
+        The detection with `top_k` grasps: those with a trajectory, then others within reach, then
+        those there was no time for, then those out of reach; the better ones first, and at like
+        scores the nearer ones.
+
+    Raises:
+        InvalidRequest: The arm cannot stand where the options put it.
+    """
+    asked = options.robot
+    assert asked is not None
+    if scene is None:
+        return detection
+    start = time.perf_counter()
+    picks: list[_Pick] = []
+    failures: Counter[str] = Counter()
+    with surrounded(robot, scene, points, asked, options.collision.obstacles):
+        arm = _Arm(robot, asked, scene, options)
+        for grasp in detection.grasps:
+            if failures["reachable"] == options.top_k or time.monotonic() > until:
+                break
+            pick = arm.reach(grasp)
+            failures[pick.outcome] += 1
+            picks.append(pick)
+        untried = [_Pick(grasp, None, "untried") for grasp in detection.grasps[len(picks) :]]
+        picks = _preferred(picks, np.array(asked.joints), options)[: options.top_k]
+        if asked.plan == "motion":
+            for row, pick in enumerate(picks):
+                if pick.line is None or time.monotonic() > until:
+                    break
+                picks[row] = arm.motion(pick)
+    picks.sort(key=lambda pick: pick.tier)
+    picks = [*picks, *untried]
+    picks = sorted(picks, key=lambda pick: pick.tier)[: options.top_k]
+    return _told(detection, picks, failures, asked, time.perf_counter() - start)
+
+
+@dataclass(frozen=True)
+class _Pick:
+    """A grasp, and what is known of the arm's way there."""
+
+    grasp: Grasp
+    plan: ArmPlan | None
+    outcome: str
+    line: list[Float64] | None = None  # joints (J,) along the approach; None: out of reach
+
+    @property
+    def tier(self) -> int:
+        """0: with a trajectory, 1: within reach, 2: not tried, 3: out of reach."""
+        if self.plan is None:
+            return 2
+        return 3 if not self.plan.reachable else int(self.plan.trajectory is None)
+
+
+class _Arm:
+    """The arm of one request, within its surroundings."""
+
+    def __init__(self, robot: Robot, asked: RobotArm, scene: Scene, options: DetectOptions) -> None:
+        self._robot, self._scene, self._options = robot, scene, options
+        self._start = np.array(asked.joints)
+        self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
+        self._to_pregrasp = self._solver(robot.scene, restarts=3)
+        self._along = self._solver(robot.straight, restarts=0)
+        self._ignoring = self._solver(robot.straight, restarts=3, check=False)
+
+    def reach(self, grasp: Grasp) -> _Pick:
+        """Joints at the pregrasp and on straight to the grasp."""
+        if not grasp.collision_free:
+            return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
+        poses = self._line_of(grasp, -self._options.collision.approach_length, 0.0)
+        for start in (self._start, self._robot.home):
+            first = self._solve(self._to_pregrasp, poses[0], start)
+            line = None if first is None else self._follow(poses, first)
+            if line is not None:
+                plan = ArmPlan(True, line[0], line[-1])
+                return _Pick(grasp, plan, "reachable", line)
+        first = self._solve(self._ignoring, poses[0], self._start)
+        free = first is not None and self._solve(self._ignoring, poses[-1], first) is not None
+        return _Pick(grasp, ArmPlan(False), "arm_collision" if free else "out_of_reach")
+
+    def motion(self, pick: _Pick) -> _Pick:
+        """Add a trajectory that has been checked, where one is found."""
+        assert pick.plan is not None
+        assert pick.line is not None
+        path = self._free_path(self._start, pick.line[0])
+        back = self._retreat(pick)
+        if path is None or back is None:
+            return pick
+        parts = [
+            self._timed(self._robot.scene, path, None),
+            self._timed(self._robot.straight, pick.line, "line"),
+            self._timed(self._robot.straight, back, "line"),
+        ]
+        times, positions, velocities, ends = np.zeros(1), self._start[None], np.zeros((1, 1)), []
+        velocities = np.zeros_like(positions)
+        for part in parts:
+            if part is None:
+                return pick
+            times = np.concatenate([times, times[-1] + np.array(part.times[1:])])
+            positions = np.concatenate([positions, part.positions[1:]])
+            velocities = np.concatenate([velocities, part.velocities[1:]])
+            ends.append(len(times) - 1)
+        trajectory = ArmTrajectory(
+            self._robot.joint_names, times, positions, velocities, ends[0], ends[1]
+        )
+        return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
+
+    def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> SimpleIk:
+        """Inverse kinematics that a seed decides, and no clock."""
+        options = SimpleIkOptions(
+            GROUP, max_iters=60, max_time=10.0, max_restarts=restarts, step_size=0.5,
+            max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
+            check_collisions=check,
+        )  # fmt: skip
+        return SimpleIk(scene, options)
+
+    def _solve(self, solver: SimpleIk, T_base_hand: Float64, start: Float64) -> Float64 | None:
+        """Joints (J,) that bring the hand there, within their limits."""
+        robot = self._robot
+        T_base_flange = np.asfortranarray(T_base_hand @ np.linalg.inv(robot.T_flange_hand))
+        goal = core.CartesianConfiguration(robot.base_frame, robot.flange_frame, T_base_flange)
+        found = core.JointConfiguration(robot.joint_names, start)
+        solver.setRngSeed(self._options.seed % 2**31)
+        if not solver.solveIk(goal, core.JointConfiguration(robot.joint_names, start), found):
+            return None
+        joints = np.array(found.positions)
+        return joints if self._within_limits(joints) else None
+
+    def _within_limits(self, joints: Float64) -> bool:
+        return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
+
+    def _line_of(self, grasp: Grasp, begin: float, end: float) -> list[Float64]:
+        """Poses T_base_hand along the approach, `begin` to `end` metres from the grasp."""
+        T_cloud_hand = grasp.T_cloud_hand.astype(np.float64)
+        return self._straight(T_cloud_hand, T_cloud_hand[:3, 2], begin, end)
+
+    def _straight(
+        self, T_cloud_hand: Float64, direction: Float64, begin: float, end: float
+    ) -> list[Float64]:
+        steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
+        poses = np.repeat(T_cloud_hand[None], steps + 1, axis=0)
+        poses[:, :3, 3] += np.linspace(begin, end, steps + 1)[:, None] * direction
+        return list(self._T_base_cloud @ poses)
+
+    def _follow(self, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
+        """Joints along a straight way, each near to those before."""
+        line = [first]
+        for pose in poses[1:]:
+            joints = self._solve(self._along, pose, line[-1])
+            if joints is None or np.abs(joints - line[-1]).max() > MAX_JUMP:
+                return None
+            line.append(joints)
+        return line
+
+    def _retreat(self, pick: _Pick) -> list[Float64] | None:
+        """Joints along the way out, on which what is held meets nothing."""
+        rules, grasp = self._options.collision, pick.grasp
+        assert pick.line is not None
+        if rules.retreat_length == 0.0 or rules.retreat_direction == "back":
+            direction = -grasp.approach_direction.astype(np.float64)
+        else:
+            direction = self._scene.frame.directions_in_cloud((0.0, 0.0, 1.0)).astype(np.float64)
+        # The hand's way in is known to be free, and the way out that was asked for.
+        length = rules.retreat_length or rules.approach_length
+        if not can_leave(grasp, self._scene, self._robot.gripper, direction * length, rules):
+            return None
+        poses = self._straight(grasp.T_cloud_hand.astype(np.float64), direction, 0.0, length)
+        return self._follow(poses, pick.line[-1])
+
+    def _free_path(self, start: Float64, end: Float64) -> list[Float64] | None:
+        """Joints between which straight motions of the joints touch nothing."""
+        robot, names = self._robot, self._robot.joint_names
+        options = RRTOptions(
+            GROUP, max_nodes=3000, rrt_connect=True, collision_check_step_size=PATH_STEP
+        )
+        planner = RRT(robot.scene, options)
+        planner.setRngSeed(self._options.seed % 2**31)
+        try:
+            path = planner.plan(
+                core.JointConfiguration(names, start), core.JointConfiguration(names, end)
+            )
+        except RuntimeError:  # as many nodes as there may be, and no path
+            return None
+        rules = core.PathShortcuttingOptions(
+            GROUP, max_step_size=PATH_STEP, seed=self._options.seed % 2**31
+        )
+        shorter = core.PathShortcutter(robot.scene, rules).shortcut(path)
+        return [np.array(joints) for joints in shorter.positions]
+
+    def _timed(
+        self, scene: core.Scene, joints: Sequence[Float64], kind: str | None
+    ) -> core.JointTrajectory | None:
+        """A path with times, from rest to rest, each row of which is checked."""
+        path = core.JointPath()
+        path.joint_names, path.positions = self._robot.joint_names, list(joints)
+        modes = SplineFittingMode
+        mode = modes.Adaptive if kind is None else modes.Cubic
+        options = TOPPRAOptions(dt=DT, mode=mode)
+        try:
+            found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
+        except RuntimeError:
+            return None
+        way = None if kind is None else [self._robot.hand_pose(joints[at])[:3, 3] for at in (0, -1)]
+        for row in np.array(found.positions):
+            if not self._within_limits(row) or scene.hasCollisions(row):
+                return None
+            if way is not None and _off_line(self._robot.hand_pose(row)[:3, 3], *way) > OFF_LINE:
+                return None
+        return found
+
+
+def _off_line(point: Float64, start: Float64, end: Float64) -> float:
+    """Distance of a point (3,) from the line through two others, metres."""
+    along = (end - start) / np.linalg.norm(end - start)
+    return float(np.linalg.norm(np.cross(point - start, along)))
+
+
+def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:
+    """Those within reach first; by score less what the way there costs, unless ordered else."""
+
+    def key(pick: _Pick) -> tuple[int, float]:
+        if pick.plan is None or pick.plan.pregrasp_joints is None or options.order != "score":
+            return pick.tier, 0.0
+        travel = np.abs(pick.plan.pregrasp_joints - joints).max()
+        return pick.tier, TRAVEL_COST * float(travel) - pick.grasp.score
+
+    return sorted(picks, key=key)
+
+
+def _told(
+    detection: Detection,
+    picks: Sequence[_Pick],
+    outcomes: Counter[str],
+    asked: RobotArm,
+    seconds: float,
+) -> Detection:
+    """The detection with the picks as its grasps, and what became of them counted."""
+    grasps = [replace(pick.grasp, arm=pick.plan) for pick in picks]
+    moving = sum(pick.tier == 0 for pick in picks)
+    within = sum(pick.tier <= 1 for pick in picks)
+    warnings = list(detection.warnings)
+    if detection.grasps and not outcomes["reachable"]:
+        warnings.append(NO_REACH)
+    if asked.plan == "motion" and moving < within:
+        warnings.append(
+            f"{within - moving} grasps within reach have no trajectory: none was found in time "
+            "that touches nothing."
+        )
+    if any(pick.tier == 2 for pick in picks):
+        warnings.append("time ran out before the arm was asked for every grasp.")
+    names = ("hand_collision", "out_of_reach", "arm_collision", "reachable")
+    counts = {name: n for name, n in detection.counts.items() if name != "returned"}
+    counts |= {name: outcomes[name] for name in names}
+    if asked.plan == "motion":
+        counts["with_trajectory"] = moving
+    counts["returned"] = len(grasps)
+    best: dict[int | None, float] = {}
+    for grasp in grasps:
+        best[grasp.object] = max(grasp.score, best.get(grasp.object, 0.0))
+    total = detection.seconds.get("total", 0.0) + seconds
+    return replace(
+        detection,
+        grasps=grasps,
+        counts=counts,
+        seconds=detection.seconds | {"arm": seconds, "total": total},
+        warnings=warnings,
+        objects=[replace(one, best_score=best.get(one.number)) for one in detection.objects],
+    )

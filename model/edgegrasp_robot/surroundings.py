@@ -1,0 +1,167 @@
+"""What an arm must not touch: the seen cloud, the support, obstacles; and where it may start."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from roboplan import core
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import Box, OrientedBox, RobotArm
+from edgegrasp_model.scene.scene import Scene
+from edgegrasp_robot.robot import HAND, Robot, touching
+
+Float64 = NDArray[np.float64]
+
+CELL = 0.01  # metres, side of a voxel
+AROUND = 2.0  # metres from the arm's base: what is beyond is left out
+SEEN_SELF = 0.02  # metres from the arm within which the camera sees the arm itself
+INSIDE = 10  # voxels of objects that may lie within the arm, as the camera errs
+SLAB = (6.0, 6.0, 0.5)  # metres, of the support
+GREY = np.ones(4)
+
+Thing = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose in the base frame
+
+
+@contextmanager
+def surrounded(
+    robot: Robot,
+    scene: Scene,
+    points: NDArray[np.floating],
+    asked: RobotArm,
+    obstacles: Sequence[Box | OrientedBox],
+) -> Iterator[None]:
+    """Put what is around the robot into its scenes, and take it away afterwards.
+
+    The hand may touch it in `robot.straight`: there it goes where the detection found it free.
+
+    Args:
+        robot: The robot.
+        scene: What the camera's cloud shows.
+        points: (..., 3) metres, cloud frame: the whole cloud.
+        asked: Where the robot is.
+        obstacles: Boxes beside the cloud, cloud frame.
+
+    Raises:
+        InvalidRequest: It touches something where it is, or stands within an object.
+    """
+    joints = np.array(asked.joints)
+    T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
+    _check_objects(robot, joints, scene, T_base_cloud)
+    things = [_obstacle(row, box, T_base_cloud) for row, box in enumerate(obstacles)]
+    T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
+    if scene.support is not None:
+        things.append(_support(scene, T_base_scene))
+    if (cloud := _cloud(robot, joints, scene, points, T_base_scene)) is not None:
+        things.append(cloud)
+    names = [name for name, _, _ in things]
+    try:
+        for planned in (robot.scene, robot.straight):
+            _add(planned, robot, things)
+        robot.straight.setCollisions([(HAND, name) for name in names], False)
+        if robot.scene.hasCollisions(joints):
+            again = robot.model.scene(robot.name, robot.base_frame, robot.flange_frame)
+            _add(again, robot, things)
+            pair = touching(again, robot.model, joints, names)
+            fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
+            raise InvalidRequest("options.robot.joints", f"a start where {pair} touch", fix)
+        yield
+    finally:
+        for planned in (robot.scene, robot.straight):
+            for name in names:
+                planned.removeGeometry(name)
+
+
+def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
+    for name, shape, pose in things:
+        add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
+        add(name, robot.base_frame, shape, np.asfortranarray(pose), GREY)  # type: ignore[arg-type]
+    standing = [(link, name) for link in robot.model.standing for name, _, _ in things]
+    planned.setCollisions(standing, False)
+
+
+def _check_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> None:
+    of_object = scene.object_of_point >= 0
+    objects = scene.points_in_cloud[of_object]
+    within = _near_robot(robot, joints, moved(T_base_cloud, objects), 0.0)
+    if within.sum() > INSIDE:
+        number = np.bincount(scene.object_of_point[of_object][within]).argmax()
+        value = f"a pose that puts the arm into object {number}"
+        fix = "Send where the cloud's frame is in the arm's base frame, and the joints as they are."
+        raise InvalidRequest("options.robot.T_base_cloud", value, fix)
+
+
+def _near_robot(
+    robot: Robot, joints: Float64, points: Float64, distance: float
+) -> NDArray[np.bool_]:
+    """Which points (N, 3) of the base frame lie within a distance of the robot.  # (N,)."""
+    T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
+    options = core.RobotBodyFilterOptions(distance, num_threads=1)
+    return core.RobotBodyFilter(robot.scene, options).computeMask(
+        joints, np.ascontiguousarray(moved(T_root_base, points))
+    )
+
+
+def _obstacle(row: int, box: Box | OrientedBox, T_base_cloud: Float64) -> Thing:
+    T_cloud_box, half = box_pose(box)
+    return f"collision.obstacles.{row}", core.Box(*(2 * half)), T_base_cloud @ T_cloud_box
+
+
+def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
+    """Pose T_cloud_box (4, 4) and half extents (3,) of a box."""
+    pose = np.eye(4)
+    if isinstance(box, OrientedBox):
+        pose[:3, :3] = Rotation.from_quat(box.quaternion).as_matrix()
+        pose[:3, 3] = box.center
+        return pose, np.array(box.half_extents)
+    low, high = np.array(box.min), np.array(box.max)
+    pose[:3, 3] = (low + high) / 2
+    return pose, (high - low) / 2
+
+
+def _support(scene: Scene, T_base_scene: Float64) -> Thing:
+    """A slab below the support plane, its middle below the arm's base."""
+    assert scene.support is not None
+    normal = np.array(scene.support.normal)
+    base = np.linalg.inv(T_base_scene)[:3, 3]
+    T_scene_slab = np.eye(4)
+    T_scene_slab[:3, :3] = Rotation.align_vectors(normal[None], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    depth = scene.support.heights(base) + SLAB[2] / 2
+    T_scene_slab[:3, 3] = base - depth * normal
+    return "the support", core.Box(*SLAB), T_base_scene @ T_scene_slab
+
+
+def _cloud(
+    robot: Robot,
+    joints: Float64,
+    scene: Scene,
+    points: NDArray[np.floating],
+    T_base_scene: Float64,
+) -> Thing | None:
+    """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
+    flat = np.asarray(points).reshape(-1, 3)
+    seen = scene.frame.points(flat[np.isfinite(flat).all(axis=1)])
+    base = np.linalg.inv(T_base_scene)[:3, 3]
+    seen = seen[np.abs(seen - base).max(axis=1) < AROUND]
+    if scene.support is not None:
+        seen = seen[scene.support.heights(seen) > CELL / 2]
+    if len(seen) == 0:
+        return None
+    cell = np.floor(seen / CELL).astype(np.int64)
+    corner = cell.min(axis=0)
+    taken = np.zeros(cell.max(axis=0) - corner + 1, dtype=bool)
+    taken[tuple((cell - corner).T)] = True
+    centers = (np.argwhere(taken) + corner + 0.5) * CELL
+    centers = centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
+    if len(centers) == 0:
+        return None
+    cells = np.column_stack([centers, np.full(len(centers), CELL), *np.ones((2, len(centers)))])
+    return "the cloud", core.OcTree(list(cells), CELL), T_base_scene
+
+
+def moved(T_b_a: Float64, points: ArrayLike) -> Float64:
+    """Points (N, 3) of frame a in frame b."""
+    found: Float64 = np.asarray(points, np.float64) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    return found
