@@ -1,7 +1,7 @@
 """What a server answers, as typed values, and how they are read from either transport."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,7 +10,33 @@ from numpy.typing import ArrayLike, NDArray
 from edgegrasp_client.errors import GraspClientError
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTrajectory:
+    """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
+
+    The gripper opens before `pregrasp_row` and closes at `grasp_row`; the arm rests at both.
+    """
+
+    joint_names: list[str]  # J
+    times: Float64  # (T,) seconds from the start
+    positions: Float64  # (T, J) radians, metres of sliding joints
+    velocities: Float64  # (T, J) per second
+    pregrasp_row: int
+    grasp_row: int
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPlan:
+    """How an arm gets to a grasp."""
+
+    reachable: bool  # whether it gets to the pregrasp and straight on, touching nothing
+    pregrasp_joints: Float64 | None  # (J,) where it is reachable
+    grasp_joints: Float64 | None  # (J,) where it is reachable
+    trajectory: ArmTrajectory | None  # where it was asked for and found in time
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +53,7 @@ class Grasp:
     collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
     object: int | None = None  # number of the object that the contact is on; None: of none
+    arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
 
     def pregrasp(self, distance: float = 0.05) -> Float32:
         """The hand's pose (4, 4) `distance` metres back, where the straight way in begins."""
@@ -110,6 +137,11 @@ class Detection:
     up: Float32  # (3,) unit, away from gravity, as it was used
     objects: list[DetectedObject]  # the largest first
 
+    @property
+    def best_pick(self) -> Grasp | None:
+        """The first grasp within the robot's reach; the server puts those with a motion first."""
+        return next((one for one in self.grasps if one.arm and one.arm.reachable), None)
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -167,7 +199,8 @@ _STAGES = (
     *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
     *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
     *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
-    *("suppressed", "returned", "description", "network", "ranking", "total"),
+    *("suppressed", "hand_collision", "out_of_reach", "arm_collision", "reachable"),
+    *("with_trajectory", "returned", "description", "network", "ranking", "arm", "total"),
 )
 
 
@@ -180,7 +213,7 @@ def detection_from(answer: Any, read: Read) -> Detection:
     """The answer to a request for grasps."""
     debug, support = read(answer, "debug"), read(answer, "support")
     return Detection(
-        grasps=[_record(Grasp, grasp, read) for grasp in read(answer, "grasps")],
+        grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
         up=_array(read(answer, "up")),
         support=None if support is None else _record(FoundSupport, support, read),
         objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
@@ -206,11 +239,33 @@ def models_from(answer: Any, read: Read) -> list[Model]:
 def _record(kind: type[Record], answer: Any, read: Read) -> Record:
     """An object whose fields are read as they are, lists of numbers as arrays, poses (4, 4)."""
     plain = (str, int, float, type(None))
-    values: dict[str, Any] = {one.name: read(answer, one.name) for one in fields(kind)}
+    names = [one.name for one in fields(kind) if one.name != "arm"]
+    values: dict[str, Any] = {name: read(answer, name) for name in names}
     for name, value in values.items():
         if not isinstance(value, plain):
             values[name] = _array(value).reshape((4, 4) if name.startswith("T_") else -1)
     return kind(**values)
+
+
+def _grasp(answer: Any, read: Read) -> Grasp:
+    arm = read(answer, "arm")
+    return replace(_record(Grasp, answer, read), arm=None if arm is None else _arm(arm, read))
+
+
+def _arm(answer: Any, read: Read) -> ArmPlan:
+    def numbers(holder: Any, name: str) -> Float64 | None:
+        sent = read(holder, name)
+        return np.array(sent, dtype=np.float64) if sent else None  # gRPC: none are sent
+
+    motion, trajectory = read(answer, "trajectory"), None
+    if motion is not None:
+        names = list(read(motion, "joint_names"))
+        times, *rows = (numbers(motion, name) for name in ("times", "positions", "velocities"))
+        positions, velocities = (np.reshape(each, (-1, len(names))) for each in rows)
+        ends = read(motion, "pregrasp_row"), read(motion, "grasp_row")
+        trajectory = ArmTrajectory(names, times, positions, velocities, *ends)
+    joints = numbers(answer, "pregrasp_joints"), numbers(answer, "grasp_joints")
+    return ArmPlan(read(answer, "reachable"), *joints, trajectory)
 
 
 def _array(numbers: Any) -> Float32:
@@ -233,9 +288,7 @@ def _in_order(stages: Mapping[str, Any]) -> dict[str, Any]:
 
 def _evaluation(answer: Any, read: Read) -> Evaluation:
     grasp = read(answer, "grasp")
-    return Evaluation(
-        None if grasp is None else _record(Grasp, grasp, read), read(answer, "reason")
-    )
+    return Evaluation(None if grasp is None else _grasp(grasp, read), read(answer, "reason"))
 
 
 def _debug(answer: Any, read: Read) -> DebugInfo:

@@ -89,6 +89,7 @@ Pixel = Annotated[
 ]
 
 
+Matrix = Annotated[tuple[Finite, ...], Field(min_length=16, max_length=16)]  # row by row
 Quaternion = Annotated[
     tuple[Finite, Finite, Finite, Finite],
     AfterValidator(_of_length_one),
@@ -478,10 +479,7 @@ class RobotArm(Strict):
 
     name: str = Field(max_length=100, description="one of the server's robots")
     T_base_cloud: Annotated[
-        tuple[Finite, ...],
-        Field(min_length=16, max_length=16),
-        AfterValidator(_rigid),
-        BeforeValidator(_row_by_row, json_schema_input_type=tuple[Finite, ...]),
+        Matrix, AfterValidator(_rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
     ] = Field(
         description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
     )

@@ -111,8 +111,8 @@ class Model:
 
     urdf: str  # of the arm without what is beyond its flange, and with the gripper's boxes
     packages: list[str]
-    links: list[str]  # those that have a shape, from the base on
-    standing: list[str]  # those of them that no joint moves
+    links: list[str]  # those that have a shape
+    standing: list[str]  # those of them that no joint moves: they may touch what they stand on
     allowed: list[tuple[str, str]]  # pairs of links that may touch
     limits: str  # YAML
 

@@ -57,9 +57,9 @@ def surrounded(
     if (cloud := _cloud(robot, joints, scene, points, T_base_scene)) is not None:
         things.append(cloud)
     names = [name for name, _, _ in things]
+    for planned in (robot.scene, robot.straight):
+        _add(planned, robot, things)
     try:
-        for planned in (robot.scene, robot.straight):
-            _add(planned, robot, things)
         robot.straight.setCollisions([(HAND, name) for name in names], False)
         if robot.scene.hasCollisions(joints):
             again = robot.model.scene(robot.name, robot.base_frame, robot.flange_frame)
@@ -75,9 +75,10 @@ def surrounded(
 
 
 def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
+    T_root_base = planned.forwardKinematics(robot.home, robot.base_frame)
     for name, shape, pose in things:
         add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
-        add(name, robot.base_frame, shape, np.asfortranarray(pose), GREY)  # type: ignore[arg-type]
+        add(name, "universe", shape, np.asfortranarray(T_root_base @ pose), GREY)  # type: ignore[arg-type]
     standing = [(link, name) for link in robot.model.standing for name, _, _ in things]
     planned.setCollisions(standing, False)
 

@@ -15,7 +15,7 @@ UNIX = "unix:"  # begins a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
 NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
-LISTS = ("weights", "grippers", "allowed_hosts")
+LISTS = ("weights", "grippers", "robots", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 Count = Annotated[int, Field(ge=1)]
@@ -44,6 +44,9 @@ class Settings(BaseModel):
         (), description="weights files or folders of them, besides those that ship"
     )
     grippers: tuple[Path, ...] = Field((), description="gripper files (.toml), named by their stem")
+    robots: tuple[Path, ...] = Field(
+        (), description="robot files (.toml), or names of those that ship; needs the extra robot"
+    )
     default_model: str = Field("", description="weights used when a request names none")
     device: str = Field(
         "cpu",

@@ -26,9 +26,11 @@ from edgegrasp_service.worker.process import limited_memory
 
 if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
+    from edgegrasp_robot import Robot
 
 # Memory to read a request in: numbers take some 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
+TO_ENCODE = 0.1  # of the time that a request has, kept for its answer
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -45,7 +47,17 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
         settings.weights, settings.default_model, device, settings.grippers, settings.max_voxels
     )
     catalogue.warm_up()
+    _robots(settings)
     return catalogue
+
+
+def _robots(settings: Settings) -> "Mapping[str, Robot]":
+    """The robots that the settings name; loaded once, before the workers fork."""
+    if not settings.robots:
+        return {}
+    from edgegrasp_robot import load_robots  # half a gigabyte, which few servers need
+
+    return load_robots(settings.robots)
 
 
 def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
@@ -103,6 +115,11 @@ class _Work:
     def _detect(self) -> Detection:
         with self._stage("decode"):
             detector, cloud, options, _ = self._decode()
+        asked, robot = options, self._robot(options)
+        if robot is not None:
+            from edgegrasp_robot import with_robot
+
+            options = with_robot(options, robot)
         with self._stage("prepare"):
             most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
@@ -111,8 +128,24 @@ class _Work:
             logits = detector.evaluate(prepared)
         with self._stage("finish"):
             detection: Detection = detector.finish(prepared, logits)
+        if robot is not None:
+            from edgegrasp_robot import plan_picks
+
+            until = self._deadline - TO_ENCODE * self._job.remaining
+            with self._stage("arm"):
+                detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
         self.facts.grasps = len(detection.grasps)
         return detection
+
+    def _robot(self, options: DetectOptions) -> "Robot | None":
+        """The robot that a request asks about; raises InvalidRequest where it is not here."""
+        if options.robot is None:
+            return None
+        robots = _robots(self._settings)
+        if options.robot.name not in robots:
+            fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
+            raise InvalidRequest("options.robot.name", repr(options.robot.name), fix)
+        return robots[options.robot.name]
 
     def _score(self) -> Scoring:
         with self._stage("decode"):

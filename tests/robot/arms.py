@@ -1,0 +1,79 @@
+"""A table with boxes on it as an arm meets it: a scene and hands over the boxes, no network."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.options import SupportPlane, parse_options
+from edgegrasp_model.results import Detection, Grasp, GripperOutline
+from edgegrasp_model.scene.cloud import CanonicalFrame
+from edgegrasp_model.scene.scene import Scene
+from edgegrasp_robot import plan_picks, with_robot
+
+BOXES = ((0.5, 0.0, 0.05), (0.55, 0.2, 0.03), (0.45, -0.2, 0.04))  # x, y, half height; base frame
+HALF = 0.02  # metres
+TURNED = np.eye(4)  # T_base_cloud of a cloud whose frame is turned and moved
+TURNED[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.2, 1.0)).as_matrix()
+TURNED[:3, 3] = (0.2, -0.3, 0.5)
+
+
+def surface(x, y, half_height, step=0.004):
+    """Points (N, 3) on the sides and top of a box that stands on z = 0."""
+    side = np.arange(-HALF, HALF + 1e-9, step)
+    up = np.arange(0.0, 2 * half_height + 1e-9, step)
+    top = np.stack(np.meshgrid(side, side, [2 * half_height]), axis=-1).reshape(-1, 3)
+    walls = [
+        np.stack(np.meshgrid(*axes, up), axis=-1).reshape(-1, 3)
+        for axes in (([-HALF, HALF], side), (side, [-HALF, HALF]))
+    ]
+    return np.concatenate([top, *walls]) + (x, y, 0.0)
+
+
+def hand_over(gripper, x, y, half_height, tilt=0.0):
+    """T_base_hand (4, 4) from above, the fingers closing on the box's sides."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("yx", (tilt, np.pi)).as_matrix()
+    pose[:3, 3] = np.array([x, y, 2 * half_height]) - (gripper.tip_z - 0.02) * pose[:3, 2]
+    return pose
+
+
+def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=()):
+    """A scene of boxes on a table, its whole cloud, and a detection with a hand over each box."""
+    plane = np.stack(np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01)), -1)
+    table = np.column_stack([plane.reshape(-1, 2), np.zeros(plane.size // 2)])
+    things = [surface(*box) for box in boxes]
+    T_cloud_base = np.linalg.inv(T_base_cloud)
+
+    def in_cloud(points):
+        return (points @ T_cloud_base[:3, :3].T + T_cloud_base[:3, 3]).astype(np.float32)
+
+    objects = in_cloud(np.concatenate(things))
+    number = np.repeat(np.arange(len(things)), [len(one) for one in things])
+    up = T_cloud_base[:3, 2]
+    frame = CanonicalFrame.of_scene(objects, up, T_cloud_base[:3, :3] @ (1.0, 0.0, 0.7))
+    foot = frame.points(in_cloud(np.zeros((1, 3))))[0]
+    every = np.ones(len(objects), dtype=bool)
+    scene = Scene(
+        frame=frame, cloud=None, points_in_cloud=objects, point_of_row=number,
+        approach_allowed=every, contact_allowed=every, object_of_point=number,
+        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
+    )  # fmt: skip
+    poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
+    grasps = [
+        Grasp(0.9 - 0.1 * row, pose.astype(np.float32), pose.astype(np.float32), 0.08, pose[:3, 3],
+              pose[:3, 3], pose[:3, 2].astype(np.float32), True, 0.01, row)
+        for row, pose in enumerate(poses)
+    ]  # fmt: skip
+    gripper = GripperOutline(robot.gripper.name, robot.gripper.palm_z, robot.gripper.tip_z)
+    detection = Detection(grasps, {"scored": len(grasps), "returned": len(grasps)}, {}, "", gripper)
+    cloud = np.concatenate([objects, in_cloud(table), *map(in_cloud, more)])
+    return scene, cloud, detection
+
+
+def picks_of(robot, T_base_cloud=TURNED, joints=None, plan="motion", options=None, **given):
+    """The detection with the arm's plans."""
+    scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
+    asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}
+    asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
+    parsed = parse_options({"robot": asked, **(options or {})})
+    with_robot(parsed, robot)
+    return plan_picks(detection, scene, cloud, parsed, robot)
