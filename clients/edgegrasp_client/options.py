@@ -217,6 +217,19 @@ class Collision(TypedDict, total=False):
     obstacles: Sequence[Obstacle]
 
 
+class RobotArm(TypedDict):
+    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+
+    # one of the server's robots
+    name: str
+    # where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row
+    T_base_cloud: Sequence[float]
+    # the arm's joints now, radians or metres, in the order of the robot file
+    joints: Sequence[float]
+    # reach: joints before and at each grasp; motion: a timed trajectory too
+    plan: NotRequired[Literal["reach", "motion"]]
+
+
 class Suppression(TypedDict, total=False):
     """Drop a grasp near a better one: nearer than both distances."""
 
@@ -267,6 +280,8 @@ class DetectOptions(TypedDict, total=False):
     approach_direction: ApproachDirection | None
     # what the hand must not meet; a bare mode will do
     collision: Literal["avoid", "penalise", "ignore"] | Collision
+    # the arm that is to execute a grasp; grasps within its reach come first; None: a hand alone
+    robot: RobotArm | None
     # lowest score returned
     min_score: float
     # grasps returned at most

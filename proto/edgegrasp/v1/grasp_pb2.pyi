@@ -586,6 +586,7 @@ class DetectOptions(_message.Message):
     CONTACT_REGION_FIELD_NUMBER: _builtins.int
     APPROACH_DIRECTION_FIELD_NUMBER: _builtins.int
     COLLISION_FIELD_NUMBER: _builtins.int
+    ROBOT_FIELD_NUMBER: _builtins.int
     MIN_SCORE_FIELD_NUMBER: _builtins.int
     TOP_K_FIELD_NUMBER: _builtins.int
     SUPPRESSION_FIELD_NUMBER: _builtins.int
@@ -669,6 +670,10 @@ class DetectOptions(_message.Message):
         """What the hand must not meet; a bare mode will do."""
 
     @_builtins.property
+    def robot(self) -> Global___RobotArm:
+        """The arm that is to execute a grasp; grasps within its reach come first; absent: a hand alone."""
+
+    @_builtins.property
     def suppression(self) -> Global___Suppression:
         """Non-maximum suppression; disabled: none."""
 
@@ -697,6 +702,7 @@ class DetectOptions(_message.Message):
         contact_region: Global___Region | None = ...,
         approach_direction: Global___ApproachDirection | None = ...,
         collision: Global___Collision | None = ...,
+        robot: Global___RobotArm | None = ...,
         min_score: _builtins.float | None = ...,
         top_k: _builtins.int | None = ...,
         suppression: Global___Suppression | None = ...,
@@ -704,9 +710,9 @@ class DetectOptions(_message.Message):
         debug: _builtins.bool | None = ...,
         object_choice: Global___ObjectChoice | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
@@ -1141,6 +1147,53 @@ class Collision(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__retreat_length) -> _WhichOneofReturnType__retreat_length | None: ...
 
 Global___Collision: _TypeAlias = Collision  # noqa: Y015
+
+@_typing.final
+class RobotArm(_message.Message):
+    """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    T_BASE_CLOUD_FIELD_NUMBER: _builtins.int
+    JOINTS_FIELD_NUMBER: _builtins.int
+    PLAN_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """One of the server's robots."""
+    plan: _builtins.str
+    """Reach: joints before and at each grasp; motion: a timed trajectory too. One of "reach",
+    "motion".
+    """
+    @_builtins.property
+    def T_base_cloud(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row."""
+
+    @_builtins.property
+    def joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """The arm's joints now, radians or metres, in the order of the robot file."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str | None = ...,
+        T_base_cloud: _abc.Iterable[_builtins.float] | None = ...,
+        joints: _abc.Iterable[_builtins.float] | None = ...,
+        plan: _builtins.str | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_name", b"_name", "_plan", b"_plan", "name", b"name", "plan", b"plan"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_cloud", b"T_base_cloud", "_name", b"_name", "_plan", b"_plan", "joints", b"joints", "name", b"name", "plan", b"plan"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
+    _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
+    _WhichOneofReturnType__plan: _TypeAlias = _typing.Literal["plan"]  # noqa: Y015
+    _WhichOneofArgType__plan: _TypeAlias = _typing.Literal["_plan", b"_plan"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__name) -> _WhichOneofReturnType__name | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__plan) -> _WhichOneofReturnType__plan | None: ...
+
+Global___RobotArm: _TypeAlias = RobotArm  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
@@ -1940,6 +1993,7 @@ class Grasp(_message.Message):
     COLLISION_FREE_FIELD_NUMBER: _builtins.int
     CLEARANCE_FIELD_NUMBER: _builtins.int
     OBJECT_FIELD_NUMBER: _builtins.int
+    ARM_FIELD_NUMBER: _builtins.int
     score: _builtins.float
     """Probability that the grasp holds, in [0, 1]."""
     width: _builtins.float
@@ -1970,6 +2024,12 @@ class Grasp(_message.Message):
     def approach_direction(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """3 floats: unit direction in which the hand moves, cloud frame; +z of the hand."""
 
+    @_builtins.property
+    def arm(self) -> Global___ArmPlan:
+        """How the robot's arm gets there; absent (null in JSON): no robot was asked about, or there was
+        no time for it.
+        """
+
     def __init__(
         self,
         *,
@@ -1983,16 +2043,107 @@ class Grasp(_message.Message):
         collision_free: _builtins.bool = ...,
         clearance: _builtins.float = ...,
         object: _builtins.int | None = ...,
+        arm: Global___ArmPlan | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_object", b"_object", "object", b"object"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_object", b"_object", "arm", b"arm", "object", b"object"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "arm", b"arm", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__object: _TypeAlias = _typing.Literal["object"]  # noqa: Y015
     _WhichOneofArgType__object: _TypeAlias = _typing.Literal["_object", b"_object"]  # noqa: Y015
     def WhichOneof(self, oneof_group: _WhichOneofArgType__object) -> _WhichOneofReturnType__object | None: ...
 
 Global___Grasp: _TypeAlias = Grasp  # noqa: Y015
+
+@_typing.final
+class ArmPlan(_message.Message):
+    """How an arm gets to a grasp. J joints, in the order of the robot file."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    REACHABLE_FIELD_NUMBER: _builtins.int
+    PREGRASP_JOINTS_FIELD_NUMBER: _builtins.int
+    GRASP_JOINTS_FIELD_NUMBER: _builtins.int
+    TRAJECTORY_FIELD_NUMBER: _builtins.int
+    reachable: _builtins.bool
+    """Whether it gets to the pregrasp and straight on, touching nothing."""
+    @_builtins.property
+    def pregrasp_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J radians (metres of sliding joints) where it is reachable; else absent (null in JSON)."""
+
+    @_builtins.property
+    def grasp_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J radians (metres of sliding joints) where it is reachable; else absent (null in JSON)."""
+
+    @_builtins.property
+    def trajectory(self) -> Global___ArmTrajectory:
+        """Where it was asked for and found in time; else absent (null in JSON)."""
+
+    def __init__(
+        self,
+        *,
+        reachable: _builtins.bool = ...,
+        pregrasp_joints: _abc.Iterable[_builtins.float] | None = ...,
+        grasp_joints: _abc.Iterable[_builtins.float] | None = ...,
+        trajectory: Global___ArmTrajectory | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["trajectory", b"trajectory"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["grasp_joints", b"grasp_joints", "pregrasp_joints", b"pregrasp_joints", "reachable", b"reachable", "trajectory", b"trajectory"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ArmPlan: _TypeAlias = ArmPlan  # noqa: Y015
+
+@_typing.final
+class ArmTrajectory(_message.Message):
+    """A timed motion: to the pregrasp, straight to the grasp, straight out. T rows."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    JOINT_NAMES_FIELD_NUMBER: _builtins.int
+    TIMES_FIELD_NUMBER: _builtins.int
+    POSITIONS_FIELD_NUMBER: _builtins.int
+    VELOCITIES_FIELD_NUMBER: _builtins.int
+    PREGRASP_ROW_FIELD_NUMBER: _builtins.int
+    GRASP_ROW_FIELD_NUMBER: _builtins.int
+    pregrasp_row: _builtins.int
+    """Row at which the arm rests at the pregrasp."""
+    grasp_row: _builtins.int
+    """Row at which the arm rests at the grasp, for the gripper to close."""
+    @_builtins.property
+    def joint_names(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """J names."""
+
+    @_builtins.property
+    def times(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """T seconds from the start."""
+
+    @_builtins.property
+    def positions(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """T * J radians (metres of sliding joints), row by row."""
+
+    @_builtins.property
+    def velocities(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """T * J per second, row by row."""
+
+    def __init__(
+        self,
+        *,
+        joint_names: _abc.Iterable[_builtins.str] | None = ...,
+        times: _abc.Iterable[_builtins.float] | None = ...,
+        positions: _abc.Iterable[_builtins.float] | None = ...,
+        velocities: _abc.Iterable[_builtins.float] | None = ...,
+        pregrasp_row: _builtins.int = ...,
+        grasp_row: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["grasp_row", b"grasp_row", "joint_names", b"joint_names", "positions", b"positions", "pregrasp_row", b"pregrasp_row", "times", b"times", "velocities", b"velocities"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ArmTrajectory: _TypeAlias = ArmTrajectory  # noqa: Y015
 
 @_typing.final
 class DebugInfo(_message.Message):
