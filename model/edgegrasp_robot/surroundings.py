@@ -86,7 +86,7 @@ def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
 def _check_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> None:
     of_object = scene.object_of_point >= 0
     objects = scene.points_in_cloud[of_object]
-    within = _near_robot(robot, joints, moved(T_base_cloud, objects), 0.0)
+    within = _near_robot(robot, joints, moved(T_base_cloud, objects), CELL / 2)  # of its skin
     if within.sum() > INSIDE:
         number = np.bincount(scene.object_of_point[of_object][within]).argmax()
         value = f"a pose that puts the arm into object {number}"
@@ -158,7 +158,9 @@ def _cloud(
     centers = centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
     if len(centers) == 0:
         return None
-    cells = np.column_stack([centers, np.full(len(centers), CELL), *np.ones((2, len(centers)))])
+    # Columns as coal's octrees have them: center, size, how probably it is occupied, and from
+    # which probability on it counts; octomap knows no certainty.
+    cells = np.column_stack([centers, np.tile([CELL, 0.97, 0.5], (len(centers), 1))])
     return "the cloud", core.OcTree(list(cells), CELL), T_base_scene
 
 

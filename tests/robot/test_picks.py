@@ -1,0 +1,210 @@
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("roboplan", reason="the extra robot is not installed")
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import parse_options
+from edgegrasp_robot import load_robot, plan_picks
+from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
+
+CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
+
+
+@pytest.fixture(scope="module", params=["fr3", "ur5"])
+def robot(request):
+    return load_robot(request.param)
+
+
+@pytest.fixture(scope="module")
+def fr3():
+    return load_robot("fr3")
+
+
+def assert_pose(found, wanted):
+    assert np.linalg.norm(found[:3, 3] - wanted[:3, 3]) < CLOSE
+    turn = Rotation.from_matrix(found[:3, :3].T @ wanted[:3, :3]).magnitude()
+    assert turn < CLOSE_ANGLE
+
+
+def plans_of(detection):
+    return [(grasp, grasp.arm) for grasp in detection.grasps if grasp.arm and grasp.arm.reachable]
+
+
+def touches(robot, joints, points, distance=0.0):
+    """Whether the robot, as the planner sees it, holds any of the points (N, 3), base frame."""
+    from edgegrasp_robot.surroundings import _near_robot
+
+    return bool(_near_robot(robot, joints, points, distance).any())
+
+
+def test_every_box_gets_a_motion(robot):
+    detection = picks_of(robot)
+    assert detection.counts["reachable"] == detection.counts["with_trajectory"] == len(BOXES)
+    assert detection.warnings == []
+
+
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(x=st.floats(0.4, 0.6), y=st.floats(-0.25, 0.25), tilt=st.floats(-3.1, 3.1))
+def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
+    T_base_cloud = TURNED.copy()
+    T_base_cloud[:3, :3] = Rotation.from_euler("z", tilt).as_matrix()
+    detection = picks_of(robot, T_base_cloud, boxes=((x, y, 0.04),))
+    for grasp, plan in plans_of(detection):
+        T_base_hand = T_base_cloud @ grasp.T_cloud_hand
+        assert_pose(robot.hand_pose(plan.grasp_joints), T_base_hand)
+        before = T_base_hand.copy()
+        before[:3, 3] -= 0.05 * T_base_hand[:3, 2]
+        assert_pose(robot.hand_pose(plan.pregrasp_joints), before)
+        motion = plan.trajectory
+        assert motion is not None
+        np.testing.assert_allclose(motion.positions[0], robot.home, atol=1e-9)
+        np.testing.assert_allclose(
+            motion.positions[motion.pregrasp_row], plan.pregrasp_joints, atol=1e-6
+        )
+        np.testing.assert_allclose(motion.positions[motion.grasp_row], plan.grasp_joints, atol=1e-6)
+        for row in (0, motion.pregrasp_row, motion.grasp_row, -1):
+            assert np.abs(motion.velocities[row]).max() < 1e-6
+        assert (motion.positions >= robot.lower).all()
+        assert (motion.positions <= robot.upper).all()
+        assert (np.abs(motion.velocities) <= 1.001 * robot.max_velocity).all()
+        step = np.diff(motion.times)
+        assert (step > 0).all()
+        velocities = np.diff(motion.positions, axis=0) / step[:, None]
+        assert (np.abs(velocities) <= 1.001 * robot.max_velocity).all()
+        rate = np.abs(np.diff(motion.velocities, axis=0) / step[:, None])
+        assert (rate <= 1.05 * robot.max_acceleration).all()
+
+
+def test_the_way_in_is_straight(robot):
+    for grasp, plan in plans_of(picks_of(robot)):
+        motion = plan.trajectory
+        T_base_hand = TURNED @ grasp.T_cloud_hand
+        for joints in motion.positions[motion.pregrasp_row : motion.grasp_row + 1]:
+            hand = robot.hand_pose(joints)
+            off = np.cross(hand[:3, 3] - T_base_hand[:3, 3], T_base_hand[:3, 2])
+            assert np.linalg.norm(off) < 0.002
+
+
+def test_a_scene_turned_with_the_base_gives_the_same_picks(fr3):
+    one, other = picks_of(fr3, np.eye(4)), picks_of(fr3, TURNED)
+    assert [grasp.object for grasp in one.grasps] == [grasp.object for grasp in other.grasps]
+    for (_, first), (_, second) in zip(plans_of(one), plans_of(other), strict=True):
+        np.testing.assert_allclose(first.grasp_joints, second.grasp_joints, atol=2e-3)
+
+
+def test_the_same_request_gives_the_same_motion(fr3):
+    one, other = picks_of(fr3), picks_of(fr3)
+    for (_, first), (_, second) in zip(plans_of(one), plans_of(other), strict=True):
+        np.testing.assert_array_equal(first.trajectory.positions, second.trajectory.positions)
+
+
+def test_the_motion_goes_around_what_is_seen(fr3):
+    turned = fr3.home.copy()
+    turned[0] = -1.4  # beside the table
+    seen = np.stack(
+        np.meshgrid(np.arange(0.25, 0.75, 0.008), [-0.33], np.arange(0.0, 0.5, 0.008)), -1
+    )
+    seen = seen.reshape(-1, 3)
+    detection = picks_of(fr3, joints=turned, boxes=BOXES[:1], more=[seen])
+    ((_, plan),) = plans_of(detection)
+    assert not any(touches(fr3, joints, seen) for joints in plan.trajectory.positions)
+    direct = np.linspace(turned, plan.pregrasp_joints, 60)
+    assert any(touches(fr3, joints, seen) for joints in direct)  # it had to go around
+
+
+def test_what_is_out_of_reach_is_counted_and_comes_last(fr3):
+    detection = picks_of(fr3, boxes=((1.4, 0.0, 0.05), BOXES[0]))
+    assert detection.counts["out_of_reach"] == 1
+    assert [grasp.arm.reachable for grasp in detection.grasps] == [True, False]
+    assert detection.grasps[0].object == 1  # of a lower score
+
+
+def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
+    lid = {"min": (0.4, -0.1, 0.2), "max": (0.6, 0.1, 0.22)}
+    detection = picks_of(
+        fr3,
+        np.eye(4),
+        boxes=BOXES[:1],
+        options={"collision": {"obstacles": [{"kind": "box", **lid}]}},
+    )
+    assert detection.counts["arm_collision"] == 1
+    assert "arm's reach" in detection.warnings[0]
+
+
+def test_reach_has_joints_and_no_motion(fr3):
+    detection = picks_of(fr3, plan="reach")
+    assert all(plan.trajectory is None for _, plan in plans_of(detection))
+    assert "with_trajectory" not in detection.counts
+    assert len(plans_of(detection)) == len(BOXES)
+
+
+def test_no_time_gives_no_motion_and_says_so(fr3):
+    scene, cloud, detection = scene_of(fr3)
+    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    options = parse_options({"robot": robot})
+    found = plan_picks(detection, scene, cloud, options, fr3, until=0.0)
+    assert [grasp.arm for grasp in found.grasps] == [None] * len(BOXES)
+    assert "time ran out" in found.warnings[-1]
+
+
+def test_a_colliding_hand_gets_no_motion(fr3):
+    from dataclasses import replace
+
+    scene, cloud, detection = scene_of(fr3)
+    grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
+    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    found = plan_picks(
+        replace(detection, grasps=grasps), scene, cloud, parse_options({"robot": robot}), fr3
+    )
+    assert not any(grasp.arm.reachable for grasp in found.grasps)
+    assert found.counts["hand_collision"] == len(BOXES)
+
+
+REFUSED = {
+    "too few joints": ({"joints": [0.0] * 3}, "options.robot.joints", "Send 7"),
+    "beyond a limit": ({"joints": [3.0, 0, 0, -2, 0, 2, 0]}, "options.robot.joints.0", "fr3_joint1"),
+    "in the table": (
+        {"joints": [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]}, "options.robot.joints", "touch",
+    ),
+    "in itself": (
+        {"joints": [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]}, "options.robot.joints", "touch",
+    ),
+    "in an object": ({"boxes": ((0.06, 0.0, 0.05),)}, "options.robot.T_base_cloud", "object"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_robot_that_cannot_be_there_is_refused(fr3, case):
+    changed, field, word = REFUSED[case]
+    with pytest.raises(InvalidRequest) as error:
+        picks_of(fr3, **changed)
+    assert error.value.field == field
+    assert word in str(error.value)
+    assert len(plans_of(picks_of(fr3))) == len(BOXES)  # nothing of it is left
+
+
+@pytest.mark.parametrize("pose", [np.full(16, np.nan), np.zeros(16), 2 * np.eye(4)])
+def test_a_pose_that_is_none_is_refused(pose):
+    robot = {"name": "fr3", "T_base_cloud": pose.ravel().tolist(), "joints": [0.0] * 7}
+    with pytest.raises(InvalidRequest) as error:
+        parse_options({"robot": robot})
+    assert error.value.field.startswith("options.robot.T_base_cloud")
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"collision": "ignore"}, "options.collision.mode"),
+        ({"gripper": "barrett"}, "options.gripper"),
+    ],
+)
+def test_options_that_do_not_go_with_an_arm_are_refused(fr3, options, field):
+    with pytest.raises(InvalidRequest) as error:
+        picks_of(fr3, options=options)
+    assert error.value.field == field

@@ -1,0 +1,89 @@
+import shutil
+
+import numpy as np
+import pytest
+
+pytest.importorskip("roboplan", reason="the extra robot is not installed")
+
+from edgegrasp_robot import load_robot, load_robots, robot_names
+from edgegrasp_robot.robot import ROBOT_FOLDER, InvalidRobot
+
+
+def test_the_hand_of_the_fr3_is_where_franka_has_it():
+    robot = load_robot("fr3")
+    upright = robot.hand_pose([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4])
+    # 0.333 + 0.316 up, 0.0825 ahead, then 0.0825 up, 0.384 ahead, 0.088 ahead, 0.107 down.
+    np.testing.assert_allclose(upright[:3, 3], (0.5545, 0.0, 0.6245), atol=1e-4)
+    np.testing.assert_allclose(upright[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-4)
+
+
+def test_the_hand_of_the_ur5_is_a_coupling_away_from_its_flange():
+    robot = load_robot("ur5")
+    straight = robot.hand_pose(np.zeros(6))
+    # DH parameters of UR: a2 + a3 ahead; d4 + d6 and the coupling aside; d1 - d5 up.
+    expected = (0.425 + 0.39225, 0.10915 + 0.0823 + 0.0108, 0.089159 - 0.09465)
+    np.testing.assert_allclose(straight[:3, 3], expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_robots_that_ship_load_and_tell_what_they_are(name):
+    facts = load_robots((ROBOT_FOLDER / name,))[name].describe()
+    assert facts["name"] == name
+    assert len(facts["joint_names"]) == len(facts["home"]) == len(facts["max_acceleration"])
+
+
+def changed(folder, **lines):
+    """The file of the FR3 with other lines."""
+    text = (ROBOT_FOLDER / "fr3.toml").read_text()
+    kept = [line for line in text.splitlines() if line.partition(" ")[0] not in lines]
+    file = folder / "mine.toml"
+    file.write_text(
+        "\n".join([*(f"{name} = {value}" for name, value in lines.items() if value), *kept])
+    )
+    return file
+
+
+BAD = {
+    "no urdf": ({"urdf": ""}, "urdf"),
+    "no such urdf": ({"urdf": '"nowhere.urdf"'}, "urdf: there is no 'nowhere.urdf'"),
+    "no such srdf": ({"srdf": '"nowhere.srdf"'}, "srdf: there is no"),
+    "unknown flange": ({"flange_frame": '"flansch"'}, "fr3_link8"),
+    "base beside the chain": ({"base_frame": '"fr3_hand"'}, "base_frame"),
+    "flange that nothing moves": ({"flange_frame": '"fr3_link0"'}, "flange_frame"),
+    "unknown gripper": ({"gripper": '"claw"'}, "gripper"),
+    "short home": ({"home": "[0.0]"}, "home: got 1 numbers"),
+    "home beyond limits": ({"home": "[9.0, 0.0, 0.0, -2.0, 0.0, 2.0, 0.0]"}, "home"),
+    "home in itself": ({"home": "[0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]"}, "touch"),
+    "unknown field": ({"speed": "1.0"}, "speed"),
+    "no toml": ({"home": "["}, "mine.toml"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_file_that_is_wrong_says_how(tmp_path, case):
+    lines, word = BAD[case]
+    with pytest.raises(InvalidRobot, match=r"mine\.toml") as error:
+        load_robot(changed(tmp_path, **lines))
+    assert word in str(error.value)
+
+
+def test_a_missing_mesh_is_named(tmp_path):
+    urdf = """<robot name="r"><link name="base"/><link name="tip"><collision><geometry>
+        <mesh filename="package://lost/tip.stl"/></geometry></collision></link>
+        <joint name="turn" type="revolute"><parent link="base"/><child link="tip"/>
+        <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+        <link name="flange"/><joint name="end" type="fixed"><parent link="tip"/>
+        <child link="flange"/></joint></robot>"""
+    (tmp_path / "r.urdf").write_text(urdf)
+    lines = {
+        "urdf": '"r.urdf"', "srdf": '""', "base_frame": '"base"', "flange_frame": '"flange"',
+        "home": "[0.0]", "max_velocity": "[1.0]", "max_acceleration": "[1.0]",
+    }  # fmt: skip
+    with pytest.raises(InvalidRobot, match=r"mesh of tip: there is no 'package://lost/tip\.stl'"):
+        load_robot(changed(tmp_path, **lines))
+    shutil.rmtree(tmp_path)
+
+
+def test_an_unknown_name_says_those_that_ship():
+    with pytest.raises(InvalidRobot, match="fr3"):
+        load_robot("r2d2")
