@@ -55,7 +55,7 @@ Intrinsics = Annotated[
 Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
 
 
-@takes_flags(connection=CONNECTION, options=option_flags())
+@takes_flags(connection=CONNECTION, options=option_flags("robot"))
 def detect(
     file: Cloud = None,
     depth: Depth = None,
@@ -73,6 +73,19 @@ def detect(
     picture: Annotated[
         Path | None, Option(help="Picture of the best grasps to write, .png or .jpg.")
     ] = None,
+    robot: Annotated[
+        str | None, Option(help="The server's robot of that name; else one that ships, or a file.")
+    ] = None,
+    joints: Annotated[
+        str | None, Option(help="The robot's joints now: j1,j2,… in radians.")
+    ] = None,
+    base: Annotated[
+        str | None,
+        Option(help="T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON."),
+    ] = None,
+    trajectory: Annotated[
+        Path | None, Option(help="JSON file to write the arm's motion to the best pick to.")
+    ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
@@ -88,12 +101,16 @@ def detect(
     edgegrasp detect cloud.ply --viewpoint 0,0,0 --picture grasps.png
 
     edgegrasp detect --depth depth.png --intrinsics 615,615,320,240 --at 310,250
+
+    edgegrasp detect cloud.ply --robot fr3 --joints 0,-0.8,0,-2.4,0,1.6,0.8 --base 1,0,0,0.3,…
     """
     from rich.console import Console
 
     if picture is not None:
         _check_picture(picture)
-    fields = _options(options_file, options)
+    fields = _options(options_file, options) | _robot_option(robot, joints, base)
+    if trajectory is not None and "robot" not in fields:
+        raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
     images = _depth_images(file, depth, intrinsics, depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
     if mask is not None:
@@ -105,6 +122,8 @@ def detect(
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if picture is not None:
         draw(picture, detection, fields, file, images, colors)
+    if trajectory is not None:
+        _write_trajectory(trajectory, detection)
     if as_document:
         from edgegrasp_service.worker.http_bodies import write
 
@@ -168,7 +187,15 @@ class OwnDetector:
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
         sent, parsed = decode(cloud, depth_images, colors, options)
-        return self._catalogue.get(parsed.model).detect(sent, parsed)
+        detector = self._catalogue.get(parsed.model)
+        if parsed.robot is None:
+            return detector.detect(sent, parsed)
+        from edgegrasp_robot import load_robot, plan_picks, with_robot
+
+        robot = load_robot(parsed.robot.name)
+        prepared = detector.prepare(sent, with_robot(parsed, robot))
+        detection = detector.finish(prepared, detector.evaluate(prepared))
+        return plan_picks(detection, prepared.scene, sent.points, parsed, robot)
 
     def models(self) -> "list[Model]":
         """The weights that can be used."""
@@ -265,6 +292,37 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
     return fields | parse_option_flags(given)
+
+
+def _robot_option(robot: str | None, joints: str | None, base: str | None) -> dict[str, Any]:
+    """The option `robot` of the flags; nothing where there is none of them."""
+    from edgegrasp_service.worker.http_bodies import value_of_text
+
+    given = {"--robot": robot, "--joints": joints, "--base": base}
+    missing = [flag for flag, value in given.items() if value is None]
+    if len(missing) == len(given):
+        return {}
+    if missing:
+        raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
+    numbers = [part for part in str(joints).split(",") if part]
+    pose = value_of_text("--base", str(base))
+    return {"robot": {"name": robot, "joints": list(map(float, numbers)), "T_base_cloud": pose}}
+
+
+def _write_trajectory(file: Path, detection: Any) -> None:
+    """Write the motion to the best pick, and the pick; raises ValueError where there is none."""
+    import numpy as np
+
+    moving = [one for one in detection.grasps if one.arm is not None and one.arm.trajectory]
+    if not moving:
+        counts = ", ".join(f"{count} {name}" for name, count in detection.counts.items())
+        raise ValueError(f"--trajectory: the arm has no way to any grasp ({counts}).")
+    motion = {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(moving[0].arm.trajectory).items()
+    }
+    motion |= {"T_cloud_hand": moving[0].T_cloud_hand.tolist(), "width": moving[0].width}
+    file.write_text(json.dumps(motion))
 
 
 def _depth_images(

@@ -250,6 +250,14 @@ def _collision(message: Message, value: Any, path: str) -> Filled:
     return message, {"mode": value} if isinstance(value, str) else value
 
 
+def _robot(message: Message, value: Any, path: str) -> Filled:
+    """A pose may also be rows, as arrays are sent."""
+    pose = value.get("T_base_cloud") if isinstance(value, Mapping) else None
+    if isinstance(pose, list) and all(isinstance(row, list) for row in pose):
+        value = {**value, "T_base_cloud": [number for row in pose for number in row]}
+    return message, value
+
+
 def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
     return {name: part for name, part in value.items() if name != "kind"}
 
@@ -257,6 +265,7 @@ def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
 # Messages that JSON does not write field by field: the message to fill, and its fields.
 _FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
     grasp_pb2.DetectOptions: _options,
+    grasp_pb2.RobotArm: _robot,
     grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,

@@ -56,7 +56,8 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
     if options.gripper not in (None, robot.gripper.name):
         fix = f"Leave it out: the robot {robot.name!r} has a {robot.gripper.name!r}."
         raise InvalidRequest("options.gripper", "another gripper than the robot's", fix)
-    return options.model_copy(update={"top_k": max(options.top_k, TRIED)})
+    changes = {"top_k": max(options.top_k, TRIED), "gripper": robot.hand}
+    return options.model_copy(update=changes)
 
 
 def plan_picks(

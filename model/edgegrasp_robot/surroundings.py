@@ -79,8 +79,15 @@ def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
     for name, shape, pose in things:
         add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
         add(name, "universe", shape, np.asfortranarray(T_root_base @ pose), GREY)  # type: ignore[arg-type]
-    standing = [(link, name) for link in robot.model.standing for name, _, _ in things]
-    planned.setCollisions(standing, False)
+    names = [name for name, _, _ in things]
+    still = [*robot.model.standing, *names]  # no joint moves them
+    pairs = [
+        (one, name)
+        for row, one in enumerate(still)
+        for name in names
+        if name not in still[: row + 1]
+    ]
+    planned.setCollisions(pairs, False)
 
 
 def _check_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> None:

@@ -25,7 +25,7 @@ def surface(x, y, half_height, step=0.004):
         np.stack(np.meshgrid(*axes, up), axis=-1).reshape(-1, 3)
         for axes in (([-HALF, HALF], side), (side, [-HALF, HALF]))
     ]
-    return np.concatenate([top, *walls]) + (x, y, 0.0)
+    return np.concatenate([top, *walls]) + np.array((x, y, 0.0))
 
 
 def hand_over(gripper, x, y, half_height, tilt=0.0):

@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
+from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
+
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import parse_options
 from edgegrasp_robot import load_robot, plan_picks
-from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
 
@@ -137,6 +138,12 @@ def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
     assert "arm's reach" in detection.warnings[0]
 
 
+def test_obstacles_may_touch_each_other(fr3):
+    boxes = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
+    detection = picks_of(fr3, np.eye(4), options={"collision": {"obstacles": boxes}})
+    assert detection.counts["with_trajectory"] == len(BOXES)
+
+
 def test_reach_has_joints_and_no_motion(fr3):
     detection = picks_of(fr3, plan="reach")
     assert all(plan.trajectory is None for _, plan in plans_of(detection))
@@ -168,7 +175,7 @@ def test_a_colliding_hand_gets_no_motion(fr3):
 
 REFUSED = {
     "too few joints": ({"joints": [0.0] * 3}, "options.robot.joints", "Send 7"),
-    "beyond a limit": ({"joints": [3.0, 0, 0, -2, 0, 2, 0]}, "options.robot.joints.0", "fr3_joint1"),
+    "beyond a limit": ({"joints": [3, 0, 0, -2, 0, 2, 0]}, "options.robot.joints.0", "fr3_joint1"),
     "in the table": (
         {"joints": [0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8]}, "options.robot.joints", "touch",
     ),

@@ -115,11 +115,17 @@ class _Work:
     def _detect(self) -> Detection:
         with self._stage("decode"):
             detector, cloud, options, _ = self._decode()
-        asked, robot = options, self._robot(options)
-        if robot is not None:
-            from edgegrasp_robot import with_robot
+        if options.robot is None:
+            detection, _ = self._grasps(detector, cloud, options)
+        else:
+            detection = self._picks(detector, cloud, options, options.robot.name)
+        self.facts.grasps = len(detection.grasps)
+        return detection
 
-            options = with_robot(options, robot)
+    def _grasps(
+        self, detector: Any, cloud: CloudInput, options: DetectOptions
+    ) -> tuple[Detection, Any]:
+        """The detection, and the scene that it is of."""
         with self._stage("prepare"):
             most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
@@ -127,25 +133,23 @@ class _Work:
         with self._stage("network"):
             logits = detector.evaluate(prepared)
         with self._stage("finish"):
-            detection: Detection = detector.finish(prepared, logits)
-        if robot is not None:
-            from edgegrasp_robot import plan_picks
+            return detector.finish(prepared, logits), prepared.scene
 
-            until = self._deadline - TO_ENCODE * self._job.remaining
-            with self._stage("arm"):
-                detection = plan_picks(detection, prepared.scene, cloud.points, asked, robot, until)
-        self.facts.grasps = len(detection.grasps)
-        return detection
-
-    def _robot(self, options: DetectOptions) -> "Robot | None":
-        """The robot that a request asks about; raises InvalidRequest where it is not here."""
-        if options.robot is None:
-            return None
+    def _picks(
+        self, detector: Any, cloud: CloudInput, options: DetectOptions, name: str
+    ) -> Detection:
+        """The detection, with how a robot's arm gets to the grasps."""
         robots = _robots(self._settings)
-        if options.robot.name not in robots:
+        if name not in robots:
             fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
-            raise InvalidRequest("options.robot.name", repr(options.robot.name), fix)
-        return robots[options.robot.name]
+            raise InvalidRequest("options.robot.name", repr(name), fix)
+        from edgegrasp_robot import plan_picks, with_robot
+
+        robot = robots[name]
+        detection, scene = self._grasps(detector, cloud, with_robot(options, robot))
+        until = self._deadline - TO_ENCODE * self._job.remaining
+        with self._stage("arm"):
+            return plan_picks(detection, scene, cloud.points, options, robot, until)
 
     def _score(self) -> Scoring:
         with self._stage("decode"):

@@ -1,0 +1,114 @@
+"""A worker with a robot: the arm's plans as either transport carries them."""
+
+import json
+import operator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("roboplan", reason="the extra robot is not installed")
+
+from tests.robot.arms import BOXES, TURNED, scene_of
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_client import grpc_wire
+from edgegrasp_client.requests import Request, plain_options
+from edgegrasp_client.results import detection_from
+from edgegrasp_model.results import Pace
+from edgegrasp_robot import load_robots
+from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.answer import answer
+from edgegrasp_service.worker.job import Job
+
+SETTINGS = Settings(robots=(Path("fr3"),))
+
+
+class Catalogue:
+    """A detector that finds a hand over each box, and keeps the options it was asked with."""
+
+    pace = Pace()
+
+    def __init__(self, robot):
+        self.scene, self.cloud, self.detection = scene_of(robot)
+
+    def get(self, name):
+        return self
+
+    def prepare(self, cloud, options, most):
+        self.options = options
+        return SimpleNamespace(scene=self.scene, counts={})
+
+    def evaluate(self, prepared):
+        return None
+
+    def finish(self, prepared, logits):
+        return self.detection
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robots(SETTINGS.robots)["fr3"]
+
+
+def ask(robot, transport, settings=SETTINGS, remaining=60.0, **changes):
+    """The answer to a request about the robot, and the catalogue that it went to."""
+    catalogue = Catalogue(robot)
+    asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
+    request = Request(catalogue.cloud, options=plain_options({"robot": asked}))
+    if transport == "grpc":
+        body = grpc_wire.detect_message(request).SerializeToString()
+        return answer(Job("DetectGrasps", "grpc", body, remaining), catalogue, settings), catalogue
+    text = {"points": catalogue.cloud.tolist(), "options": dict(request.options)}
+    job = Job("DetectGrasps", "http", json.dumps(text).encode(), remaining, "application/json")
+    return answer(job, catalogue, settings), catalogue
+
+
+def read(transport, body):
+    if transport == "grpc":
+        return detection_from(grasp_pb2.DetectGraspsResponse.FromString(body), grpc_wire.read_field)
+    return detection_from(json.loads(body), operator.getitem)
+
+
+@pytest.mark.parametrize("transport", ["grpc", "http"])
+def test_the_client_reads_the_best_pick(robot, transport):
+    given, catalogue = ask(robot, transport)
+    assert given.error is None
+    detection = read(transport, given.body)
+    pick = detection.best_pick
+    assert pick is detection.grasps[0]
+    assert pick.arm.trajectory.joint_names == robot.joint_names
+    np.testing.assert_allclose(pick.arm.trajectory.positions[0], robot.home)
+    assert pick.arm.trajectory.velocities.shape == pick.arm.trajectory.positions.shape
+    T_base_hand = TURNED @ pick.T_cloud_hand
+    np.testing.assert_allclose(robot.hand_pose(pick.arm.grasp_joints), T_base_hand, atol=2e-3)
+    assert list(detection.counts)[-2:] == ["with_trajectory", "returned"]
+    assert catalogue.options.gripper.name == robot.gripper.name  # for which grasps are
+
+
+@pytest.mark.parametrize("transport", ["grpc", "http"])
+def test_reach_alone_and_what_is_out_of_reach(robot, transport):
+    far = TURNED.copy()
+    far[0, 3] += 3.0
+    given, _ = ask(robot, transport, plan="reach", T_base_cloud=far)
+    detection = read(transport, given.body)
+    assert detection.best_pick is None
+    assert [grasp.arm.pregrasp_joints for grasp in detection.grasps] == [None] * len(BOXES)
+    near = read(transport, ask(robot, transport, plan="reach")[0].body).best_pick.arm
+    assert near.reachable
+    assert near.trajectory is None
+
+
+@pytest.mark.parametrize(
+    ("settings", "fix"), [(SETTINGS, "Use one of: fr3."), (Settings(), "Set the setting `robots`.")]
+)
+def test_a_robot_that_is_not_here_is_refused(robot, settings, fix):
+    error = ask(robot, "http", settings, name="r2d2")[0].error
+    assert (error.field, error.fix, error.status) == ("options.robot.name", fix, 400)
+
+
+def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
+    error = ask(robot, "grpc", joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])[0].error
+    assert (error.code, error.field) == ("INVALID_ARGUMENT", "options.robot.joints")
+    assert "the support" in error.value
