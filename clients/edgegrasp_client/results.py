@@ -253,19 +253,22 @@ def _grasp(answer: Any, read: Read) -> Grasp:
 
 
 def _arm(answer: Any, read: Read) -> ArmPlan:
-    def numbers(holder: Any, name: str) -> Float64 | None:
-        sent = read(holder, name)
+    def joints(name: str) -> Float64 | None:
+        sent = read(answer, name)
         return np.array(sent, dtype=np.float64) if sent else None  # gRPC: none are sent
 
     motion, trajectory = read(answer, "trajectory"), None
     if motion is not None:
         names = list(read(motion, "joint_names"))
-        times, *rows = (numbers(motion, name) for name in ("times", "positions", "velocities"))
-        positions, velocities = (np.reshape(each, (-1, len(names))) for each in rows)
+        times = np.array(read(motion, "times"), dtype=np.float64)
+        positions, velocities = (
+            np.array(read(motion, name), dtype=np.float64).reshape(-1, len(names))
+            for name in ("positions", "velocities")
+        )
         ends = read(motion, "pregrasp_row"), read(motion, "grasp_row")
         trajectory = ArmTrajectory(names, times, positions, velocities, *ends)
-    joints = numbers(answer, "pregrasp_joints"), numbers(answer, "grasp_joints")
-    return ArmPlan(read(answer, "reachable"), *joints, trajectory)
+    reachable, before = read(answer, "reachable"), joints("pregrasp_joints")
+    return ArmPlan(reachable, before, joints("grasp_joints"), trajectory)
 
 
 def _array(numbers: Any) -> Float32:

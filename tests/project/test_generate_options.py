@@ -33,7 +33,7 @@ def test_a_new_option_reaches_the_message_the_client_and_the_page(
 
     assert "double force" not in script.proto()
     monkeypatch.setattr(script, "DetectOptions", More)
-    assert "  // Newtons; absent: any.\n  optional double force = 26;\n" in script.proto()
+    assert "  // Newtons; absent: any.\n  optional double force = 27;\n" in script.proto()
     assert "    # newtons; None: any\n    force: float | None\n" in script.client_types()
     assert "| `force` | number or null | `double` |" in script.page()
 

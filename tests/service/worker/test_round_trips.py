@@ -146,6 +146,15 @@ OPTIONS = {name: drawn(schema) for name, schema in SCHEMAS.items() if "anyOf" no
         {}, optional={"translation": numbers(0.0, 1.0), "rotation": numbers(0.0, 3.2)}
     ),
 }
+RIGID = np.eye(4).ravel().tolist()
+OPTIONS["robot"] = st.none() | st.fixed_dictionaries(
+    {
+        "name": names,
+        "T_base_cloud": st.just(RIGID) | vector.map(lambda v: [*RIGID[:3], v[0], *RIGID[4:]]),
+        "joints": st.lists(coordinate, min_size=1, max_size=7),
+    },
+    optional={"plan": st.sampled_from(["reach", "motion"])},
+)
 any_options = st.fixed_dictionaries({}, optional=OPTIONS)
 
 
