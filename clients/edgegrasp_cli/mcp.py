@@ -19,6 +19,7 @@ import typer
 from numpy.typing import NDArray
 
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.errors import EdgeGraspError
 from edgegrasp_camera.poses import quaternion_from_matrix
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
@@ -177,16 +178,16 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         instructions=INSTRUCTIONS,
         version=importlib.metadata.version("edgegrasp"),
         log_level="WARNING",
-        tools=[_tool(function) for function in functions],
+        tools=[_tool(function, folder) for function in functions],
     )
 
 
-def _tool(function: Callable[..., Any]) -> "Tool":
+def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
     """The tool, which refuses arguments that it does not have, and describes its options."""
     from mcp.server.mcpserver.tools.base import Tool
 
     # Compact text: as structured output the SDK would send it twice, once indented.
-    tool = Tool.from_function(_with_sentences(function), structured_output=False)
+    tool = Tool.from_function(_with_sentences(function, folder), structured_output=False)
     arguments = tool.fn_metadata.arg_model
     arguments.model_config["extra"] = "forbid"
     arguments.model_rebuild(force=True)
@@ -295,8 +296,8 @@ def _asked(
     return {**(options or {}), **given, **({"viewpoint": viewpoint} if viewpoint else {})}
 
 
-def _with_sentences(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The tool; what its caller can mend reaches the model as a sentence."""
+def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
+    """The tool; what its caller can mend reaches the model as a sentence, without the folder."""
     from mcp.server.mcpserver.exceptions import ToolError
 
     from edgegrasp_client import GraspClientError
@@ -308,8 +309,8 @@ def _with_sentences(function: Callable[..., Any]) -> Callable[..., Any]:
         except OSError as error:  # its own text has the whole path
             name = Path(str(error.filename or "")).name
             raise ToolError(f"{name}: {error.strerror}.") from error
-        except (GraspClientError, ValueError) as error:
-            raise ToolError(str(error)) from error
+        except (EdgeGraspError, GraspClientError, ValueError) as error:
+            raise ToolError(str(error).replace(f"{folder}/", "")) from error
 
     return run
 

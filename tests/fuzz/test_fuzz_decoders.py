@@ -2,6 +2,10 @@
 
 import io
 import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -54,8 +58,22 @@ def test_files(file_format: str, data: st.DataObject) -> None:
     decode(len(content), cloud=File(file_format, content))
 
 
+def chunk_places(png: bytes) -> Iterator[tuple[int, int]]:
+    """Start and size of each chunk."""
+    start = 8
+    while start < len(png):
+        size = int.from_bytes(png[start : start + 4])
+        yield start, size
+        start += 12 + size
+
+
 PNG = io.BytesIO()
 Image.fromarray(np.arange(400, 800, dtype=np.uint16).reshape(20, 20)).save(PNG, "png")
+
+
+PNG_CHUNKS = [
+    PNG.getvalue()[start : start + 12 + size] for start, size in chunk_places(PNG.getvalue())
+] + [b"\0\0\0\0" + kind + b"\0\0\0\0" for kind in (b"tRNS", b"iCCP", b"zTXt", b"acTL", b"gAMA")]
 
 
 @given(mutated([PNG.getvalue()]))
@@ -63,6 +81,34 @@ def test_images(content: bytes) -> None:
     depth = File("png", content)
     decode(len(content), depth_images=[{"depth": depth, "intrinsics": [30.0, 30.0, 9.5, 9.5]}])
     decode(len(content), points=POINTS.tobytes(), colors=depth)
+
+
+def packed(compression: int) -> bytes:
+    """An archive that is compressed in another way than NumPy does."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", compression) as archive:
+        archive.writestr("points.npy", npy(POINTS))
+    return file.getvalue()
+
+
+@given(mutated([packed(zipfile.ZIP_LZMA), packed(zipfile.ZIP_BZIP2)]))
+def test_archives_of_other_compressions(content: bytes) -> None:
+    decode(len(content), cloud=File("npz", content))
+
+
+@given(st.lists(st.tuples(st.sampled_from(PNG_CHUNKS), st.none() | st.binary(max_size=40))))
+def test_chunks_of_images(chunks: list[tuple[bytes, bytes | None]]) -> None:
+    """Chunks whose sums are right, and which say what they like."""
+    content = PNG.getvalue()[:8]
+    for original, data in chunks:
+        body = original[4:8] + (original[8:-4] if data is None else data)
+        content += struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    decode(len(content), points=POINTS.tobytes(), colors=File("png", content))
+
+
+@given(changed(POINT_CLOUD2))
+def test_layouts(layout: dict[str, Any]) -> None:
+    decode(len(repr(layout)), point_cloud2=layout)
 
 
 @given(LISTS, st.sampled_from(sorted(PER_POINT)))
