@@ -28,7 +28,7 @@ class Client:
             cloud_file(cloud)
         for number, image in enumerate(depth_images):
             depth_image_fields(image, number)
-        nothing: dict[str, Any] = dict.fromkeys(("grasps", "objects", "warnings"), [])
+        nothing: dict[str, Any] = {name: [] for name in ("grasps", "objects", "warnings")}
         return SimpleNamespace(**nothing, model="none", counts={}, up=[0.0, 0.0, 1.0])
 
 

@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse,
 from fastapi_offline import FastAPIOffline
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
+from starlette.routing import Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -40,11 +41,14 @@ CHALLENGE = 'Bearer realm="edgegrasp"'
 TIMEOUT = "X-Request-Timeout"
 NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
 
-# Values of the label `method`: the gRPC method's name where there is one.
-METHODS = {
+WORK: dict[str, Method] = {  # what workers do
     "/v1/grasps": "DetectGrasps",
     "/v1/grasps:score": "ScoreGrasps",
     "/v1/outcomes": "RecordOutcome",
+}
+# Values of the label `method`: the gRPC method's name where there is one.
+METHODS = {
+    **WORK,
     "/v1/models": "ListModels",
     "/v1/models:reload": "ReloadModels",
     "/health/live": "Live",
@@ -153,19 +157,9 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
         app.add_exception_handler(kind, _answer_error)
     app.add_exception_handler(HTTPException, _answer_http_error)
 
-    @app.post("/v1/grasps")
-    async def detect_grasps() -> Response:
-        return _GraspResponse(service, "DetectGrasps")
-
-    @app.post("/v1/grasps:score")
-    async def score_grasps() -> Response:
-        return _GraspResponse(service, "ScoreGrasps")
-
-    if service.settings.outcomes_file is not None:
-
-        @app.post("/v1/outcomes")
-        async def record_outcome() -> Response:
-            return _GraspResponse(service, "RecordOutcome")
+    for path, method in WORK.items():
+        if method != "RecordOutcome" or settings.outcomes_file is not None:
+            app.router.routes.append(Route(path, _Work(service, method), methods=["POST"]))
 
     @app.get("/v1/models")
     async def list_models() -> Response:
@@ -207,11 +201,10 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
     return app
 
 
-class _GraspResponse(Response):
-    """Receives a request once there is room for it, has it answered, and sends the answer."""
+class _Work:
+    """A route to the workers: receives a body once there is room, and sends what they answer."""
 
     def __init__(self, service: GraspService, method: Method) -> None:
-        super().__init__()
         self._service = service
         self._method = method
 

@@ -19,9 +19,8 @@ from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
 from edgegrasp_service.worker.process import ENDED, LOST
 
-MAIN = "import sys; from edgegrasp_service.worker.process import main; main(sys.argv[1])"
 # -P: nothing is imported from the folder the server was started in.
-NURSERY = (sys.executable, "-P", "-c", MAIN)
+NURSERY = (sys.executable, "-P", "-m", "edgegrasp_service.worker.process")
 ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 WORKER_LOST = kind_of(WorkerLost)

@@ -1,5 +1,8 @@
 """The processes that work: one that loads everything once, and those that fork from it.
 
+usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
+socket
+
 `main` is the nursery's. It imports and loads what a worker needs, and then forks a worker whenever
 the pool asks for one: there in milliseconds, its memory shared with all others until it is written
 to. The nursery never has a second thread.
@@ -13,6 +16,7 @@ import resource
 import signal
 import socket
 import struct
+import sys
 import traceback
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -132,3 +136,7 @@ def limited_memory(most: int) -> Iterator[None]:
 def _send(to: socket.socket, message: object) -> None:
     for part in pack(message):
         to.sendall(part)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
