@@ -23,18 +23,13 @@ ENV PIP_NO_CACHE_DIR=1 PIP_COMPILE=0 PIP_CONSTRAINT=/source/constraints.txt
 # hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends binutils
 WORKDIR /source
-COPY pyproject.toml constraints.txt ./
+COPY pyproject.toml constraints.txt docker/requirements.txt ./
 RUN python3 -m venv /tools && /tools/bin/pip install cyclonedx-bom pip-licenses \
     && python3 -m venv --without-pip /venv
 ENV PIP_PYTHON=/venv/bin/python
 # hadolint ignore=SC2086
 RUN /tools/bin/pip install ${TORCH}
-RUN python3 -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-    extras = [p["optional-dependencies"][name] for name in ("cli", "files", "model", "service")]; \
-    named = p["dependencies"] + [one for extra in extras for one in extra]; \
-    print(*(a for a in named if not a.startswith(("edgegrasp", "torch"))), sep="\n")' \
-    > requirements.txt \
-    && /tools/bin/pip install -r requirements.txt \
+RUN /tools/bin/pip install --require-hashes -r requirements.txt \
     && find /venv -regextype posix-extended -type d -regex ".*/(tests|numba/cuda|numpy/distutils|torchgen/packaged\
 |scipy/(cluster|datasets|differentiate|fft|fftpack|integrate|interpolate|io|odr|optimize|signal|stats)\
 |torch/(_dynamo|_inductor|include|onnx|share|test|testing/_internal/[a-z]+))" -prune -exec rm -r {} + \

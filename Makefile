@@ -48,6 +48,9 @@ lint: $(TOOLS) ## style, types, import boundaries, generated code
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose*.yaml
 	mkdir -p build
+	rm -f build/audit.json # is not written where advisories cannot be reached, which pip-audit says
+	$(BIN)/pip-audit --progress-spinner off --disable-pip --require-hashes -r docker/requirements.txt \
+		-f json -o build/audit.json || [ ! -e build/audit.json ]
 	PYTHON=$(BIN)/python scripts/generate_proto.sh build
 	set -e; for file in $(GENERATED); do cmp $$file build/$$file; done
 
