@@ -266,8 +266,8 @@ class _Inputs:
         elif path.suffix == ".npy":
             arrays = {"points": np.load(path, allow_pickle=False)}
         if "depth" in arrays:
-            depth = metres(arrays["depth"], scale)
-            arrays["points"] = unproject(depth, intrinsics_of(np.ravel(arrays["intrinsics"])))
+            camera = intrinsics_of(np.ravel(arrays["intrinsics"]))
+            arrays["points"] = unproject(metres(arrays["depth"], scale), camera)
         if "points" not in arrays:
             return None, None
         points = arrays["points"].reshape(-1, 3)

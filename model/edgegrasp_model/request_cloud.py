@@ -86,7 +86,7 @@ def decode_cloud(
         viewpoint = cameras[0] if len(cameras) == 1 else tuple(cameras)
         options = options.model_copy(update={"viewpoint": viewpoint})
     elif source == "point_cloud2":
-        layout = parse(PointCloud2, fields[source], "point_cloud2")
+        layout: Any = parse(PointCloud2, fields[source], "point_cloud2")
         cloud = read_point_cloud2(layout, max_points)
     elif source == "cloud":
         file: File = fields[source]

@@ -366,7 +366,8 @@ def cloud_points(cloud: Any) -> Float64:
     Raises:
         InvalidRequest: It has no x, y, z of floats, or is not whole.
     """
-    return np.reshape(read_point_cloud2(cloud).points, (-1, 3)).astype(np.float64)
+    points = read_point_cloud2(cloud).points
+    return np.asarray(points, dtype=np.float64).reshape(-1, 3)
 
 
 def matrix_of(transform: Any) -> Float64:
