@@ -193,7 +193,7 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
         warnings.simplefilter("error")  # that the image is huge
         start = 8
         for _ in range(MAX_CHUNKS):
-            start += 12 + int.from_bytes(data[start : start + 4])
+            start += 12 + int.from_bytes(data[start : start + 4], "big")
         if start < len(data):
             raise ValueError(f"more than {MAX_CHUNKS} chunks")
         image = Image.open(io.BytesIO(data), formats=["PNG"])
