@@ -50,6 +50,7 @@ class DummyPrepared:
     batch: Float32  # (A,) scores, descending, which the network gives back
     counts: dict[str, int]
     seconds: dict[str, float] = field(default_factory=dict)
+    scene: None = None
 
 
 class DummyDetector:
