@@ -53,6 +53,7 @@ class Cluster:
             "RAY_TMPDIR": str(folder),
             "RAY_AUTH_MODE": "disabled",
             "RAY_USAGE_STATS_ENABLED": "0",
+            "RAY_worker_niceness": "0",  # as nice as the test itself, on a busy machine too
             "PYTHONPATH": os.pathsep.join(sys.path),
             "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
         }
