@@ -18,6 +18,7 @@ COMMANDS = {
     "detect": ("detect", "service,view", "Find grasps in a cloud or a depth image."),
     "view": ("view", "service", "Look at a scene and its grasps in the browser."),
     "models": ("detect", "service", "List the weights that can be used."),
+    "robot": ("robot", "robot,view", "Make a robot file of a URDF, and check one."),
     "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),
     "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),

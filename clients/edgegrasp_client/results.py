@@ -199,7 +199,7 @@ _STAGES = (
     *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
     *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
     *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
-    *("suppressed", "hand_collision", "out_of_reach", "arm_collision", "reachable"),
+    *("suppressed", "on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"),
     *("with_trajectory", "returned", "description", "network", "ranking", "arm", "total"),
 )
 

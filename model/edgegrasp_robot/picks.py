@@ -93,15 +93,17 @@ def plan_picks(
     start = time.perf_counter()
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
-    with surrounded(robot, scene, points, asked, options.collision.obstacles):
+    with surrounded(robot, scene, points, asked, options.collision.obstacles) as own:
+        grasps = [grasp for grasp in detection.grasps if grasp.object not in own]
+        failures["on_arm"] = len(detection.grasps) - len(grasps)
         arm = _Arm(robot, asked, scene, options)
-        for grasp in detection.grasps:
+        for grasp in grasps:
             if failures["reachable"] == options.top_k or time.monotonic() > until:
                 break
             pick = arm.reach(grasp)
             failures[pick.outcome] += 1
             picks.append(pick)
-        untried = [_Pick(grasp, None, "untried") for grasp in detection.grasps[len(picks) :]]
+        untried = [_Pick(grasp, None, "untried") for grasp in grasps[len(picks) :]]
         picks = _preferred(picks, np.array(asked.joints), options)[: options.top_k]
         if asked.plan == "motion":
             for row, pick in enumerate(picks):
@@ -327,7 +329,7 @@ def _told(
         )
     if any(pick.tier == 2 for pick in picks):
         warnings.append("time ran out before the arm was asked for every grasp.")
-    names = ("hand_collision", "out_of_reach", "arm_collision", "reachable")
+    names = ("on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable")
     counts = {name: n for name, n in detection.counts.items() if name != "returned"}
     counts |= {name: outcomes[name] for name in names}
     if asked.plan == "motion":

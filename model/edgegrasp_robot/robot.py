@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import xacro
@@ -26,6 +26,7 @@ Element = ElementTree.Element
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
+LIMITS = {"lower": -2 * np.pi, "upper": 2 * np.pi, "velocity": 1.0}  # where a URDF has none
 MOVING = ("revolute", "continuous", "prismatic")
 Joints = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)]
 
@@ -90,6 +91,14 @@ class Robot:
             np.asarray(joints, np.float64), self.flange_frame, self.base_frame
         )
         return np.asarray(T_base_flange @ self.T_flange_hand)
+
+    def link_poses(self, joints: ArrayLike) -> Float64:
+        """T_base_link (L, 4, 4) of the links that have a shape, the hand last."""
+        given = np.asarray(joints, np.float64)
+        poses = [
+            self.scene.forwardKinematics(given, link, self.base_frame) for link in self.model.links
+        ]
+        return np.array(poses)
 
     def describe(self) -> dict[str, Any]:
         """What a caller needs to know, as plain JSON values."""
@@ -176,7 +185,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     packages = [str(path.parent / folder) for folder in file.packages]
     packages.append(str(get_package_share_dir()))
     root = _read_urdf(_located(path, "urdf", file.urdf, packages))
-    joint_names = _chain(path, root, file)
+    joint_names = _chain(path, root, file.base_frame, file.flange_frame)
     for field in ("home", "max_velocity", "max_acceleration"):
         given = getattr(file, field)
         if len(given) != len(joint_names):
@@ -218,6 +227,31 @@ def _load(path: Path, file: RobotFile) -> Robot:
         fix = "Name other joints, or the pair in the SRDF's disable_collisions"
         raise InvalidRobot(f"{path.name}: home: {pair} touch there. {fix}.")
     return robot
+
+
+class UrdfJoint(NamedTuple):
+    """A moving joint of a URDF; radians, metres of sliding joints, and seconds."""
+
+    name: str
+    lower: float
+    upper: float
+    velocity: float
+
+
+def urdf_joints(urdf: Path, base: str, flange: str) -> list[UrdfJoint]:
+    """The moving joints of an arm between two links, in order; raises InvalidRobot."""
+    try:
+        root = _read_urdf(urdf)
+    except (OSError, ElementTree.ParseError, xacro.XacroException) as error:
+        raise InvalidRobot(f"{urdf}: {error}") from None
+    joints = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
+    found = []
+    for name in _chain(urdf, root, base, flange):
+        limit = joints[name]
+        given = {} if limit is None else limit.attrib
+        numbers = (float(given.get(which, other)) for which, other in LIMITS.items())
+        found.append(UrdfJoint(name, *numbers))
+    return found
 
 
 def touching(scene: core.Scene, model: Model, joints: Float64, things: Sequence[str] = ()) -> str:
@@ -286,19 +320,19 @@ def _parent(joint: Element) -> str:
     return str(joint.find("parent").get("link"))  # type: ignore[union-attr]
 
 
-def _chain(path: Path, root: Element, file: RobotFile) -> list[str]:
+def _chain(path: Path, root: Element, base: str, flange: str) -> list[str]:
     """The moving joints between base and flange, in order."""
     links = _links(root)
-    for field in ("base_frame", "flange_frame"):
-        if (name := getattr(file, field)) not in links:
+    for field, name in (("base_frame", base), ("flange_frame", flange)):
+        if name not in links:
             fix = f"Use a link of the URDF: {', '.join(links)}."
             raise InvalidRobot(f"{path.name}: {field}: got {name!r}. {fix}")
-    joints, link = [], file.flange_frame
-    while link != file.base_frame:
+    joints, link = [], flange
+    while link != base:
         joint = _joint(root, link)
         if joint is None:
-            fix = f"Name a link that carries {file.flange_frame!r}."
-            raise InvalidRobot(f"{path.name}: base_frame: got {file.base_frame!r}. {fix}")
+            fix = f"Name a link that carries {flange!r}."
+            raise InvalidRobot(f"{path.name}: base_frame: got {base!r}. {fix}")
         link = _parent(joint)
         if joint.get("type") in MOVING:
             joints.append(str(joint.get("name")))

@@ -32,7 +32,7 @@ def surrounded(
     points: NDArray[np.floating],
     asked: RobotArm,
     obstacles: Sequence[Box | OrientedBox],
-) -> Iterator[None]:
+) -> Iterator[set[int | None]]:
     """Put what is around the robot into its scenes, and take it away afterwards.
 
     The hand may touch it in `robot.straight`: there it goes where the detection found it free.
@@ -44,12 +44,15 @@ def surrounded(
         asked: Where the robot is.
         obstacles: Boxes beside the cloud, cloud frame.
 
+    Yields:
+        Numbers of objects that are the arm itself, as the camera sees it.
+
     Raises:
         InvalidRequest: It touches something where it is, or stands within an object.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
-    _check_objects(robot, joints, scene, T_base_cloud)
+    own = _own_objects(robot, joints, scene, T_base_cloud)
     things = [_obstacle(row, box, T_base_cloud) for row, box in enumerate(obstacles)]
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
@@ -67,7 +70,7 @@ def surrounded(
             pair = touching(again, robot.model, joints, names)
             fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
             raise InvalidRequest("options.robot.joints", f"a start where {pair} touch", fix)
-        yield
+        yield own
     finally:
         for planned in (robot.scene, robot.straight):
             for name in names:
@@ -90,15 +93,24 @@ def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
     planned.setCollisions(pairs, False)
 
 
-def _check_objects(robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64) -> None:
+def _own_objects(
+    robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64
+) -> set[int | None]:
+    """Numbers of objects that are the arm itself, as the camera sees it."""
     of_object = scene.object_of_point >= 0
-    objects = scene.points_in_cloud[of_object]
-    within = _near_robot(robot, joints, moved(T_base_cloud, objects), CELL / 2)  # of its skin
-    if within.sum() > INSIDE:
-        number = np.bincount(scene.object_of_point[of_object][within]).argmax()
-        value = f"a pose that puts the arm into object {number}"
-        fix = "Send where the cloud's frame is in the arm's base frame, and the joints as they are."
-        raise InvalidRequest("options.robot.T_base_cloud", value, fix)
+    number = scene.object_of_point[of_object]
+    objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
+    near = np.bincount(number[_near_robot(robot, joints, objects, SEEN_SELF)], minlength=1)
+    within = np.bincount(number[_near_robot(robot, joints, objects, CELL / 2)], minlength=1)
+    own: set[int | None] = set()
+    for row in np.flatnonzero(near):
+        if near[row] > 0.5 * np.sum(number == row):
+            own.add(int(row))
+        elif row < len(within) and within[row] > INSIDE:
+            value = f"a pose that puts the arm into object {row}"
+            fix = "Send where the cloud's frame is in the arm's base frame, and the joints now."
+            raise InvalidRequest("options.robot.T_base_cloud", value, fix)
+    return own
 
 
 def _near_robot(

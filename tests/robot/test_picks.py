@@ -144,6 +144,26 @@ def test_obstacles_may_touch_each_other(fr3):
     assert detection.counts["with_trajectory"] == len(BOXES)
 
 
+def test_the_arm_itself_is_no_object(fr3):
+    """The camera sees the hand, and takes it for an object."""
+    from dataclasses import replace
+
+    scene, cloud, detection = scene_of(fr3)
+    hand = fr3.hand_pose(fr3.home)[:3, 3] + np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
+    seen = (hand - TURNED[:3, 3]) @ TURNED[:3, :3]
+    scene = replace(
+        scene,
+        points_in_cloud=np.concatenate([scene.points_in_cloud, seen.astype(np.float32)]),
+        object_of_point=np.append(scene.object_of_point, np.full(50, 7)),
+    )
+    grasps = [replace(detection.grasps[0], object=7), *detection.grasps]
+    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    options = parse_options({"robot": robot})
+    found = plan_picks(replace(detection, grasps=grasps), scene, cloud, options, fr3)
+    assert [grasp.object for grasp in found.grasps] == [0, 1, 2]
+    assert found.counts["on_arm"] == 1
+
+
 def test_reach_has_joints_and_no_motion(fr3):
     detection = picks_of(fr3, plan="reach")
     assert all(plan.trajectory is None for _, plan in plans_of(detection))
@@ -182,7 +202,7 @@ REFUSED = {
     "in itself": (
         {"joints": [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]}, "options.robot.joints", "touch",
     ),
-    "in an object": ({"boxes": ((0.06, 0.0, 0.05),)}, "options.robot.T_base_cloud", "object"),
+    "in an object": ({"boxes": ((0.08, 0.0, 0.1),)}, "options.robot.T_base_cloud", "object"),
 }  # fmt: skip
 
 

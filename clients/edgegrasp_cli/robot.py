@@ -1,0 +1,92 @@
+"""The command `robot`: make a robot file of a URDF, and check one."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+robot = typer.Typer(help="Make and check robot files.", no_args_is_help=True)
+ACCELERATION = 2.0  # per second squared, where nobody says more: careful
+
+GripperName = Annotated[str, typer.Option(help="Name of a gripper that ships, or its file.")]
+Links = Annotated[str, typer.Option(help="Link of the URDF.")]
+
+
+@robot.command()
+def add(
+    urdf: Annotated[Path, typer.Argument(help="URDF or xacro of the arm.")],
+    base: Links,
+    flange: Links,
+    output: Annotated[Path, typer.Option(help="Robot file to write, .toml.")],
+    gripper: GripperName = "panda",
+    srdf: Annotated[str, typer.Option(help="SRDF with links that may touch.")] = "",
+    packages: Annotated[list[str] | None, typer.Option(help="Folder that holds packages.")] = None,
+) -> None:
+    """Write a robot file for an arm's URDF, with what is left to fill in, and check it.
+
+    edgegrasp robot add my.urdf --base base_link --flange tool0 --output my.toml
+    """
+    from edgegrasp_robot.robot import urdf_joints
+
+    if output.suffix != ".toml" or output.exists():
+        raise ValueError(f"--output: got {str(output)!r}. Name a new file, .toml.")
+    joints = urdf_joints(urdf, base, flange)
+    middle = [min(max(0.0, joint.lower), joint.upper) for joint in joints]
+    fields: dict[str, Any] = {
+        "urdf": str(urdf.absolute()),
+        "srdf": str(Path(srdf).absolute()) if srdf else "",
+        "packages": [str(Path(folder).absolute()) for folder in packages or ()],
+        "base_frame": base,
+        "flange_frame": flange,
+        "gripper": gripper,
+        "home": middle,
+        "max_velocity": [joint.velocity for joint in joints],
+        "max_acceleration": [ACCELERATION] * len(joints),
+    }
+    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
+    pose = [
+        "",
+        "[T_flange_hand]",
+        "position = [0.0, 0.0, 0.0]",
+        "quaternion = [0.0, 0.0, 0.0, 1.0]",
+    ]
+    output.write_text("\n".join([f"# {', '.join(one.name for one in joints)}", *lines, *pose, ""]))
+    print(f"{output}: now set T_flange_hand, home and max_acceleration.")
+    check(output)
+
+
+@robot.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="Robot file, .toml, or a name of one that ships.")],
+    picture: Annotated[Path | None, typer.Option(help="Picture of it at its home, .png.")] = None,
+) -> None:
+    """Load a robot file, say what it is, and draw the arm at its home.
+
+    edgegrasp robot check fr3 --picture fr3.png
+    """
+    from edgegrasp_robot import load_robot
+
+    found = load_robot(file)
+    for name, value in found.describe().items():
+        print(f"{name}: {value}")
+    x, y, z = found.hand_pose(found.home)[:3, 3]
+    print(f"hand at home: {x:.3f} {y:.3f} {z:.3f} m from {found.base_frame}")
+    if picture is not None:
+        _draw(found, picture)
+
+
+def _draw(found: Any, file: Path) -> None:
+    """Draw the links as a line and the hand's axes at home: x red, y green (closing), z blue."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 6), dpi=100)
+    axes = figure.add_subplot(projection="3d")
+    poses = found.link_poses(found.home)
+    axes.plot(*poses[:, :3, 3].T, "o-", color="0.3", linewidth=4)
+    hand = found.hand_pose(found.home)
+    for axis, color in zip(hand[:3, :3].T, ("red", "green", "blue"), strict=True):
+        axes.plot(*zip(hand[:3, 3], hand[:3, 3] + 0.15 * axis, strict=True), color=color)
+    axes.set(xlabel="x", ylabel="y", zlabel="z", title=f"{found.name} at home")
+    axes.set_aspect("equal")
+    figure.savefig(file)
