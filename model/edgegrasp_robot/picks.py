@@ -63,7 +63,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
 def plan_picks(
     detection: Detection,
     scene: Scene | None,
-    points: NDArray[np.floating],
+    points: object,
     options: DetectOptions,
     robot: Robot,
     until: float = float("inf"),

@@ -29,7 +29,7 @@ Thing = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose 
 def surrounded(
     robot: Robot,
     scene: Scene,
-    points: NDArray[np.floating],
+    points: object,
     asked: RobotArm,
     obstacles: Sequence[Box | OrientedBox],
 ) -> Iterator[set[int | None]]:
@@ -157,11 +157,11 @@ def _cloud(
     robot: Robot,
     joints: Float64,
     scene: Scene,
-    points: NDArray[np.floating],
+    points: object,
     T_base_scene: Float64,
 ) -> Thing | None:
     """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
-    flat = np.asarray(points).reshape(-1, 3)
+    flat = np.asarray(points, dtype=np.float32).reshape(-1, 3)
     seen = scene.frame.points(flat[np.isfinite(flat).all(axis=1)])
     base = np.linalg.inv(T_base_scene)[:3, 3]
     seen = seen[np.abs(seen - base).max(axis=1) < AROUND]

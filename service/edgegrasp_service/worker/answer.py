@@ -125,7 +125,7 @@ class _Work:
     def _grasps(
         self, detector: Any, cloud: CloudInput, options: DetectOptions
     ) -> tuple[Detection, Any]:
-        """The detection, and the scene that it is of."""
+        """The detection, and what it was prepared from."""
         with self._stage("prepare"):
             most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
@@ -133,7 +133,7 @@ class _Work:
         with self._stage("network"):
             logits = detector.evaluate(prepared)
         with self._stage("finish"):
-            return detector.finish(prepared, logits), prepared.scene
+            return detector.finish(prepared, logits), prepared
 
     def _picks(
         self, detector: Any, cloud: CloudInput, options: DetectOptions, name: str
@@ -146,10 +146,10 @@ class _Work:
         from edgegrasp_robot import plan_picks, with_robot
 
         robot = robots[name]
-        detection, scene = self._grasps(detector, cloud, with_robot(options, robot))
+        detection, prepared = self._grasps(detector, cloud, with_robot(options, robot))
         until = self._deadline - TO_ENCODE * self._job.remaining
         with self._stage("arm"):
-            return plan_picks(detection, scene, cloud.points, options, robot, until)
+            return plan_picks(detection, prepared.scene, cloud.points, options, robot, until)
 
     def _score(self) -> Scoring:
         with self._stage("decode"):
