@@ -46,7 +46,7 @@ def describe_hands(
     gripper: Gripper,
     up: Float32,
     support: SupportPlane | None,
-    viewpoint: Float32 | None = None,
+    viewpoints: Float32 | None = None,
     at_side: NDArray[np.bool_] | None = None,
     view: HandView | None = None,
     object_of_point: Int64 | None = None,
@@ -63,7 +63,8 @@ def describe_hands(
         gripper: Fingers open to its maximum.
         up: (3,) away from gravity.
         support: Plane that heights are measured from; None where it is unknown.
-        viewpoint: (3,) the camera; None where it is unknown, or there are several.
+        viewpoints: (W, 3) the cameras, the first of which is the one mentioned above; None where
+            they are unknown.
         at_side: (N,) points where a side of the workspace cuts things off: what is between the
             fingers there may be wider than it seems. None: nowhere.
         view: `hand_views` of the same candidates, where the caller has it already.
@@ -76,15 +77,14 @@ def describe_hands(
     """
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
+    viewpoint = None if viewpoints is None else viewpoints[0]
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
     mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
     ends = seen_part(gripper)
     seen = _look(view, cloud.normals, mirrored, side, at_side, ends)
-    depth = None
-    if viewpoint is not None and len(cloud.points):
-        depth = DepthMap.of_cloud(cloud.points, viewpoint, up)
-    unseen = unseen_space(depth, candidates.T_cloud_hand, seen.first_met, ends)
+    depths = DepthMap.of_each(cloud.points, viewpoints, up)
+    unseen = unseen_space(depths, candidates.T_cloud_hand, seen.first_met, ends)
     columns = [
         *seen.hits.T,
         *seen.between.T,

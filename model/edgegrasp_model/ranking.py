@@ -153,14 +153,14 @@ def grasps_in_cloud(
 def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     """Opening (E,) to approach with, metres: what is seen between the fingers, and some clearance.
 
-    The gripper's maximum where the camera did not see on which side of a finger the object ends.
+    The gripper's maximum where no camera saw on which side of a finger the object ends.
     """
     met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
     width = required_openings(met, gripper)
-    if scene.viewpoint is None or len(T_cloud_hand) == 0:
+    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
+    if not depths or len(T_cloud_hand) == 0:
         return width
-    depth = DepthMap.of_cloud(scene.cloud.points, scene.viewpoint, UP)
-    beyond = unseen_space(depth, T_cloud_hand, met, seen_part(gripper)).beyond
+    beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
     hidden = np.maximum(*beyond) > HIDDEN
     return np.where(hidden, np.float32(gripper.max_opening), width)
 

@@ -1,5 +1,6 @@
-"""What the one camera did not see around a hand, and how far what it saw of an object extends."""
+"""What no camera saw around a hand, and how far what they saw of an object extends."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, Self
@@ -21,6 +22,7 @@ SPLAT = 2  # cells around its own that a point covers: as far as the next point 
 BEHIND = 0.004  # metres behind a surface that may still be the surface
 DEEP = 0.02  # metres further behind at which space counts as wholly unknown
 FAR = 0.10  # metres behind a surface; what is farther is no different
+UNKNOWN_SHARE = 0.25  # of a palm or way in, unseen, from which on the hand may hit something
 WAY = 0.05  # metres of straight approach on which a finger sweeps space
 LINE = 27  # places on the closing line, from beyond one finger to beyond the other
 NOTHING = np.float32(np.inf)
@@ -46,24 +48,24 @@ class UnseenSpace(NamedTuple):
 
 
 def unseen_space(
-    depth: "DepthMap | None", T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
+    depths: Sequence["DepthMap"], T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
 ) -> UnseenSpace:
-    """Ask a depth map about the hands of some candidates.
+    """Ask depth maps about the hands of some candidates.
 
     Args:
-        depth: What the only camera saw; None where it is unknown: then all counts as seen.
-        T_cloud_hand: (E, 4, 4), in the map's frame.
+        depths: What each camera saw; none where they are unknown: then all counts as seen.
+        T_cloud_hand: (E, 4, 4), in the maps' frame.
         first_met: (E, 2) greatest and least y of what is between the fingers, hand frame.
         gripper: Fingers open to its maximum.
     """
-    if depth is None:
+    if not depths:
         nothing = np.zeros(len(T_cloud_hand), dtype=np.float32)
         both = [nothing, nothing]
         return UnseenSpace([nothing] * len(probes(gripper)), both, both, both, nothing)
     parts, ways, (y, line) = probes(gripper), _ways(gripper), _closing_line(gripper)
     places = [*parts, *ways, line]
     ends = np.cumsum([len(place) for place in places])[:-1]
-    behind = np.split(depth.behind(T_cloud_hand, np.concatenate(places)), ends, axis=1)
+    behind = np.split(_behind_all(depths, T_cloud_hand, np.concatenate(places)), ends, axis=1)
     shares = [unseen(part).mean(axis=1) for part in behind[:-1]]
     tips = [np.minimum(part, FAR).mean(axis=1) for part in behind[:2]]
     along = behind[-1].reshape(len(T_cloud_hand), LINE, len(line) // LINE)  # (E, Y, P)
@@ -77,6 +79,26 @@ def unseen_space(
         beyond=[step * (hidden * side).sum(axis=1) for side in (y > high, y < low)],
         free=step * (seen * ((y > low + BEHIND) & (y < high - BEHIND))).sum(axis=1),
     )
+
+
+def enters_unseen(
+    depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper
+) -> NDArray[np.bool_]:
+    """Which hands (E,) would have their palm, or a finger on its way in, in unseen space.
+
+    Behind a surface, only the ends of the fingers may reach where nobody looked.
+    """
+    entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
+    for places in (probes(gripper)[-1], *_ways(gripper)) if depths else ():
+        behind = _behind_all(depths, T_cloud_hand, places)
+        entered |= unseen(behind).mean(axis=1) > UNKNOWN_SHARE
+    return entered
+
+
+def _behind_all(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
+    """Metres (E, S) that places (S, 3) of hands lie behind what every camera saw first."""
+    behind: Float32 = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
+    return behind
 
 
 def unseen(behind: Float32) -> Float32:
@@ -270,6 +292,16 @@ class DepthMap:
 
     frame: CameraFrame
     distance: Float32  # (2 H + 1, 2 H + 1) metres from the camera; inf where nothing was seen
+
+    @classmethod
+    def of_each(cls, points: Float32, viewpoints: Float32 | None, up: Float32) -> list[Self]:
+        """What each of some cameras (W, 3) saw of a cloud (N, 3); none where they are unknown.
+
+        A point blocks the sight of all of them, whichever saw it.
+        """
+        if viewpoints is None or len(points) == 0:
+            return []
+        return [cls.of_cloud(points, viewpoint, up) for viewpoint in viewpoints]
 
     @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:

@@ -100,8 +100,8 @@ def tried_grasps(
     label = _labels(view)[rows[candidates.pair]]
     seen = None
     if config.architecture == "hand":
-        viewpoint = view.camera_position if viewpoint_known else None
-        batch = hand_batch(view, candidates, viewpoint, SPARE_POINTS * config.hand_points)
+        viewpoints = view.camera_position[None] if viewpoint_known else None
+        batch = hand_batch(view, candidates, viewpoints, SPARE_POINTS * config.hand_points)
         description, points = batch.description.numpy(), batch.points.numpy()
         seen = HandInputs(
             description.astype(np.float16), points.astype(np.float16), batch.point_count.numpy()
@@ -112,7 +112,7 @@ def tried_grasps(
 def hand_batch(
     view: LabelledView,
     candidates: Candidates,
-    viewpoint: NDArray[np.float32] | None,
+    viewpoints: NDArray[np.float32] | None,
     max_points: int,
 ) -> HandBatch:
     """The hand network's inputs for candidates in a simulated scene.
@@ -120,7 +120,7 @@ def hand_batch(
     Args:
         view: What is seen of the scene.
         candidates: E hands to try.
-        viewpoint: (3,) camera position, metres; None: not known.
+        viewpoints: (W, 3) camera positions, metres; None: not known.
         max_points: Points of each hand at most.
     """
     return HandBatch.from_cloud(
@@ -129,7 +129,7 @@ def hand_batch(
         view.hand,
         view.up,
         view.support_plane,
-        viewpoint,
+        viewpoints,
         view.cut_off(),
         max_points,
         object_of_point=view.numbered_objects(),

@@ -66,7 +66,7 @@ class Teacher:
             rows, numbers = np.empty(0, np.uint16), np.empty(0, np.float16)
             return SoftLabels(rows, rows, np.empty((0, 3), np.float16), numbers, numbers)
         max_points = self.metadata.network.hand_points
-        hands = hand_batch(view, candidates, view.camera_position, max_points)
+        hands = hand_batch(view, candidates, view.camera_position[None], max_points)
         with torch.inference_mode():
             chance = torch.sigmoid(self.network(hands) / self.metadata.temperature).numpy()
         return SoftLabels(
@@ -87,7 +87,9 @@ class Teacher:
         every = np.arange(len(crop.ball_rows))
         across = [
             outline_grasps(cloud.points, crop, balls, every, seen, support, view.hand)
-            for seen in outlines(cloud.points, view.camera_position, np.unique(crop.ball_rows))
+            for seen in outlines(
+                cloud.points, view.camera_position[None], np.unique(crop.ball_rows)
+            )
         ]
         both = Candidates.concatenate([edge_grasps(cloud, *pairs, view.hand), *across])
         if support is not None:

@@ -54,7 +54,8 @@ def look(
 ) -> HandBatch:
     support = support or plane(UP, -0.05)
     up = np.array(support.normal, dtype=np.float32)
-    return HandBatch.from_cloud(cloud, candidates, gripper, up, support, camera, None, limit)
+    cameras = None if camera is None else camera[None]
+    return HandBatch.from_cloud(cloud, candidates, gripper, up, support, cameras, None, limit)
 
 
 def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
@@ -262,16 +263,20 @@ def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
     hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
     hand[:3, 3] = [-0.1, 0.0, 0.1]
     met = np.zeros((1, 2), dtype=np.float32)
-    found = unseen_space(DepthMap.of_cloud(plate(), ABOVE, UP), hand[None], met, PANDA)
+    above_only = DepthMap.of_each(plate(), ABOVE[None], UP)
+    found = unseen_space(above_only, hand[None], met, PANDA)
     above, below = found.parts[0][0], found.parts[1][0]
     assert above == found.depths[0][0] == found.beyond[0][0] == 0.0
     assert below > 0.9
     assert 0.04 < found.depths[1][0] < FAR
     assert found.beyond[1][0] > 0.04
     assert found.ways[0][0] == 0.0
-    unknown = unseen_space(None, hand[None], met, PANDA)
+    unknown = unseen_space([], hand[None], met, PANDA)
     assert len(unknown.parts) == len(found.parts)
     assert not np.any(unknown.parts + unknown.ways + unknown.depths + unknown.beyond)
+    both = DepthMap.of_each(plate(), np.stack([ABOVE, -ABOVE]), UP)
+    seen = unseen_space(both, hand[None], met, PANDA)  # one camera above the plate, one below
+    assert not np.any(seen.parts + seen.ways + seen.depths + seen.beyond)
 
 
 def blocks(gap: float) -> np.ndarray:
@@ -291,7 +296,7 @@ def test_two_things_with_a_gap_between_them_are_not_one() -> None:
         cloud = Cloud(points, np.broadcast_to(UP, points.shape).astype(np.float32))
         still = np.zeros(1, dtype=np.float32)
         grasp = Candidates(index, index, index, UP[None], still, hand[None])
-        described[gap] = describe_hands(cloud, grasp, PANDA, UP, None, ABOVE)[0]
+        described[gap] = describe_hands(cloud, grasp, PANDA, UP, None, ABOVE[None])[0]
     free, longest, first, second = described[0.002][67:71]
     assert free == 0.0
     np.testing.assert_allclose([longest, first, second], [0.002, 0.042, 0.042], atol=1e-5)

@@ -47,7 +47,9 @@ def grasps_of(
     points = points.astype(np.float32)
     approach = np.arange(0, len(points), 4)
     crop = crop_balls(points, approach, 0.045)
-    seen = outlines(points, viewpoint, np.arange(len(points)))[view]
+    seen = outlines(points, None if viewpoint is None else viewpoint[None], np.arange(len(points)))[
+        view
+    ]
     every = np.arange(len(crop.ball_rows))
     return points, outline_grasps(points, crop, approach, every, seen, FLOOR, PANDA)
 

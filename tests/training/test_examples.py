@@ -75,7 +75,7 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
         load_gripper(),
         UP,
         TABLE,
-        view.camera_position,
+        view.camera_position[None],
         near_workspace_side(view.points, WORKSPACE, UP, view.points),
         hands.hand_points,
         object_of_point=view.numbered_objects(),

@@ -16,6 +16,7 @@ from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import FIXED
+from edgegrasp_model.unseen import DepthMap, enters_unseen
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -27,7 +28,9 @@ TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to 
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet the cloud, the support plane or an obstacle, or close on furniture.
+    """Which open hands meet something, may meet it where nobody looked, or close on furniture.
+
+    They meet the cloud, the support plane or an obstacle.
 
     Checked at the grasp, on the straight way in and on the way out, with each box of the hand
     grown by the margin on every side.
@@ -48,6 +51,8 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
         hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
     free = np.flatnonzero(~hit)
     hit[free] = closes_on_furniture(scene, T_cloud_hand[free], gripper)
+    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
+    hit[free] |= enters_unseen(depths, T_cloud_hand[free], gripper)
     return hit
 
 

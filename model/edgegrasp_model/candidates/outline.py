@@ -50,18 +50,18 @@ class Outline:
 
 
 def outlines(
-    points: Float32, viewpoint: Float32 | None, rows: Int64, *, leaning: bool = False
+    points: Float32, viewpoints: Float32 | None, rows: Int64, *, leaning: bool = False
 ) -> list[Outline]:
-    """The outlines of a cloud from above and, where that is another direction, from the camera.
+    """The outlines of a cloud from above and, where that is another direction, from each camera.
 
     Args:
         points: (N, 3) canonical frame, metres.
-        viewpoint: (3,) the only camera; None where it is unknown, or there are several.
+        viewpoints: (W, 3) the cameras; None where they are unknown.
         rows: (M,) of the points to look at.
         leaning: Also from all around, LEAN off above.
     """
     seen = [_outline(points, np.broadcast_to(UP, points.shape), rows)]
-    if viewpoint is not None:
+    for viewpoint in () if viewpoints is None else viewpoints:
         toward = viewpoint - points
         toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
         seen.append(_outline(points, toward, rows[toward[rows] @ UP < ONE_VIEW]))

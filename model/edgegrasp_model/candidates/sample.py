@@ -251,7 +251,7 @@ def _constrained(
     is_contact[pairs[1]] = True
     across = [
         outline_grasps(points, crop, approach_index, pair, each, scene.support, gripper, margin)
-        for each in outlines(points, scene.viewpoint, np.flatnonzero(is_contact), leaning=leaning)
+        for each in outlines(points, scene.viewpoints, np.flatnonzero(is_contact), leaning=leaning)
     ]
     candidates = Candidates.concatenate([candidates, *across])
     add_count(counts, "candidates", len(candidates))

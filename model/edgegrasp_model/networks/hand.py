@@ -58,7 +58,7 @@ class HandBatch:
         gripper: Gripper,
         up: Float32,  # (3,) away from gravity
         support: SupportPlane | None,
-        viewpoint: Float32 | None,  # (3,) the camera, where there is one and it is known
+        viewpoints: Float32 | None,  # (W, 3) the cameras, where they are known
         at_side: NDArray[np.bool_] | None,  # (N,) cut off by a side of the workspace
         num_points: int,
         view: HandView | None = None,
@@ -72,7 +72,10 @@ class HandBatch:
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
         of_points = at_side, view, object_of_point, description_size
-        description = describe_hands(cloud, candidates, gripper, up, support, viewpoint, *of_points)
+        description = describe_hands(
+            cloud, candidates, gripper, up, support, viewpoints, *of_points
+        )
+        viewpoint = None if viewpoints is None else viewpoints[0]
         points, count = points_around_fingers(
             cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
         )
@@ -112,7 +115,7 @@ def hand_batch(
         gripper,
         UP,
         scene.support,
-        scene.viewpoint,
+        scene.viewpoints,
         scene.at_side,
         network.hand_points,
         view,

@@ -92,7 +92,7 @@ class Scene:
     object_of_point: Int64  # (V,) number of the object that each point is of; FIXED; UNKNOWN
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
-    viewpoint: Float32 | None = None  # (3,) the camera, where there is one and only one
+    viewpoints: Float32 | None = None  # (W, 3) the cameras, where they are known
     confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
@@ -301,7 +301,7 @@ def build_scene(
         object_of_point=number,
         support=None if support is None else plane_in_frame(support.plane, frame),
         at_side=near_workspace_side(in_cloud[kept], options.workspace, selected.up, sent.points),
-        viewpoint=single_viewpoint(viewpoints, frame),
+        viewpoints=None if viewpoints is None else frame.points(viewpoints).astype(np.float32),
         confidence=selected.confidence,
         obstacles=SolidBoxes.from_shapes(obstacles, frame) if obstacles else None,
     )
@@ -456,15 +456,6 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.f
         fix = f"Send numbers from 0 to {len(viewpoints) - 1}, rows of options.viewpoint."
         raise InvalidRequest("view_ids", f"values from {low} to {high}", fix)
     return viewpoints
-
-
-def single_viewpoint(
-    viewpoints: NDArray[np.float64] | None, frame: CanonicalFrame
-) -> Float32 | None:
-    """The camera (3,) in the canonical frame, if there is exactly one."""
-    if viewpoints is None or len(viewpoints) != 1:
-        return None
-    return frame.points(viewpoints[0]).astype(np.float32)
 
 
 def inside_workspace(
