@@ -337,6 +337,7 @@ def _short(found: "Detection") -> str:
             "size": _digits(2 * thing.half_extents, 3),
             "confidence": None if thing.confidence is None else round(thing.confidence, 3),
             "best_score": None if thing.best_score is None else round(thing.best_score, 3),
+            "reason": thing.reason,
         }
         for thing in found.objects[:MOST_GRASPS]
     ]

@@ -103,6 +103,9 @@ class DetectedObject:
     quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
     best_score: float | None  # of the grasps returned; None: there is none on it
     confidence: float | None  # probability that it is an object; None: the caller named it
+    # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
+    # nobody can say.
+    reason: str | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -264,7 +264,7 @@ class GraspDetector:
             debug,
             found_support(prepared.selected.support),
             prepared.selected.up.astype(np.float32),
-            [] if scene is None else detected_objects(scene, grasps),
+            [] if scene is None else detected_objects(scene, grasps, sample, score, gripper),
         )
 
     def score(

@@ -16,7 +16,14 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.hand_view import hand_views, reach_of, seen_part
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import DebugInfo, DetectedObject, FoundSupport, Grasp, Outcome
+from edgegrasp_model.results import (
+    DebugInfo,
+    DetectedObject,
+    FoundSupport,
+    Grasp,
+    Outcome,
+    Ungraspable,
+)
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
@@ -29,6 +36,7 @@ COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the r
 GOOD_SCORE = 0.5  # from which an object has a grasp to offer
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
 HIDDEN = 0.004  # metres of unseen space from which on an object may go on there
+FLAT = 0.012  # metres of visible height below which the support may be in the way
 OUTCOMES = list(Outcome)
 
 
@@ -157,12 +165,17 @@ def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     """
     met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
     width = required_openings(met, gripper)
-    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
-    if not depths or len(T_cloud_hand) == 0:
-        return width
-    beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
-    hidden = np.maximum(*beyond) > HIDDEN
+    hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)
     return np.where(hidden, np.float32(gripper.max_opening), width)
+
+
+def _far_side_hidden(
+    scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper
+) -> NDArray[np.bool_]:
+    """Between which hands (E,) the object may go on unseen; `met` is what they meet first."""
+    depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
+    beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
+    return np.asarray(np.maximum(*beyond) > HIDDEN)
 
 
 def found_support(support: Support | None) -> FoundSupport | None:
@@ -174,8 +187,22 @@ def found_support(support: Support | None) -> FoundSupport | None:
     return FoundSupport(normal, support.plane.offset, residual, support.share)
 
 
-def detected_objects(scene: Scene, grasps: Sequence[Grasp]) -> list[DetectedObject]:
-    """The scene's objects, and the best score of the grasps on each; the largest first."""
+def detected_objects(
+    scene: Scene,
+    grasps: Sequence[Grasp],
+    sample: Sample | None,
+    score: NDArray[np.floating],
+    gripper: Gripper,
+) -> list[DetectedObject]:
+    """The scene's objects, the largest first: the best grasp on each, or why there is no good one.
+
+    Args:
+        scene: The scene.
+        grasps: Those that are returned.
+        sample: E scored candidates; None: there are none.
+        score: (E,) probabilities.
+        gripper: The hand.
+    """
     number, count = np.unique(scene.object_of_point[scene.object_of_point >= 0], return_counts=True)
     best = {grasp.object: grasp.score for grasp in sorted(grasps, key=lambda grasp: grasp.score)}
     objects = []
@@ -191,9 +218,40 @@ def detected_objects(scene: Scene, grasps: Sequence[Grasp]) -> list[DetectedObje
                 quaternion=Rotation.from_matrix(T_cloud_box[:3, :3]).as_quat().astype(np.float32),
                 best_score=best.get(which),
                 confidence=scene.confidence.get(which),
+                reason=_why_ungraspable(scene, which, 2 * half, sample, score, gripper),
             )
         )
     return objects
+
+
+def _why_ungraspable(
+    scene: Scene,
+    number: int,
+    size: Float32,
+    sample: Sample | None,
+    score: NDArray[np.floating],
+    gripper: Gripper,
+) -> Ungraspable | None:
+    """Why an object with a box of this size (3,), the last upward, has no good grasp."""
+    if sample is None:
+        return None
+    drawn = scene.object_of_point[sample.drawn.contact_index] == number
+    scored = np.flatnonzero(drawn[sample.row])
+    if score[scored].max(initial=0.0) >= GOOD_SCORE:
+        return None
+    if size[:2].min() > gripper.max_opening:
+        return Ungraspable.TOO_WIDE
+    outcome = sample.outcome[drawn]
+    out_of_reach = np.isin(outcome, (CODE[Outcome.SUPPORT], CODE[Outcome.DIRECTION]))
+    if size[2] < FLAT and out_of_reach.sum() >= len(outcome) / 2:
+        return Ungraspable.TOO_FLAT
+    if not sample.collision_free[scored].any():
+        hit = len(scored) > 0 or (outcome == CODE[Outcome.COLLISION]).any()
+        return Ungraspable.BLOCKED if hit else None
+    hands = sample.candidates.T_cloud_hand[scored]
+    met = met_first(hand_views(scene.cloud, hands, reach_of(gripper)), gripper)
+    hidden = _far_side_hidden(scene, hands, met, gripper)
+    return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
 
 
 def _upright_box(scene: Scene, held: NDArray[np.bool_]) -> tuple[Float32, Float32]:

@@ -40,6 +40,15 @@ class NoGrasp(StrEnum):
     NOTHING_BETWEEN = "nothing-between"  # the hand pose has no point between its fingers
 
 
+class Ungraspable(StrEnum):
+    """Why an object has no grasp that is more likely to hold than not."""
+
+    TOO_WIDE = "too-wide"  # what is seen of it is wider than the hand opens, on all sides
+    TOO_FLAT = "too-flat"  # most hands would cut into the support, or come from below
+    BLOCKED = "blocked"  # every hand would hit something, or may where no camera looked
+    HIDDEN = "hidden"  # no camera sees where it ends beyond the fingers
+
+
 @dataclass(frozen=True)
 class ArmTrajectory:
     """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
@@ -112,6 +121,7 @@ class DetectedObject:
     quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
     best_score: float | None  # of the grasps returned; None: there is none on it
     confidence: float | None  # probability that it is an object; None: the caller named it
+    reason: Ungraspable | None  # why it has no good grasp; None: it has one, or nobody can say
 
 
 @dataclass(frozen=True)

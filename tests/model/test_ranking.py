@@ -1,12 +1,17 @@
 import numpy as np
 import pytest
+import torch
 
 from edgegrasp_model.candidates.collision import FINGER_CLEARANCE
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
+from edgegrasp_model.networks.checkpoint import build_network
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.options import parse_options
 from edgegrasp_model.ranking import objects_first, openings
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.scene import Scene
 
-from .scenes import PANDA
+from .scenes import PANDA, TINY
 
 
 def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
@@ -41,7 +46,60 @@ def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening) -> Non
         object_of_point=np.zeros(len(points), dtype=np.int64),
         support=None,
         obstacles=None,
-        viewpoint=None if camera is None else np.array(camera, dtype=np.float32),
+        viewpoints=None if camera is None else np.array([camera], dtype=np.float32),
     )
     width = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
     np.testing.assert_allclose(width, opening, atol=1e-6)
+
+
+def hopeless() -> GraspDetector:
+    """A detector to which no grasp seems any good."""
+    network = build_network(TINY["hand"])
+    with torch.no_grad():
+        list(network.parameters())[-1].fill_(-50.0)  # the bias of the last layer
+    return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
+
+
+def seen_box(*size: float) -> np.ndarray:
+    """Top and two sides of a box on z = 0."""
+    rng = np.random.default_rng(0)
+    u, v = rng.uniform(-0.5, 0.5, (2, 3000))
+    end = np.full(3000, 0.5)
+    faces = [np.stack(face, axis=1) for face in ((u, v, end), (end, u, v), (u, end, v))]
+    return (np.concatenate(faces) * size + (0, 0, size[2] / 2)).astype(np.float32)
+
+
+LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
+
+
+@pytest.mark.parametrize(
+    ("size", "options", "reason"),
+    [
+        ((0.10, 0.13, 0.10), {}, "too-wide"),
+        ((0.03, 0.05, 0.008), {}, "too-flat"),
+        ((0.04, 0.06, 0.08), {"collision": {"obstacles": LID}}, "blocked"),
+        ((0.04, 0.06, 0.08), {"viewpoint": (1.0, 0.0, 0.04)}, "hidden"),
+        ((0.04, 0.06, 0.08), {"viewpoint": None}, None),  # nobody can say
+    ],
+)
+def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> None:
+    floor = {"normal": (0, 0, 1), "offset": 0.0}
+    told = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
+    asked = parse_options(told | {"approach_direction": {"preset": "top-down"}} | options)
+    (thing,) = hopeless().detect(seen_box(*size), asked).objects
+    assert thing.reason == reason
+
+
+def test_an_object_with_a_good_grasp_needs_no_reason() -> None:
+    (thing,) = (
+        ModelCatalogue.load()
+        .get("edgegrasp-plus")
+        .detect(
+            seen_box(0.04, 0.06, 0.08),
+            parse_options({"viewpoint": (0.3, 0.2, 0.5), "objects": "off"}),
+        )
+        .objects
+    )
+    assert thing.best_score is not None
+    assert thing.best_score > 0.5
+    assert thing.reason is None

@@ -1929,6 +1929,7 @@ class DetectedObject(_message.Message):
     QUATERNION_FIELD_NUMBER: _builtins.int
     BEST_SCORE_FIELD_NUMBER: _builtins.int
     CONFIDENCE_FIELD_NUMBER: _builtins.int
+    REASON_FIELD_NUMBER: _builtins.int
     number: _builtins.int
     """As in Grasp.object; the segment, where segment_ids were sent."""
     points: _builtins.int
@@ -1938,6 +1939,10 @@ class DetectedObject(_message.Message):
     confidence: _builtins.float
     """Probability that it is an object, a factor of its grasps' scores; absent (null in JSON): the
     caller named it.
+    """
+    reason: _builtins.str
+    """Why it has no grasp of a score of 0.5 and more: too-wide, too-flat, blocked or hidden; absent
+    (null in JSON): it has one, or none of these is why.
     """
     @_builtins.property
     def center(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
@@ -1961,19 +1966,24 @@ class DetectedObject(_message.Message):
         quaternion: _abc.Iterable[_builtins.float] | None = ...,
         best_score: _builtins.float | None = ...,
         confidence: _builtins.float | None = ...,
+        reason: _builtins.str | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "best_score", b"best_score", "confidence", b"confidence"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "_reason", b"_reason", "best_score", b"best_score", "confidence", b"confidence", "reason", b"reason"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "best_score", b"best_score", "center", b"center", "confidence", b"confidence", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "_reason", b"_reason", "best_score", b"best_score", "center", b"center", "confidence", b"confidence", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion", "reason", b"reason"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__best_score: _TypeAlias = _typing.Literal["best_score"]  # noqa: Y015
     _WhichOneofArgType__best_score: _TypeAlias = _typing.Literal["_best_score", b"_best_score"]  # noqa: Y015
     _WhichOneofReturnType__confidence: _TypeAlias = _typing.Literal["confidence"]  # noqa: Y015
     _WhichOneofArgType__confidence: _TypeAlias = _typing.Literal["_confidence", b"_confidence"]  # noqa: Y015
+    _WhichOneofReturnType__reason: _TypeAlias = _typing.Literal["reason"]  # noqa: Y015
+    _WhichOneofArgType__reason: _TypeAlias = _typing.Literal["_reason", b"_reason"]  # noqa: Y015
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__best_score) -> _WhichOneofReturnType__best_score | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__confidence) -> _WhichOneofReturnType__confidence | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__reason) -> _WhichOneofReturnType__reason | None: ...
 
 Global___DetectedObject: _TypeAlias = DetectedObject  # noqa: Y015
 

@@ -220,6 +220,9 @@ function showAnswer() {
     ? `${grasps.length} grasp${grasps.length === 1 ? "" : "s"} on ${answer.objects.filter((o) => o.best_score !== null).length} of ${answer.objects.length} objects`
     : "No grasps yet";
   $("warnings").replaceChildren(...(answer?.warnings ?? []).map((text) => element("li", text)));
+  for (const { number, reason } of answer?.objects ?? []) {
+    if (reason) $("warnings").append(element("li", `Object ${number} has no good grasp: ${reason.replace("-", " ")}.`));
+  }
   if (answer && !answer.support) $("warnings").append(element("li", "No support plane was found."));
   if (answer) $("count").max = Math.max(grasps.length, 12);
   $("grasps").replaceChildren(...grasps.map(line));
