@@ -235,6 +235,7 @@ class GraspDetector:
         """Last stage: scores, ranking, suppression, poses."""
         scene, gripper, options = prepared.scene, prepared.gripper, prepared.options
         counts, grasps, debug = prepared.counts, [], None
+        sample = None if scored is None else scored.sample
         with prepared.timed("ranking"):
             logits = np.empty(0, dtype=np.float32) if scored is None else scored.logits
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
@@ -242,8 +243,7 @@ class GraspDetector:
                 prepared.warnings.append(NO_APPROACH_POINT)
             elif scored is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
-            elif scene is not None and scored is not None:
-                sample = scored.sample
+            elif scene is not None and sample is not None:
                 found = object_probability(scene, sample.candidates.contact_index)
                 score, ratings = score * found, self._rating(logits) * found
                 rows, outcome = select(scene, sample, score, ratings, gripper, options, counts)
@@ -251,8 +251,7 @@ class GraspDetector:
                 clear = clearances(scene, best.T_cloud_hand, gripper)
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
             if options.debug and scene is not None:
-                drawn = None if scored is None else scored.sample
-                debug = debug_info(scene, drawn, score, outcome, prepared.selected.labels)
+                debug = debug_info(scene, sample, score, outcome, prepared.selected.labels)
         counts["returned"] = len(grasps)
         return Detection(
             grasps,

@@ -19,6 +19,7 @@ from edgegrasp_model.hand_view import (
     HandView,
     hand_views,
     mirror_sides,
+    only_viewpoint,
     reach_of,
     seen_part,
 )
@@ -55,7 +56,7 @@ def describe_hands(
     """The hand-frame description of each candidate.
 
     A hand and what it would grasp may be mirrored in the hand's x without changing the outcome:
-    where the viewpoint is known, each is described with the camera on the side of positive x.
+    where there is one camera, each is described with it on the side of positive x.
 
     Args:
         cloud: N points with normals.
@@ -63,8 +64,8 @@ def describe_hands(
         gripper: Fingers open to its maximum.
         up: (3,) away from gravity.
         support: Plane that heights are measured from; None where it is unknown.
-        viewpoints: (W, 3) the cameras, the first of which is the one mentioned above; None where
-            they are unknown.
+        viewpoints: (W, 3) the cameras; None where they are unknown. Of several, nothing but what
+            none of them saw is described.
         at_side: (N,) points where a side of the workspace cuts things off: what is between the
             fingers there may be wider than it seems. None: nowhere.
         view: `hand_views` of the same candidates, where the caller has it already.
@@ -77,7 +78,7 @@ def describe_hands(
     """
     reach = reach_of(gripper)
     view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
-    viewpoint = None if viewpoints is None else viewpoints[0]
+    viewpoint = only_viewpoint(viewpoints)
     side = mirror_sides(candidates.T_cloud_hand, viewpoint)
     mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]

@@ -129,6 +129,11 @@ ABOVE = 0.001  # metres over the camera
 BESIDE, OUTSIDE, BEHIND, BEYOND = 0.027, 0.06, 0.026, 0.012
 
 
+def only_viewpoint(viewpoints: Float32 | None) -> Float32 | None:
+    """The camera (3,) among (W, 3), where there is exactly one."""
+    return viewpoints[0] if viewpoints is not None and len(viewpoints) == 1 else None
+
+
 def mirror_sides(T_cloud_hand: Float32, viewpoint: Float32 | None) -> Float32:
     """1 or -1 (E,): what a hand's x is multiplied by, so that the camera is on its positive side.
 

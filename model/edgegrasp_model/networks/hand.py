@@ -18,7 +18,13 @@ from torch import Tensor, nn
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
-from edgegrasp_model.hand_view import HandView, hand_views, points_around_fingers, reach_of
+from edgegrasp_model.hand_view import (
+    HandView,
+    hand_views,
+    only_viewpoint,
+    points_around_fingers,
+    reach_of,
+)
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -75,9 +81,9 @@ class HandBatch:
         description = describe_hands(
             cloud, candidates, gripper, up, support, viewpoints, *of_points
         )
-        viewpoint = None if viewpoints is None else viewpoints[0]
+        camera = only_viewpoint(viewpoints)
         points, count = points_around_fingers(
-            cloud.normals, T_cloud_hand, gripper, viewpoint, view, num_points
+            cloud.normals, T_cloud_hand, gripper, camera, view, num_points
         )
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
 
