@@ -41,7 +41,7 @@ def grasps_of(answer: Any) -> list[dict[str, Any]]:
         for name, value in fields.items():
             if name.startswith("T_"):
                 fields[name] = [list(value[row : row + 4]) for row in range(0, 16, 4)]
-            elif name == "object":
+            elif grasp.DESCRIPTOR.fields_by_name[name].has_presence:
                 fields[name] = value if grasp.HasField(name) else None
             elif not isinstance(value, float | bool):
                 fields[name] = list(value)
