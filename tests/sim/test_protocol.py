@@ -52,6 +52,6 @@ def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: st
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(
         FileNotFoundError,
-        match="choose one of bin, bin-full, edgegrasp, .*, vgn",
+        match=r"choose one of bin, bin-full, edgegrasp, .*, vgn",
     ):
         load_protocol("paper")
