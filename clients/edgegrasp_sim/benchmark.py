@@ -25,7 +25,7 @@ from edgegrasp_sim.results import ResultFolder
 from edgegrasp_sim.scene import PACKED, PILE, REST
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.surroundings import TABLE_FRICTION
-from edgegrasp_sim.trial import MIN_POINTS, Planner, Round, run_round
+from edgegrasp_sim.trial import MIN_SEEN, Planner, Round, run_round
 from edgegrasp_sim.workers import run_tasks
 
 # Makes the planner in the process that uses it; must be picklable if there are several.
@@ -180,7 +180,7 @@ def constants(engine: str) -> dict[str, float]:
         "side_grasp_angle": SIDE_GRASP_ANGLE,
         "step_length": STEP_LENGTH,
         "min_opening": MIN_OPENING,
-        "min_points": MIN_POINTS,
+        "min_points": MIN_SEEN,
     }
 
 

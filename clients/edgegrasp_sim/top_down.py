@@ -9,7 +9,7 @@ from edgegrasp_sim.trial import PlannedGrasp
 REACH = 0.04  # metres around the highest point that count as the object to grasp
 DEPTH = 0.025  # metres that the fingertips go below its top
 TABLE_CLEARANCE = 0.004  # metres
-MIN_POINTS = 10
+FEWEST = 10  # points that an object has
 
 
 def plan_top_down(observation: Observation, seed: int) -> PlannedGrasp | None:
@@ -19,14 +19,14 @@ def plan_top_down(observation: Observation, seed: int) -> PlannedGrasp | None:
     """
     del seed
     cloud = observation.cloud.astype(np.float64)
-    if len(cloud) < MIN_POINTS:
+    if len(cloud) < FEWEST:
         return None
     # Not the very highest point, which is the noisiest.
-    top = cloud[np.argsort(cloud[:, 2])[-MIN_POINTS]]
+    top = cloud[np.argsort(cloud[:, 2])[-FEWEST]]
     near = cloud[
         (np.linalg.norm(cloud[:, :2] - top[:2], axis=1) < REACH) & (cloud[:, 2] > top[2] - DEPTH)
     ]
-    if len(near) < MIN_POINTS:
+    if len(near) < FEWEST:
         return None
     _, axes = np.linalg.eigh(np.cov(near[:, :2].T))
     closing = np.array([*axes[:, 0], 0.0])

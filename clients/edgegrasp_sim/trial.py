@@ -18,7 +18,7 @@ from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
 
-MIN_POINTS = 100
+MIN_SEEN = 100  # points above the table; a round ends where a view shows fewer
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,7 @@ class RoundDriver:
         self.view += 1
         inside = crop(self._seen.cloud, self._seen.workspace)
         above = inside[:, 2] > self._seen.table_height + 0.005
-        if np.count_nonzero(above) < MIN_POINTS:
+        if np.count_nonzero(above) < MIN_SEEN:
             self.end = RoundEnd.NOTHING_SEEN
         return self._seen
 
