@@ -88,11 +88,11 @@ def reliability_tables(scored: Scored, names: list[str]) -> str:
             loss = cross_entropy(scored.logit[row, mine], held.astype(np.float64))
             brier = np.square(score[row, mine] - held).mean()
             error = calibration_error(score[row, mine], held)
-            share = f"{100 * held.mean():.1f} %"
-            rows.append(
-                (group, name, len(held), share, *(f"{v:.3f}" for v in (loss, brier, error)))
-            )
-    lines = table(("grasps", "weights", "number", "held", "loss", "Brier", "ECE"), rows)
+            shares = (f"{100 * v.mean():.1f} %" for v in (score[row, mine], held))
+            figures = (f"{v:.3f}" for v in (loss, brier, error))
+            rows.append((group, name, len(held), *shares, *figures))
+    head = ("grasps", "weights", "number", "mean score", "held", "loss", "Brier", "ECE")
+    lines = table(head, rows)
     ranges = [
         (f"{low:g} to {high:g}", *(_held_of(each, scored.held, low, high) for each in score))
         for low, high in pairwise(EDGES)
