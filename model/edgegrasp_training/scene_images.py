@@ -36,6 +36,7 @@ OTHER, SUPPORT, OBJECT = 0, 1, 2  # stored labels; objects are numbered from OBJ
 MAX_OBJECTS = 96
 VIEWS_PER_SCENE = 4
 SCENES_PER_FILE = 50
+FILES_PER_POOL = 20  # that draw from the same objects
 LEVEL = 0.85  # least z of a support's normal: its edges are labelled other
 CELL = 0.005  # metres, of the height map that objects are put down on
 REACH = 0.9  # metres that it extends to either side
@@ -73,7 +74,7 @@ class SceneMeshes:
     centres: list[Float64] = field(default_factory=list)  # of the objects
     elevation: tuple[float, float] = (0.25, 1.5)  # radians above level, of the camera
     azimuth: tuple[float, float] = (-np.pi, np.pi)  # radians, 0 along x
-    distance: tuple[float, float] = (0.35, 1.6)  # metres
+    distance: tuple[float, float] = (0.3, 1.9)  # metres
     spread: float = 0.1  # metres around the target
     level: float = 0.0  # metres, of the main support
 
@@ -180,11 +181,11 @@ def draw_scene(
 ) -> SceneMeshes:
     """Any of the kinds of scenes."""
     draw: list[tuple[float, Callable[..., SceneMeshes]]] = [
-        (0.45, _table),
-        (0.25, _bin),
-        (0.14, _shelf),
-        (0.08, _tray),
-        (0.08, _floor),
+        (0.42, _table),
+        (0.24, _bin),
+        (0.16, _shelf),
+        (0.11, _tray),
+        (0.07, _floor),
     ]
     shares = np.array([share for share, _ in draw])
     make = draw[int(rng.choice(len(draw), p=shares / shares.sum()))][1]
@@ -205,12 +206,15 @@ def generate(
         parts: How many shares there are.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng([seed, part, 7])
-    pool, arms = make_pool(rng, objects), make_arms(rng)
+    drawn = -1
     for number in range(part, files, parts):
         path = folder / f"scenes-{number:04d}.npz"
         if path.exists():
             continue
+        if drawn != number // FILES_PER_POOL:
+            drawn = number // FILES_PER_POOL
+            rng = np.random.default_rng([seed, drawn, 7])
+            pool, arms = make_pool(rng, objects), make_arms(rng)
         rng = np.random.default_rng([seed, number])
         images: list[SceneImage] = []
         while len(images) < SCENES_PER_FILE * VIEWS_PER_SCENE:
@@ -577,9 +581,13 @@ def _room(
 
 
 def _distractors(
-    rng: np.random.Generator, scene: SceneMeshes, heights: HeightMap, half: tuple[float, float]
+    rng: np.random.Generator,
+    scene: SceneMeshes,
+    heights: HeightMap,
+    half: tuple[float, float],
+    pool: Sequence[PoolMesh],
 ) -> None:
-    """Large or fixed things on a support: cartons, monitors, keyboards, pillars, cables."""
+    """Large or fixed background on a support: cartons, boards, monitors, pillars, cables."""
 
     def put(mesh: Mesh) -> None:
         samples = pool_mesh(rng, mesh)
@@ -587,33 +595,41 @@ def _distractors(
         heights.put(samples.samples + centre)
         scene.add(mesh)
 
-    for _ in range(int(rng.integers(0, 4))):
+    for _ in range(int(rng.integers(0, 5))):
         yaw = rng.uniform(0, 2 * np.pi)
-        place = rng.uniform(0.4, 1.0) * np.array([rng.choice([-1, 1]), rng.choice([-1, 1])]) * half
+        place = rng.uniform(0.35, 1.1) * np.array([rng.choice([-1, 1]), rng.choice([-1, 1])]) * half
         if rng.random() < 0.5:
             place[int(rng.integers(2))] *= rng.uniform(-1, 1)
-        kind = rng.integers(5)
+        kind = rng.integers(7)
         if kind == 0:
-            size = rng.uniform((0.38, 0.15, 0.06), (0.65, 0.45, 0.45))
+            size = rng.uniform((0.38, 0.1, 0.04), (0.75, 0.5, 0.5))
             put(box(size, (*place, size[2] / 2), yaw))
         elif kind == 1:
-            size = rng.uniform((0.4, 0.015, 0.25), (0.6, 0.05, 0.4))
-            stand = rng.uniform(0.05, 0.2)
-            put(
-                merged(
-                    [
-                        box(size, (*place, stand + size[2] / 2), yaw),
-                        box((0.05, 0.05, stand), (*place, stand / 2), yaw),
-                        box((0.22, 0.18, 0.012), (*place, 0.006), yaw),
-                    ]
-                )
-            )
+            size = rng.uniform((0.38, 0.015, 0.2), (0.7, 0.05, 0.6))
+            stand = rng.uniform(0.0, 0.2)
+            panel = box(size, (*place, stand + size[2] / 2), yaw)
+            pole = box((0.05, 0.05, stand + 0.01), (*place, stand / 2), yaw)
+            foot = box((0.22, 0.18, 0.012), (*place, 0.006), yaw)
+            put(merged([panel, pole, foot]))
         elif kind == 2:
-            size = rng.uniform((0.38, 0.1, 0.012), (0.6, 0.3, 0.04))
+            size = rng.uniform((0.38, 0.04, 0.006), (0.9, 0.45, 0.06))
             put(box(size, (*place, size[2] / 2), yaw))
         elif kind == 3:
             size = rng.uniform((0.03, 0.03, 0.4), (0.12, 0.12, 1.2))
             put(box(size, (*place, size[2] / 2), yaw))
+        elif kind == 4:  # boards or cartons on top of each other
+            low = 0.0
+            for _ in range(int(rng.integers(2, 4))):
+                size = rng.uniform((0.38, 0.12, 0.01), (0.6, 0.35, 0.12))
+                shift = rng.normal(0.0, 0.02, 2)
+                put(box(size, (*(place + shift), low + size[2] / 2), yaw + rng.normal(0.0, 0.1)))
+                low += size[2]
+        elif kind == 5:  # something of any shape, too large to lift
+            drawn = pool[int(rng.integers(len(pool)))]
+            longest = np.ptp(drawn.mesh[0], axis=0).max()
+            points = drawn.mesh[0] * (rng.uniform(0.42, 0.9) / longest)
+            turn = Rotation.from_euler("z", yaw).as_matrix()
+            put((points @ turn.T + (*place, -points[:, 2].min()), drawn.mesh[1]))
         else:
             put(_cable(rng, place))
 
@@ -675,7 +691,7 @@ def _table(rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Me
         step = rng.choice([-1, 1, -1]) * rng.uniform(0.01, 0.25)
         scene.add(box((2 * side, 2.2 * half[1], 0.3), (half[0] + side, 0, step - 0.15)))
     heights = HeightMap(half)
-    _distractors(rng, scene, heights, half)
+    _distractors(rng, scene, heights, half, pool)
     _fill(rng, scene, pool, heights)
     _add_arm(rng, scene, arms)
     return scene
@@ -685,7 +701,7 @@ def _floor(rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Me
     scene = SceneMeshes(elevation=(0.2, 1.57), distance=(0.5, 2.2))
     _room(rng, scene, 0.0, pool, SUPPORT)
     heights = HeightMap((0.7, 0.7))
-    _distractors(rng, scene, heights, (0.7, 0.7))
+    _distractors(rng, scene, heights, (0.7, 0.7), pool)
     _fill(rng, scene, pool, heights)
     _add_arm(rng, scene, arms)
     return scene
@@ -750,8 +766,10 @@ def _open_box(
 def _bin(rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Mesh]) -> SceneMeshes:
     scene = SceneMeshes(elevation=(0.75, 1.57), distance=(0.4, 1.5), spread=0.07)
     half = (rng.uniform(0.12, 0.35), rng.uniform(0.1, 0.28))
-    depth = rng.uniform(0.06, 0.35)
+    depth = rng.uniform(0.03, 0.35)
     flush = rng.random() < 0.2
+    if depth < 0.1:
+        scene.elevation = (0.45, 1.57)
     scene.add(_surface(rng, half, 0.004), SUPPORT)
     for mesh in _open_box(rng, half, depth, flush):
         scene.add(mesh)

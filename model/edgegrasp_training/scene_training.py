@@ -22,13 +22,15 @@ UP_SHARE = 0.5  # of the images whose `up` the network is told
 UP_ERROR = 0.02  # radians, standard deviation of what it is told
 BATCH = 16
 SIZES, SIZE_SHARES = ((240, 320), (192, 256), (144, 192)), (0.5, 0.3, 0.2)  # pixels, of batches
+CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
 CROPPED_SHARE = 0.12  # of the images, of which only what is above the support and near is left
 HELD_OUT = 2  # files, the first ones, that the network never learns from
 LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
 SAVE_EVERY = 300  # seconds
 AVERAGED = 0.998  # of the mean weights that stay at each step
-CLASS_WEIGHT, VOTE_WEIGHT, LINK_WEIGHT, APART = 1.0, 1.0, 0.5, 4.0  # APART: of links that are none
+CLASS_WEIGHT, VOTE_WEIGHT, LINK_WEIGHT, UP_WEIGHT = 1.0, 1.0, 0.5, 0.5
+APART = 4.0  # weight of a link between different objects
 
 
 class SceneBatch(NamedTuple):
@@ -39,6 +41,7 @@ class SceneBatch(NamedTuple):
     votes: Tensor  # (B, 3, H/2, W/2) metres
     weight: Tensor  # (B, H/2, W/2) of each pixel's vote: all objects of an image count alike
     links: Tensor  # (B, 2, H/2, W/2) 1 same object, 0 not, -1 not judged
+    up: Tensor  # (B, 3) unit
 
 
 class SceneImages:
@@ -88,39 +91,22 @@ def make_batch(
 def _example(
     image: SceneImage, rng: np.random.Generator, told: bool | None, size: tuple[int, int]
 ) -> tuple[NDArray[np.generic], ...]:
-    points, label, centre, up = (
-        image_points(image),
-        image.label.astype(np.int64),
-        image.centre,
-        image.up.astype(np.float64),
-    )
-    full = label.shape
-    row, column = (
-        ((np.arange(size[d]) + 0.5) * full[d] / size[d]).astype(np.int64) for d in (0, 1)
-    )
+    points, label = image_points(image), image.label.astype(np.int64)
+    centre, true_up = image.centre, image.up.astype(np.float64)
+    full, closer = label.shape, told is None and rng.random() < CLOSER_SHARE
+    step = 1.0 if closer else full[1] / size[1]
+    corner = [int(rng.integers(full[d] - size[d] + 1)) if closer else 0 for d in (0, 1)]
+    row, column = (corner[d] + ((np.arange(size[d]) + 0.5) * step).astype(np.int64) for d in (0, 1))
     points, label = points[row][:, column], label[row][:, column]
     if told is None and rng.random() < CROPPED_SHARE:
         points = _cropped(points, label, image.plane, rng)
-    if told is None:
-        up = up + rng.normal(0.0, UP_ERROR, 3)
-        if rng.random() < 0.5:
-            mirror = np.array([-1, 1, 1], dtype=np.float32)
-            points, label, centre, up = (
-                points[:, ::-1] * mirror,
-                label[:, ::-1],
-                centre * mirror,
-                up * mirror,
-            )
-        if rng.random() < 0.5:
-            turn = np.array([-1, -1, 1], dtype=np.float32)
-            points, label, centre, up = (
-                points[::-1, ::-1] * turn,
-                label[::-1, ::-1],
-                centre * turn,
-                up * turn,
-            )
+    for turn, flip in ((_MIRROR, np.s_[:, ::-1]), (_HALF_TURN, np.s_[::-1, ::-1])):
+        if told is None and rng.random() < 0.5:
+            points, label = points[flip] * turn, label[flip]
+            centre, true_up = centre * turn, true_up * turn
+    up = true_up if told is not None else true_up + rng.normal(0.0, UP_ERROR, 3)
     known = rng.random() < UP_SHARE if told is None else told
-    footprint = full[1] / size[1] / float(image.camera[0])
+    footprint = step / float(image.camera[0])
     features = scene_features(points, up / np.linalg.norm(up) if known else None, footprint)
     points, label = points[::2, ::2], label[::2, ::2]
     seen = ~np.isnan(points[..., 2])
@@ -140,7 +126,11 @@ def _example(
         votes.astype(np.float32).transpose(2, 0, 1).copy(),
         weight.astype(np.float32),
         links.astype(np.float32),
+        true_up.astype(np.float32),
     )
+
+
+_MIRROR, _HALF_TURN = np.array([[-1, 1, 1], [-1, -1, 1]], dtype=np.float32)
 
 
 def _cropped(
@@ -175,10 +165,14 @@ def scene_loss(output: SceneOutput, batch: SceneBatch) -> dict[str, Tensor]:
         output.links, batch.links.clamp(min=0), reduction="none"
     )
     links = (wrong * weight).sum() / weight.sum().clamp(min=1.0)
+    agree = functional.cosine_similarity(output.up, batch.up[..., None, None], dim=1)
+    seen = batch.classes >= 0
+    up = ((1.0 - agree) * seen).sum() / seen.sum().clamp(min=1)
     return {
         "classes": CLASS_WEIGHT * classes,
         "votes": VOTE_WEIGHT * votes,
         "links": LINK_WEIGHT * links,
+        "up": UP_WEIGHT * up,
     }
 
 
@@ -282,8 +276,10 @@ def _learn(
 ) -> dict[str, float]:
     """One step; returns the parts of the loss."""
     network.train()
-    output = network(batch.features.contiguous(memory_format=torch.channels_last))
-    parts = scene_loss(output, batch)
+    # Products in bfloat16 are some three times as fast on processors that have them.
+    with torch.autocast("cpu", torch.bfloat16):
+        output = network(batch.features.contiguous(memory_format=torch.channels_last))
+    parts = scene_loss(SceneOutput(*(each.float() for each in output)), batch)
     optimiser.zero_grad(set_to_none=True)
     torch.stack(list(parts.values())).sum().backward()  # type: ignore[no-untyped-call]
     torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)

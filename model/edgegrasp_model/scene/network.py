@@ -22,10 +22,10 @@ HEIGHT, WIDTH = 240, 320  # pixels of the input
 MULTIPLE = 16  # its sides are multiples of
 CLASSES = ("other", "support", "object")
 CHANNELS = 12  # of `scene_features`
-WIDTHS = (16, 32, 64, 96, 128)
+WIDTHS = (24, 32, 64, 96, 128)
 STRIDE = 2  # pixels of the input between neighbours whose difference gives the normal
 VOTE_UNIT = 0.05  # metres
-OUTPUTS = len(CLASSES) + 3 + 2
+OUTPUTS = len(CLASSES) + 3 + 2 + 3
 
 
 class SceneOutput(NamedTuple):
@@ -33,13 +33,12 @@ class SceneOutput(NamedTuple):
 
     classes: Tensor  # (B, 3, H/2, W/2) logits of CLASSES
     votes: Tensor  # (B, 3, H/2, W/2) metres from the point to the centre of its object
-    links: (
-        Tensor  # (B, 2, H/2, W/2) logits: shows the same object as its right, its lower neighbour
-    )
+    links: Tensor  # (B, 2, H/2, W/2) logits: same object as the right, the lower neighbour
+    up: Tensor  # (B, 3, H/2, W/2) away from gravity, of any length
 
 
 class SceneNet(nn.Module):
-    """Classes, votes for centres and links of range images."""
+    """Classes, votes for centres, links, and which way is up, of range images."""
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
         """With random weights; `widths` are channels at each resolution, from the output's."""
@@ -70,7 +69,7 @@ class SceneNet(nn.Module):
             )
             x = layer(x + beside)
         out = self.head(x)
-        return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:])
+        return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:8], out[:, 8:])
 
     def fused(self) -> "SceneNet":
         """This network with each normalisation folded into its convolution, for inference."""
