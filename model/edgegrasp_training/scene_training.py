@@ -49,13 +49,18 @@ class SceneImages:
 
     def __init__(self, files: Sequence[Path]) -> None:
         """Read files of `generate`."""
-        self.arrays: list[dict[str, NDArray[np.generic]]] = []
+        self.arrays: dict[Path, dict[str, NDArray[np.generic]]] = {}
+        self.where: list[tuple[Path, int]] = []
+        self.add(files)
+
+    def add(self, files: Sequence[Path]) -> None:
+        """Read those of some files that were not read yet."""
         for path in files:
+            if path in self.arrays:
+                continue
             with np.load(path) as stored:
-                self.arrays.append({name: stored[name] for name in SceneImage._fields})
-        self.where = [
-            (a, k) for a, each in enumerate(self.arrays) for k in range(len(each["depth"]))
-        ]
+                self.arrays[path] = {name: stored[name] for name in SceneImage._fields}
+            self.where += [(path, k) for k in range(len(self.arrays[path]["depth"]))]
 
     def __len__(self) -> int:
         return len(self.where)
@@ -197,8 +202,11 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
     }
 
 
-def batches(images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
-    """Endless batches, each image once before any twice; one is made while another is learned."""
+def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
+    """Endless batches, each image once before any twice; one is made while another is learned.
+
+    Files that come into the folder meanwhile are read too.
+    """
 
     def one(rows: NDArray[np.int64]) -> SceneBatch:
         return make_batch([images[int(k)] for k in rows], rng)
@@ -206,6 +214,7 @@ def batches(images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatc
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         while True:
+            images.add(_files(data)[HELD_OUT:])
             order = rng.permutation(len(images))
             for start in range(0, len(order) - BATCH + 1, BATCH):
                 following = pool.submit(one, order[start : start + BATCH])
@@ -244,9 +253,8 @@ def train(
     averaging = swa_utils.get_ema_multi_avg_fn(AVERAGED)  # type: ignore[no-untyped-call]
     mean = swa_utils.AveragedModel(network, multi_avg_fn=averaging, use_buffers=True)
     optimiser = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=0.01)
-    files = sorted(data.glob("scenes-????.npz"))
-    held, images = SceneImages(files[:HELD_OUT]), SceneImages(files[HELD_OUT:])
-    source = batches(images, np.random.default_rng(seed))
+    held, images = SceneImages(_files(data)[:HELD_OUT]), SceneImages([])
+    source = batches(data, images, np.random.default_rng(seed))
     begin = saved = time.monotonic()
     step, running = 0, dict[str, float]()
     while (spent := time.monotonic() - begin) < seconds:
@@ -269,6 +277,10 @@ def train(
             losses = f"train {_text(running)} held {_text(evaluate(averaged, held))}"
             with (run / "log.txt").open("a") as log:
                 log.write(f"{step} {now - begin:.0f}s images {len(images)} {losses}\n")
+
+
+def _files(data: Path) -> list[Path]:
+    return sorted(data.glob("scenes-????.npz"))
 
 
 def _learn(

@@ -142,7 +142,7 @@ def select_points(
         views = _views(sent, viewpoints, options)
         shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
     support = choose_support(seen, inside, shown, options, warnings)
-    up = _up(options, support, seen)
+    up = _up(options, support, shown)
     number = _given_numbers(sent) if given or shown is None else shown.number
     confidence = {} if given else _confidences(number, shown)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
@@ -368,25 +368,22 @@ def _fitted_support(
     on = on[:: max(len(on) // SUPPORT_POINTS, 1)]
     part = Seen(seen.points[on], seen.viewpoint)
     weight = near_objects(part.points, seen.points[shown.number >= 0])
-    plane = fit_plane(part, weight, rng, up)
+    plane = fit_plane(part, weight, rng, shown.up if up is None else up)
     if plane is None:
         return None
     found = measured(part, plane, PLANE_LIMITS.margin[0])
     return found if area(found, part.points) > PLANE_LIMITS.least_area else None
 
 
-def _up(options: DetectOptions, support: Support | None, seen: Seen) -> Float64:
-    """Unit vector (3,) away from gravity: as sent, else the support's normal, else a guess.
+def _up(options: DetectOptions, support: Support | None, shown: Segmentation | None) -> Float64:
+    """Unit vector (3,) away from gravity: as sent, else the support's normal, else the network's.
 
-    Where a support was looked for and none is seen, that is the way to the camera; else +z.
+    +z where there is none of them.
     """
-    given = options.up
-    if given is None and support is not None:
-        given = support.plane.normal
-    up = np.array([0.0, 0.0, 1.0]) if given is None else np.asarray(given, dtype=np.float64)
-    if given is None and isinstance(options.support, AutoPlane) and seen.viewpoint is not None:
-        up = seen.viewpoint - np.median(seen.points, axis=0)
-    return np.asarray(up / np.linalg.norm(up))
+    up = np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
+    if support is not None:
+        up = support.normal
+    return up if options.up is None else np.asarray(options.up) / np.linalg.norm(options.up)
 
 
 def _given_numbers(sent: CheckedCloud) -> Int64:

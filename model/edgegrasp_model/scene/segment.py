@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from torch.nn import functional
 
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.network import SceneNet, scene_features
@@ -60,6 +61,7 @@ class Segmentation(NamedTuple):
     number: Int64  # (N,) the object, from 0; FIXED; UNKNOWN
     object: Float32  # (N,) probability of an object
     support: Float32  # (N,) probability of a support
+    up: Float64  # (3,) unit, away from gravity, as the network sees it; cloud frame
 
 
 @cache
@@ -86,16 +88,17 @@ def segment(
         up: (3,) unit, away from gravity; None: unknown.
         down: (3,) unit, downward in the image, of use where `up` is unknown; None: unknown.
     """
-    number = np.full(len(points), UNKNOWN)
+    number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     for viewpoint, rows in views:
         if rows is None:
             return _segment_view(points, viewpoint, up, down)
         if len(rows) == 0:
             continue
-        own, objects[rows], support[rows] = _segment_view(points[rows], viewpoint, up, down)
+        own, objects[rows], support[rows], own_up = _segment_view(points[rows], viewpoint, up, down)
         number[rows] = np.where(own >= 0, own + int(number.max(initial=-1)) + 1, own)
-    return Segmentation(_joined(points, number), objects, support)
+        seen_up += own_up * len(rows)
+    return Segmentation(_joined(points, number), objects, support, _unit(seen_up))
 
 
 def _segment_view(
@@ -111,16 +114,22 @@ def _segment_view(
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
         votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
         links = output.links[0].sigmoid().contiguous().numpy()
+        ways = functional.normalize(output.up[0], dim=0).numpy()
     seen = np.ascontiguousarray(image.points[::2, ::2])
-    shown = Segmentation(
-        np.full(len(points), UNKNOWN), *np.zeros((2, len(points)), dtype=np.float32)
+    number, objects, support = (
+        np.full(len(points), UNKNOWN),
+        *np.zeros((2, len(points)), dtype=np.float32),
     )
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
     of_pixel = group(seen, classes, votes, links, 2 * image.footprint)
-    _look_up(
-        points, image.pixel, T_camera_cloud, image.points.shape[1], seen, of_pixel, classes, *shown
-    )
-    return shown
+    arrays = seen, of_pixel, classes, number, objects, support
+    _look_up(points, image.pixel, T_camera_cloud, image.points.shape[1], *arrays)
+    seen_up = turn @ ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
+    return Segmentation(number, objects, support, _unit(seen_up))
+
+
+def _unit(vector: Float64) -> Float64:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 @contextmanager
