@@ -124,10 +124,15 @@ def flat(distance: float) -> np.ndarray:
 
 
 SCENE = render([table(), *boxes_on_table(3)], camera(0.7, -1.2, 0.85))
+ROOM = [box(3 * way, 3.1 - 3 * np.abs(way)) for way in np.concatenate([np.eye(3), -np.eye(3)])]
 NO_SCENES = {
     "one pixel": SCENE[120:121, 160:161],
+    "one row": SCENE[120:121],
+    "one column": SCENE[:, 160:161],
     "holes": np.full_like(SCENE, np.nan),
+    "too close": flat(0.04),
     "too far": flat(12.0),
+    "a room from inside": render(ROOM, camera(1.2, 0.3, 0.4)),
 }
 
 

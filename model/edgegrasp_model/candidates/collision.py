@@ -13,9 +13,9 @@ from edgegrasp_model.hand_kernels import (
 from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.grouping import FIXED
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import DepthMap, enters_unseen
 
 Float32 = NDArray[np.float32]

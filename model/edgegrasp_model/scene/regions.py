@@ -20,7 +20,7 @@ from edgegrasp_model.options import (
     Sphere,
 )
 from edgegrasp_model.scene.cloud import CheckedCloud, Float32, Int64, Voxels
-from edgegrasp_model.scene.segment import FIXED
+from edgegrasp_model.scene.grouping import FIXED
 
 Bools = NDArray[np.bool_]
 

@@ -31,6 +31,7 @@ from edgegrasp_model.scene.cloud import (
     voxelise,
 )
 from edgegrasp_model.scene.depth_scale import correct_depth_scale
+from edgegrasp_model.scene.grouping import FIXED, UNKNOWN
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import (
     check_pixel,
@@ -40,8 +41,6 @@ from edgegrasp_model.scene.regions import (
     inside_region,
 )
 from edgegrasp_model.scene.segment import (
-    FIXED,
-    UNKNOWN,
     Segmentation,
     segment,
     with_risen,
@@ -71,9 +70,6 @@ SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around a thing in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
-# Probability of an object by the network's mean over its pixels: logistic, fitted to 1,306 objects
-# of held-out simulated images.
-CALIBRATION = 12.0, 0.62
 UNSEEN_BY_NETWORK = 0.3  # probability of an object that only geometry sees
 LIKELY = 0.5  # probability of object or support from which what rises may be an object
 SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
@@ -144,7 +140,7 @@ def select_points(
     support = choose_support(seen, inside, shown, options, warnings)
     up = _up(options, support, shown)
     number = _given_numbers(sent) if given or shown is None else shown.number
-    confidence = {} if given else _confidences(number, shown)
+    confidence = {} if given or shown is None else dict(enumerate(shown.confidence.tolist()))
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     if support is not None:
         height, margin = support.heights(seen)
@@ -221,18 +217,6 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
     down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
     length = float(np.linalg.norm(down))
     return down / length if length > 0 else None
-
-
-def _confidences(number: Int64, shown: Segmentation | None) -> dict[int, float]:
-    """How probable it is that each object is one, by the network's mean over its points."""
-    held = number >= 0
-    if shown is None or not held.any():
-        return {}
-    count = np.bincount(number[held])
-    mean = np.bincount(number[held], shown.object[held]) / np.maximum(count, 1)
-    steepness, middle = CALIBRATION
-    probability = 1.0 / (1.0 + np.exp(-steepness * (mean - middle)))
-    return {int(k): float(probability[k]) for k in np.flatnonzero(count)}
 
 
 def build_scene(

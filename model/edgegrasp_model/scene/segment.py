@@ -12,12 +12,18 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.scene.grouping import (
+    FIXED,
+    UNKNOWN,
+    confidence_of,
+    group,
+    instance_traits,
+    joined,
+)
 from edgegrasp_model.scene.network import SceneNet, scene_features
 from edgegrasp_model.scene.range_image import range_image
 
@@ -26,32 +32,23 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-# In place of an object's number: background; what may belong to an object.
-FIXED, UNKNOWN = -1, -2
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 
 @dataclass(frozen=True)
-class GroupingLimits:
-    """When pixels show the same object."""
+class RisenLimits:
+    """When points that rise above the support but were not recognised make an object."""
 
-    link: float = 0.6  # probability that neighbouring pixels show one object
-    vote: float = 0.04  # metres between the centres that neighbours vote for
-    same_centre: float = 0.035  # metres between the mean votes of two parts of one object
-    smallest: int = 16  # pixels of the network's output
-    smallest_area: float = 5e-4  # square metres, as seen
-    view_cell: float = 0.01  # metres, in which the views of one object lie in the same place
-    view_share: float = 0.25  # of the smaller one's cells that two views of one object share
-    cell: float = 0.012  # metres between points of one object that the network did not see
+    cell: float = 0.012  # metres between points of one object
     most_cells: int = 2000  # along a side of the ground that is looked at
-    fewest_points: int = 6  # of such an object in a cell, the mean
+    fewest_points: int = 6  # in a cell, the mean
     fewest_cells: int = 5
     tall: float = 0.03  # metres over what belongs to the support from which background is a wall
-    beside_background: float = 0.4  # share of such an object's cells that lie beside a wall
+    beside_background: float = 0.4  # share of its cells that lie beside a wall
     stands_out: float = 0.004  # metres over what belongs to the support that it rises at least
 
 
-LIMITS = GroupingLimits()
+LIMITS = RisenLimits()
 REACH, REACH_GROWTH = 0.03, 0.01  # metres, and share of the depth, from a point to its pixel
 
 
@@ -61,6 +58,7 @@ class Segmentation(NamedTuple):
     number: Int64  # (N,) the object, from 0; FIXED; UNKNOWN
     object: Float32  # (N,) probability of an object
     support: Float32  # (N,) probability of a support
+    confidence: Float64  # (O,) probability of each number to be an object
     up: Float64  # (3,) unit, away from gravity, as the network sees it; cloud frame
 
 
@@ -90,15 +88,22 @@ def segment(
     """
     number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    confidence = np.empty(0)
     for viewpoint, rows in views:
         if rows is None:
             return _segment_view(points, viewpoint, up, down)
         if len(rows) == 0:
             continue
-        own, objects[rows], support[rows], own_up = _segment_view(points[rows], viewpoint, up, down)
-        number[rows] = np.where(own >= 0, own + int(number.max(initial=-1)) + 1, own)
-        seen_up += own_up * len(rows)
-    return Segmentation(_joined(points, number), objects, support, _unit(seen_up))
+        own = _segment_view(points[rows], viewpoint, up, down)
+        number[rows] = np.where(own.number >= 0, own.number + len(confidence), own.number)
+        objects[rows], support[rows] = own.object, own.support
+        confidence = np.concatenate([confidence, own.confidence])
+        seen_up += own.up * len(rows)
+    merged = joined(points, number, len(confidence))
+    best = np.zeros(int(merged.max(initial=-1)) + 1)
+    np.maximum.at(best, merged, confidence)
+    number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
+    return Segmentation(number, objects, support, best, _unit(seen_up))
 
 
 def _segment_view(
@@ -122,10 +127,12 @@ def _segment_view(
     )
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
     of_pixel = group(seen, classes, votes, links, 2 * image.footprint)
+    normals = features[5:8, ::2, ::2].transpose(1, 2, 0)
+    traits = instance_traits(of_pixel, seen, classes, normals, 2 * image.footprint)
     arrays = seen, of_pixel, classes, number, objects, support
     _look_up(points, image.pixel, T_camera_cloud, image.points.shape[1], *arrays)
     seen_up = turn @ ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
-    return Segmentation(number, objects, support, _unit(seen_up))
+    return Segmentation(number, objects, support, confidence_of(traits), _unit(seen_up))
 
 
 def _unit(vector: Float64) -> Float64:
@@ -226,50 +233,6 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
     return number
 
 
-def group(
-    points: Float32, classes: Float32, votes: Float32, links: Float32, footprint: float
-) -> Int64:
-    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN where in doubt.
-
-    Args:
-        points: (H, W, 3) metres; NaN where nothing was seen.
-        classes: (3, H, W) probabilities.
-        votes: (H, W, 3) metres from each point to the centre of its object.
-        links: (2, H, W) probability of showing the same object as the right, the lower pixel.
-        footprint: Width of one of these pixels at a depth of one metre, metres.
-    """
-    seen = ~np.isnan(points[..., 2])
-    held = seen & (classes.argmax(axis=0) == 2)
-    number = np.where(held, UNKNOWN, FIXED)
-    if not held.any():
-        return number
-    centre = points + votes
-    index, pairs = np.arange(held.size).reshape(held.shape), []
-    right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
-    for link, (first, second) in zip(links, (right, lower), strict=True):
-        near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
-        joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
-        pairs.append(np.stack([index[first][joined], index[second][joined]]))
-    start, end = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(held.size, held.size))
-    _, component = connected_components(graph, directed=False)
-    pixels = np.flatnonzero(held)
-    _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
-    flat = centre.reshape(-1, 3)[pixels].astype(np.float64)
-    mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
-    area = np.bincount(part, (points[..., 2].reshape(-1)[pixels] * footprint) ** 2)
-    large = np.flatnonzero((count >= LIMITS.smallest) & (area >= LIMITS.smallest_area))
-    if len(large) == 0:
-        return number
-    # Parts that something in front separates vote for one centre.
-    apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
-    _, merged = connected_components(apart < LIMITS.same_centre, directed=False)
-    of_part = np.full(len(count), UNKNOWN)
-    of_part[large] = merged
-    number.reshape(-1)[pixels] = of_part[part]
-    return number
-
-
 @compiled("contract")
 def _look_up(
     points: Float32,
@@ -303,25 +266,3 @@ def _look_up(
                     nearest = away
                     number[n] = of_pixel[k, m]
                     objects[n], support[n] = classes[2, k, m], classes[1, k, m]
-
-
-def _joined(points: Float32, number: Int64) -> Int64:
-    """The numbers (N,) where objects that lie in the same place are one."""
-    held = np.flatnonzero(number >= 0)
-    if len(held) == 0:
-        return number
-    cell = np.floor(points[held] / LIMITS.view_cell).astype(np.int64)
-    cell -= cell.min(axis=0)
-    size = cell.max(axis=0) + 1
-    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
-    _, key = np.unique(key, return_inverse=True)
-    count = int(number.max()) + 1
-    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key))).tocsr()
-    lies.data[:] = 1
-    shared = (lies @ lies.T).toarray()
-    cells = np.diag(shared)
-    same = shared >= LIMITS.view_share * np.maximum(np.minimum.outer(cells, cells), 1)
-    same &= shared > 0
-    assert len(same) == count
-    _, joined = connected_components(same, directed=False)
-    return np.where(number >= 0, joined[np.maximum(number, 0)], number)

@@ -1,0 +1,143 @@
+"""From what the `scene` network says of each pixel to objects, and how sure each of them is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# In place of an object's number: background; what may belong to an object.
+FIXED, UNKNOWN = -1, -2
+# Logistic regression of being an object: a constant, and the weights of `instance_traits`.
+CONFIDENCE = np.array([-1.898, 6.481, -2.798])
+
+
+@dataclass(frozen=True)
+class GroupingLimits:
+    """When pixels show the same object."""
+
+    link: float = 0.6  # probability that neighbouring pixels show one object
+    vote: float = 0.04  # metres between the centres that neighbours vote for
+    same_centre: float = 0.035  # metres between the mean votes of two parts of one object
+    smallest: int = 16  # pixels of the network's output
+    smallest_area: float = 5e-4  # square metres, as seen
+    smooth: float = 0.97  # cosine between normals of neighbours on one smooth surface
+    step: float = 3.0  # pixels between neighbours on one smooth surface
+    view_cell: float = 0.01  # metres, in which the views of one object lie in the same place
+    view_share: float = 0.25  # of the smaller one's cells that two views of one object share
+
+
+LIMITS = GroupingLimits()
+
+
+def group(
+    points: Float32, classes: Float32, votes: Float32, links: Float32, footprint: float
+) -> Int64:
+    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN where in doubt.
+
+    Args:
+        points: (H, W, 3) metres; NaN where nothing was seen.
+        classes: (3, H, W) probabilities.
+        votes: (H, W, 3) metres from each point to the centre of its object.
+        links: (2, H, W) probability of showing the same object as the right, the lower pixel.
+        footprint: Width of one of these pixels at a depth of one metre, metres.
+    """
+    seen = ~np.isnan(points[..., 2])
+    held = seen & (classes.argmax(axis=0) == 2)
+    number = np.where(held, UNKNOWN, FIXED)
+    if not held.any():
+        return number
+    centre = points + votes
+    index, pairs = np.arange(held.size).reshape(held.shape), []
+    right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
+    for link, (first, second) in zip(links, (right, lower), strict=True):
+        near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
+        joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
+        pairs.append(np.stack([index[first][joined], index[second][joined]]))
+    start, end = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(held.size, held.size))
+    _, component = connected_components(graph, directed=False)
+    pixels = np.flatnonzero(held)
+    _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
+    flat = centre.reshape(-1, 3)[pixels].astype(np.float64)
+    mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
+    area = np.bincount(part, (points[..., 2].reshape(-1)[pixels] * footprint) ** 2)
+    large = np.flatnonzero((count >= LIMITS.smallest) & (area >= LIMITS.smallest_area))
+    if len(large) == 0:
+        return number
+    # Parts that something in front separates vote for one centre.
+    apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
+    _, merged = connected_components(apart < LIMITS.same_centre, directed=False)
+    of_part = np.full(len(count), UNKNOWN)
+    of_part[large] = merged
+    number.reshape(-1)[pixels] = of_part[part]
+    return number
+
+
+def instance_traits(
+    number: Int64,
+    points: Float32,
+    classes: Float32,
+    normals: Float32,
+    footprint: float,
+) -> Float64:
+    """What tells objects from patches of background that the network calls one.
+
+    Args:
+        number: (H, W) as from `group`, of O objects.
+        points: (H, W, 3) metres; NaN where nothing was seen.
+        classes: (3, H, W) probabilities.
+        normals: (H, W, 3) unit; 0 where unknown.
+        footprint: Width of a pixel at a depth of one metre, metres.
+
+    Returns:
+        (O, 2) the mean probability of an object, and the share of the border on which the surface
+        runs on smoothly into what is no object.
+    """
+    count = int(number.max(initial=-1)) + 1
+    held = number >= 0
+    size = np.bincount(number[held], minlength=count)
+    mean = np.bincount(number[held], classes[2][held], minlength=count) / np.maximum(size, 1)
+    border, smooth = np.zeros((2, count))
+    near = LIMITS.step * footprint * np.nan_to_num(points[..., 2])
+    for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+        step = np.linalg.norm(points[a] - points[b], axis=-1) < near[a]  # false for NaN
+        along = (normals[a] * normals[b]).sum(axis=-1) > LIMITS.smooth
+        for inside, outside in ((a, b), (b, a)):
+            edge = (number[inside] >= 0) & (number[outside] != number[inside])
+            edge &= ~np.isnan(points[outside][..., 2])
+            border += np.bincount(number[inside][edge], minlength=count)
+            runs_on = edge & step & along & (number[outside] < 0)
+            smooth += np.bincount(number[inside][runs_on], minlength=count)
+    share = smooth / np.maximum(border, 1)
+    return np.stack([mean, share], axis=1)
+
+
+def confidence_of(traits: Float64) -> Float64:
+    """Probability (O,) of being an object: logistic regression on held-out simulated images."""
+    return np.asarray(1.0 / (1.0 + np.exp(-(traits @ CONFIDENCE[1:] + CONFIDENCE[0]))))
+
+
+def joined(points: Float32, number: Int64, count: int) -> Int64:
+    """The new number (O,) of each of the numbers (N,): objects in the same place become one."""
+    held = np.flatnonzero(number >= 0)
+    if len(held) == 0:
+        return np.arange(count)
+    cell = np.floor(points[held] / LIMITS.view_cell).astype(np.int64)
+    cell -= cell.min(axis=0)
+    size = cell.max(axis=0) + 1
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    _, key = np.unique(key, return_inverse=True)
+    shape = count, int(key.max()) + 1
+    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key)), shape).tocsr()
+    lies.data[:] = 1
+    shared = (lies @ lies.T).toarray()
+    cells = np.diag(shared)
+    same = shared >= LIMITS.view_share * np.maximum(np.minimum.outer(cells, cells), 1)
+    same &= shared > 0
+    return np.asarray(connected_components(same, directed=False)[1])
