@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from edgegrasp_model.kernels import compiled
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -21,8 +23,10 @@ CONFIDENCE = np.array([-1.898, 6.481, -2.798])
 class GroupingLimits:
     """When pixels show the same object."""
 
-    link: float = 0.6  # probability that neighbouring pixels show one object
-    vote: float = 0.04  # metres between the centres that neighbours vote for
+    link: float = 0.5  # probability that neighbouring pixels show one object
+    vote: float = 0.05  # metres between the centres that neighbours vote for
+    core: int = 12  # pixels of two parts that only become one where they vote for one centre,
+    apart: float = 0.03  # metres between these
     same_centre: float = 0.035  # metres between the mean votes of two parts of one object
     smallest: int = 16  # pixels of the network's output
     smallest_area: float = 5e-4  # square metres, as seen
@@ -53,18 +57,20 @@ def group(
     if not held.any():
         return number
     centre = points + votes
-    index, pairs = np.arange(held.size).reshape(held.shape), []
+    index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
         near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
         joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
-        pairs.append(np.stack([index[first][joined], index[second][joined]]))
-    start, end = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(start), dtype=bool), (start, end)), shape=(held.size, held.size))
-    _, component = connected_components(graph, directed=False)
+        pairs.append(np.stack([index[first][joined], index[second][joined]], axis=1))
+        strength.append(link[first][joined])
+    order = np.argsort(-np.concatenate(strength), kind="stable")
+    component = np.arange(held.size)
+    flat = np.nan_to_num(centre.reshape(-1, 3)).astype(np.float64)
+    _join(np.concatenate(pairs)[order], component, flat.copy(), LIMITS.core, LIMITS.apart)
     pixels = np.flatnonzero(held)
     _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
-    flat = centre.reshape(-1, 3)[pixels].astype(np.float64)
+    flat = flat[pixels]
     mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
     area = np.bincount(part, (points[..., 2].reshape(-1)[pixels] * footprint) ** 2)
     large = np.flatnonzero((count >= LIMITS.smallest) & (area >= LIMITS.smallest_area))
@@ -77,6 +83,49 @@ def group(
     of_part[large] = merged
     number.reshape(-1)[pixels] = of_part[part]
     return number
+
+
+@compiled()
+def _join(pairs: Int64, component: Int64, centre: Float64, core: int, apart: float) -> None:
+    """Join pairs (P, 2) of pixels in order, but not two large parts with different centres.
+
+    One weak link then does not join two objects (Kruskal's algorithm, with that exception).
+
+    Args:
+        pairs: Those that most probably show one object first.
+        component: (N,) each pixel; becomes the part that it belongs to.
+        centre: (N, 3) metres, what each pixel votes for; overwritten by sums.
+        core: Pixels of a large part.
+        apart: Metres between centres.
+    """
+    count = np.ones(len(component), dtype=np.int64)
+    for p in range(len(pairs)):
+        a, b = pairs[p, 0], pairs[p, 1]
+        while component[a] != a:
+            component[a] = component[component[a]]
+            a = component[a]
+        while component[b] != b:
+            component[b] = component[component[b]]
+            b = component[b]
+        if a == b:
+            continue
+        if count[a] >= core and count[b] >= core:
+            away = 0.0
+            for d in range(3):
+                away += (centre[a, d] / count[a] - centre[b, d] / count[b]) ** 2
+            if away > apart * apart:
+                continue
+        if count[a] < count[b]:
+            a, b = b, a
+        component[b] = a
+        count[a] += count[b]
+        for d in range(3):
+            centre[a, d] += centre[b, d]
+    for n in range(len(component)):
+        root = n
+        while component[root] != root:
+            root = component[root]
+        component[n] = root
 
 
 def instance_traits(
