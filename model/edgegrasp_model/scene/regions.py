@@ -29,6 +29,14 @@ NEAR_POINT = 0.1  # metres from a position to the object that it asks for, at mo
 NEAR_PIXEL = 0.02  # of the image's width, as far from a pixel
 
 
+def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
+    """Raise InvalidRequest where `at` or a region speaks of what the cloud does not have."""
+    check_pixel(cloud, options)
+    for name in ("approach_region", "contact_region"):
+        if (region := getattr(options, name)) is not None:
+            check_region(region, cloud, name)
+
+
 def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
     """Check that the rows a region speaks of exist.
 

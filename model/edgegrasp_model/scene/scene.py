@@ -34,8 +34,7 @@ from edgegrasp_model.scene.depth_scale import correct_depth_scale
 from edgegrasp_model.scene.grouping import FIXED, UNKNOWN
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import (
-    check_pixel,
-    check_region,
+    check_regions,
     chosen_objects,
     has_rows,
     inside_region,
@@ -67,10 +66,9 @@ MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
 SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
-REACH = 0.25  # metres around a thing in which a hand at it may meet something
+REACH = 0.25  # metres around an object in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
-UNSEEN_BY_NETWORK = 0.3  # probability of an object that only geometry sees
 LIKELY = 0.5  # probability of object or support from which what rises may be an object
 SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
 
@@ -119,10 +117,7 @@ def select_points(
             views do not suit the viewpoints, or there are none to correct depths from.
     """
     viewpoints = camera_positions(sent, options)
-    check_pixel(sent, options)
-    for name in ("approach_region", "contact_region"):
-        if (region := getattr(options, name)) is not None:
-            check_region(region, sent, name)
+    check_regions(sent, options)
     counts["points"] = len(sent.points)
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
@@ -139,28 +134,26 @@ def select_points(
         shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
     support = choose_support(seen, inside, shown, options, warnings)
     up = _up(options, support, shown)
-    number = _given_numbers(sent) if given or shown is None else shown.number
-    confidence = {} if given or shown is None else dict(enumerate(shown.confidence.tolist()))
+    recognised = None if given else shown
+    number = _given_numbers(sent) if recognised is None else recognised.number
+    confidence = {} if recognised is None else dict(enumerate(recognised.confidence.tolist()))
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
+    plan = sent.points[:, :2].astype(np.float64)
     if support is not None:
         height, margin = support.heights(seen)
         labels[sent.row[np.abs(height) <= margin]] = SUPPORT
         above = np.flatnonzero(height > margin)
         sent, number, inside = sent.take(above), number[above], inside[above]
-    counts["above_support"] = int(inside.sum())
-    plan = sent.points[:, :2].astype(np.float64)
-    if support is not None:
         plan = support.plan(sent.points)
-    if support is not None and shown is not None and not given:
-        # Callers who cut the support off have left little but objects.
-        likely = (shown.object + shown.support)[above] > LIKELY
-        likely |= math.isnan(support.spread)
-        number = with_risen(number, plan, height[above], margin[above], likely)
-        new = {int(k) for k in np.unique(number[number >= 0])} - confidence.keys()
-        confidence |= dict.fromkeys(new, UNSEEN_BY_NETWORK)
-    if support is None and not given and (viewpoints is None or not (number >= 0).any()):
-        number, confidence = np.zeros_like(number), {}  # one object, without what it stands on
+        if recognised is not None:
+            # Callers who cut the support off have left little but objects.
+            likely = (recognised.object + recognised.support)[above] > LIKELY
+            likely |= math.isnan(support.spread)
+            number = with_risen(number, plan, height[above], margin[above], likely)
+    counts["above_support"] = int(inside.sum())
     if not given:
+        if support is None and (viewpoints is None or not (number >= 0).any()):
+            number, confidence = np.zeros_like(number), {}  # one object, without what it stands on
         number = without_long(number, sent.points, options.max_object_size)
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
     if counts["above_support"] and not given and not (number >= 0).any():
@@ -170,7 +163,7 @@ def select_points(
         )
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     number = chosen_objects(number, sent, options, warnings)
-    kept = near_things(plan, number)
+    kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence)
 
@@ -386,8 +379,8 @@ def object_probability(scene: Scene, points: Int64) -> Float64:
     return probability
 
 
-def near_things(plan: Float64, number: Int64) -> Bools:
-    """Which points (M,), with places (M, 2) along the support, a hand at any thing could meet."""
+def near_objects_along(plan: Float64, number: Int64) -> Bools:
+    """Which points (M,), with places (M, 2) along the support, a hand at any object could meet."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
     x, y = (((axis - axis.min()) / PLAN_CELL).astype(np.int64) for axis in plan.T)

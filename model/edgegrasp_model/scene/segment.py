@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file
-from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
@@ -35,20 +33,8 @@ Bools = NDArray[np.bool_]
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 
-@dataclass(frozen=True)
-class RisenLimits:
-    """When points that rise above the support but were not recognised make an object."""
-
-    cell: float = 0.012  # metres between points of one object
-    most_cells: int = 2000  # along a side of the ground that is looked at
-    fewest_points: int = 6  # in a cell, the mean
-    fewest_cells: int = 5
-    tall: float = 0.03  # metres over what belongs to the support from which background is a wall
-    beside_background: float = 0.4  # share of its cells that lie beside a wall
-    stands_out: float = 0.004  # metres over what belongs to the support that it rises at least
-
-
-LIMITS = RisenLimits()
+BESIDE = 0.012  # metres from an object to points that the network missed and that belong to it
+STANDS_OUT = 0.004  # metres that these rise at least over what belongs to the support
 REACH, REACH_GROWTH = 0.03, 0.01  # metres, and share of the depth, from a point to its pixel
 
 
@@ -151,16 +137,11 @@ def _one_thread() -> Iterator[None]:
 
 
 def with_risen(
-    number: Int64,
-    plan: Float64,
-    height: Float32,
-    margin: Float32,
-    likely: Bools,
+    number: Int64, plan: Float64, height: Float32, margin: Float32, likely: Bools
 ) -> Int64:
-    """The numbers (N,), and those of what rises above the support but was called none of it.
+    """The numbers (N,), where points that rise above the support belong to the object beside them.
 
-    Geometry sees what is too thin for the network: such points join the object beside them, or
-    become one.
+    The network misses what is thin: handles, edges.
 
     Args:
         number: (N,) as from `segment`.
@@ -169,49 +150,15 @@ def with_risen(
         margin: (N,) metres over it that belong to it.
         likely: (N,) whether they show an object or a support rather than background.
     """
-    rises = (number < 0) & (height > margin + LIMITS.stands_out) & likely
-    rows = np.flatnonzero(rises)
-    if len(rows) == 0:
-        return number
-    number = number.copy()
+    rows = np.flatnonzero((number < 0) & (height > margin + STANDS_OUT) & likely)
     held = np.flatnonzero((number >= 0) & (height > margin))
-    if len(held):
-        held = held[:: max(len(held) // 20_000, 1)]
-        places = np.column_stack([plan[held], height[held]])
-        apart, nearest = cKDTree(places).query(
-            np.column_stack([plan[rows], height[rows]]), distance_upper_bound=LIMITS.cell
-        )
-        near = np.isfinite(apart)
-        number[rows[near]] = number[held[np.asarray(nearest)[near]]]
-        rows = rows[~near]
-    return _with_clusters(number, rows, plan, height > margin + LIMITS.tall)
-
-
-def _with_clusters(number: Int64, rows: Int64, plan: Float64, tall: Bools) -> Int64:
-    """The numbers (N,) where rows that lie close together, not beside walls, are objects."""
-    if len(rows) == 0:
+    if len(rows) == 0 or len(held) == 0:
         return number
-    low = plan[rows].min(axis=0) - LIMITS.cell
-    cell = np.floor((plan - low) / LIMITS.cell).astype(np.int64)
-    size = np.minimum(cell[rows].max(axis=0) + 2, LIMITS.most_cells)
-    inside = ((cell >= 0) & (cell < size)).all(axis=1)
-    count = np.zeros((2, *size), dtype=np.int64)  # of the rows, of background
-    mine = np.zeros(len(number), dtype=bool)
-    mine[rows] = True
-    for layer, held in enumerate((mine & inside, (number == FIXED) & tall & ~mine & inside)):
-        np.add.at(count[layer], tuple(cell[held].T), 1)
-    labels, found = ndimage.label(count[0] > 0, np.ones((3, 3)))
-    which = np.arange(1, found + 1)
-    cells = ndimage.sum_labels(count[0] > 0, labels, which)
-    points = ndimage.sum_labels(count[0], labels, which)
-    beside = ndimage.sum_labels(ndimage.maximum_filter(count[1], 3) > 0, labels, which)
-    good = (cells >= LIMITS.fewest_cells) & (points >= LIMITS.fewest_points * cells)
-    good &= beside < LIMITS.beside_background * cells
-    first = int(number.max(initial=-1)) + 1
-    new = np.concatenate([[UNKNOWN], np.where(good, first + np.cumsum(good) - 1, UNKNOWN)])
-    rows = rows[inside[rows]]
-    here = new[labels[tuple(cell[rows].T)]]
-    number[rows] = np.where(here >= 0, here, number[rows])
+    held = held[:: max(len(held) // 20_000, 1)]
+    places = np.column_stack([plan, height])
+    apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=BESIDE)
+    near, number = np.isfinite(apart), number.copy()
+    number[rows[near]] = number[held[np.asarray(nearest)[near]]]
     return number
 
 
