@@ -1,5 +1,6 @@
 """Train the `scene` network on the labelled images of `scene_images`."""
 
+import json
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -11,11 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn import functional
 from torch.optim import swa_utils
 
+from edgegrasp_model.scene.grouping import group, instance_traits
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
+from edgegrasp_model.scene.segment import look
 from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
 
 UP_SHARE = 0.5  # of the images whose `up` the network is told
@@ -202,6 +206,31 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
     }
 
 
+def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
+    """Logistic regression of `instance_traits` on whether what the network finds is an object.
+
+    An object is what mostly has pixels of one; of every second image `up` is known.
+    """
+    traits, right = [], []
+    for row in range(len(images)):
+        image, points = images[row], image_points(images[row])
+        known = image.up.astype(np.float64) if row % 2 else None
+        pixels, _ = look(network, points, known, 1.0 / float(image.camera[0]))
+        number = group(pixels)
+        size = np.bincount(number[number >= 0])
+        on_object = (number >= 0) & (image.label[::2, ::2] >= OBJECT)
+        held = np.bincount(number[on_object], minlength=len(size))
+        traits.append(instance_traits(number, pixels))
+        right.append(held >= 0.5 * np.maximum(size, 1))
+    sign, values = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(traits)
+
+    def loss(weights: NDArray[np.float64]) -> float:
+        return float(np.logaddexp(0.0, -sign * (values @ weights)).mean())
+
+    fitted: list[float] = minimize(loss, np.zeros(values.shape[1])).x.round(3).tolist()
+    return fitted
+
+
 def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
     """Endless batches, each image once before any twice; one is made while another is learned.
 
@@ -259,8 +288,8 @@ def train(
     step, running = 0, dict[str, float]()
     while (spent := time.monotonic() - begin) < seconds:
         factor = min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * spent / seconds))
-        for group in optimiser.param_groups:
-            group["lr"] = rate * max(factor, 1e-3)
+        for parameters in optimiser.param_groups:
+            parameters["lr"] = rate * max(factor, 1e-3)
         for name, value in _learn(network, optimiser, next(source)).items():
             running[name] = 0.98 * running.get(name, value) + 0.02 * value
         mean.update_parameters(network)
@@ -270,13 +299,17 @@ def train(
             saved = now
             averaged = mean.module
             assert isinstance(averaged, SceneNet)
-            save_file(
-                {k: v.contiguous() for k, v in averaged.state_dict().items()}, run / "scene.partial"
-            )
-            (run / "scene.partial").replace(run / "scene.safetensors")
             losses = f"train {_text(running)} held {_text(evaluate(averaged, held))}"
+            _save(averaged, fit_confidence(averaged, held), run / "scene.safetensors")
             with (run / "log.txt").open("a") as log:
                 log.write(f"{step} {now - begin:.0f}s images {len(images)} {losses}\n")
+
+
+def _save(network: SceneNet, confidence: list[float], path: Path) -> None:
+    weights = {name: value.contiguous() for name, value in network.state_dict().items()}
+    partial = path.with_suffix(".partial")
+    save_file(weights, partial, {"confidence": json.dumps(confidence)})
+    partial.replace(path)
 
 
 def _files(data: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 """From what the `scene` network says of each pixel to objects, and how sure each of them is."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,6 @@ Int64 = NDArray[np.int64]
 
 # In place of an object's number: background; what may belong to an object.
 FIXED, UNKNOWN = -1, -2
-# Logistic regression of being an object: a constant, and the weights of `instance_traits`.
-CONFIDENCE = np.array([-1.898, 6.481, -2.798])
 
 
 @dataclass(frozen=True)
@@ -39,18 +38,20 @@ class GroupingLimits:
 LIMITS = GroupingLimits()
 
 
-def group(
-    points: Float32, classes: Float32, votes: Float32, links: Float32, footprint: float
-) -> Int64:
-    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN where in doubt.
+class Pixels(NamedTuple):
+    """What the network says of the pixels of its output, and what they show; camera frame."""
 
-    Args:
-        points: (H, W, 3) metres; NaN where nothing was seen.
-        classes: (3, H, W) probabilities.
-        votes: (H, W, 3) metres from each point to the centre of its object.
-        links: (2, H, W) probability of showing the same object as the right, the lower pixel.
-        footprint: Width of one of these pixels at a depth of one metre, metres.
-    """
+    points: Float32  # (H, W, 3) metres; NaN where nothing was seen
+    normals: Float32  # (H, W, 3) unit; 0 where unknown
+    classes: Float32  # (3, H, W) probabilities
+    votes: Float32  # (H, W, 3) metres from each point to the centre of its object
+    links: Float32  # (2, H, W) probability of showing the same object as the right, lower pixel
+    footprint: float  # metres, width of a pixel at a depth of one metre
+
+
+def group(pixels: Pixels) -> Int64:
+    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN in doubt."""
+    points, _, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
     number = np.where(held, UNKNOWN, FIXED)
@@ -128,26 +129,18 @@ def _join(pairs: Int64, component: Int64, centre: Float64, core: int, apart: flo
         component[n] = root
 
 
-def instance_traits(
-    number: Int64,
-    points: Float32,
-    classes: Float32,
-    normals: Float32,
-    footprint: float,
-) -> Float64:
+def instance_traits(number: Int64, pixels: Pixels) -> Float64:
     """What tells objects from patches of background that the network calls one.
 
     Args:
         number: (H, W) as from `group`, of O objects.
-        points: (H, W, 3) metres; NaN where nothing was seen.
-        classes: (3, H, W) probabilities.
-        normals: (H, W, 3) unit; 0 where unknown.
-        footprint: Width of a pixel at a depth of one metre, metres.
+        pixels: The same.
 
     Returns:
-        (O, 2) the mean probability of an object, and the share of the border on which the surface
-        runs on smoothly into what is no object.
+        (O, 3) 1, the mean probability of an object, and the share of the border on which the
+        surface runs on smoothly into what is no object.
     """
+    points, normals, classes, _, _, footprint = pixels
     count = int(number.max(initial=-1)) + 1
     held = number >= 0
     size = np.bincount(number[held], minlength=count)
@@ -164,12 +157,7 @@ def instance_traits(
             runs_on = edge & step & along & (number[outside] < 0)
             smooth += np.bincount(number[inside][runs_on], minlength=count)
     share = smooth / np.maximum(border, 1)
-    return np.stack([mean, share], axis=1)
-
-
-def confidence_of(traits: Float64) -> Float64:
-    """Probability (O,) of being an object: logistic regression on held-out simulated images."""
-    return np.asarray(1.0 / (1.0 + np.exp(-(traits @ CONFIDENCE[1:] + CONFIDENCE[0]))))
+    return np.stack([np.ones(count), mean, share], axis=1)
 
 
 def joined(points: Float32, number: Int64, count: int) -> Int64:

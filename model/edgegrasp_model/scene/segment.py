@@ -1,5 +1,6 @@
 """What each point shows, by the `scene` network: an object and which one, the support, or else."""
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -9,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import safe_open
 from safetensors.torch import load_file
 from scipy.spatial import cKDTree
 from torch.nn import functional
@@ -17,7 +19,7 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.grouping import (
     FIXED,
     UNKNOWN,
-    confidence_of,
+    Pixels,
     group,
     instance_traits,
     joined,
@@ -48,13 +50,22 @@ class Segmentation(NamedTuple):
     up: Float64  # (3,) unit, away from gravity, as the network sees it; cloud frame
 
 
-@cache
-def scene_network() -> SceneNet:
-    """The network with the weights that ship; loaded once a process."""
-    network = SceneNet()
-    network.load_state_dict(load_file(WEIGHTS))
-    network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    return network
+class Recogniser(NamedTuple):
+    """The `scene` network, and the weights (3,) of `instance_traits` in a logistic regression."""
+
+    network: SceneNet
+    confidence: Float64
+
+    @classmethod
+    @cache
+    def shipped(cls) -> "Recogniser":
+        """With the weights that ship; loaded once a process."""
+        network = SceneNet()
+        network.load_state_dict(load_file(WEIGHTS))
+        network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        with safe_open(WEIGHTS, "pt") as file:
+            confidence = np.array(json.loads(file.metadata()["confidence"]))
+        return cls(network, confidence)
 
 
 def segment(
@@ -97,28 +108,42 @@ def _segment_view(
 ) -> Segmentation:
     """What M points show that one camera saw."""
     image = range_image(points, viewpoint, up, down)
-    turn = image.T_cloud_camera[:3, :3]
-    features = scene_features(image.points, None if up is None else up @ turn, image.footprint)
+    turn, shipped = image.T_cloud_camera[:3, :3], Recogniser.shipped()
+    up_in_view = None if up is None else up @ turn
+    pixels, seen_up = look(shipped.network, image.points, up_in_view, image.footprint)
+    of_pixel = group(pixels)
+    score = instance_traits(of_pixel, pixels) @ shipped.confidence
+    number = np.full(len(points), UNKNOWN)
+    objects, support = np.zeros((2, len(points)), dtype=np.float32)
+    T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
+    arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
+    _look_up(points, image.pixel, T_camera_cloud, image.points.shape[1], *arrays)
+    return Segmentation(number, objects, support, 1.0 / (1.0 + np.exp(-score)), turn @ seen_up)
+
+
+def look(
+    network: SceneNet, points: Float32, up: Float64 | None, footprint: float
+) -> tuple[Pixels, Float64]:
+    """What a network says of a range image, and which way (3,) it takes for up; camera frame.
+
+    Args:
+        network: In evaluation mode.
+        points: (H, W, 3) camera frame, metres; NaN where nothing was seen.
+        up: (3,) unit; None: unknown.
+        footprint: Width of a pixel at a depth of one metre, metres.
+    """
+    features = scene_features(points, up, footprint)
     with torch.inference_mode(), _one_thread():
         batch = torch.from_numpy(features)[None].contiguous(memory_format=torch.channels_last)
-        output = scene_network()(batch)
+        output = network(batch)
         classes = output.classes[0].softmax(dim=0).contiguous().numpy()
         votes = output.votes[0].permute(1, 2, 0).contiguous().numpy()
         links = output.links[0].sigmoid().contiguous().numpy()
         ways = functional.normalize(output.up[0], dim=0).numpy()
-    seen = np.ascontiguousarray(image.points[::2, ::2])
-    number, objects, support = (
-        np.full(len(points), UNKNOWN),
-        *np.zeros((2, len(points)), dtype=np.float32),
-    )
-    T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
-    of_pixel = group(seen, classes, votes, links, 2 * image.footprint)
+    seen = np.ascontiguousarray(points[::2, ::2])
     normals = features[5:8, ::2, ::2].transpose(1, 2, 0)
-    traits = instance_traits(of_pixel, seen, classes, normals, 2 * image.footprint)
-    arrays = seen, of_pixel, classes, number, objects, support
-    _look_up(points, image.pixel, T_camera_cloud, image.points.shape[1], *arrays)
-    seen_up = turn @ ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
-    return Segmentation(number, objects, support, confidence_of(traits), _unit(seen_up))
+    seen_up = _unit(ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64))
+    return Pixels(seen, normals, classes, votes, links, 2 * footprint), seen_up
 
 
 def _unit(vector: Float64) -> Float64:
