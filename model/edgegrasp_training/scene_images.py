@@ -45,6 +45,7 @@ LONGEST_OBJECT = 0.36  # metres; a longer one is background
 NUM_POOL, NUM_ARMS = 900, 60
 ARMS = "franka_panda/panda.urdf", "xarm/xarm6_robot.urdf", "kuka_iiwa/model.urdf"
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
+UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
 EMPTY_SHARE = 0.03  # of the scenes that have no object
 
 
@@ -141,12 +142,16 @@ def make_image(rng: np.random.Generator, scene: SceneMeshes, pose: Float64) -> S
     """
     focal = WIDTH / 2 / np.tan(np.radians(rng.uniform(35, 80)) / 2)
     camera = Intrinsics(WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, 0.1, 13.0)
-    depth, label = _cast(scene.casting(), scene.parts, camera, pose)
+    depth, label, steep = _cast(scene.casting(), scene.parts, camera, pose)
     close = (depth < 0.22).mean()
     seen = np.bincount(label.ravel(), minlength=OBJECT + MAX_OBJECTS)[OBJECT:]
     if close > 0.15 or (scene.centres and (seen > 25).sum() < 1):
         return None
     noisy, label = _faults(rng, depth, label, camera, pose, scene)
+    if rng.random() < UNSEEN_WALLS:  # which leaves their rims floating
+        noisy[steep & (label == OTHER) & (_blobs(rng, depth.shape) < rng.uniform(0.3, 1.0))] = (
+            np.nan
+        )
     stored = np.nan_to_num(np.clip(noisy / DEPTH_UNIT, 0, 65535)).astype(np.uint16)
     turn, place = pose[:3, :3], pose[:3, 3]
     centre = np.zeros((MAX_OBJECTS, 3), dtype=np.float32)
@@ -254,8 +259,8 @@ def _cast(
     parts: Sequence[tuple[Mesh, int]],
     camera: Intrinsics,
     pose: Float64,
-) -> tuple[Float64, NDArray[np.uint8]]:
-    """Depth (H, W) in metres, `far` where nothing is hit, and labels (H, W)."""
+) -> tuple[Float64, NDArray[np.uint8], NDArray[np.bool_]]:
+    """Depth (H, W) in metres, `far` where nothing is hit, labels (H, W), and where it is steep."""
     y, x = np.indices((camera.height, camera.width)) + 0.5
     rays = np.stack(
         [(x - camera.centre_x), (y - camera.centre_y), np.full(x.shape, camera.focal_length)], -1
@@ -269,7 +274,7 @@ def _cast(
     label = labels[which]
     steep = np.abs(hit["primitive_normals"].numpy()[..., 2]) < LEVEL
     label[(label == SUPPORT) & steep] = OTHER
-    return depth, label.astype(np.uint8)
+    return depth, label.astype(np.uint8), steep
 
 
 def _faults(
@@ -285,7 +290,7 @@ def _faults(
     glass = numbers[rng.random(len(numbers)) < 0.03]
     if len(glass):
         rest = [part for part in scene.parts if part[1] not in glass]
-        behind, behind_label = _cast(_casting(rest), rest, camera, pose)
+        behind, behind_label, _ = _cast(_casting(rest), rest, camera, pose)
         through = np.isin(label, glass) & (_blobs(rng, depth.shape) < rng.uniform(0.2, 1.0))
         depth, label = np.where(through, behind, depth), np.where(through, behind_label, label)
     if rng.random() < 0.12:
