@@ -22,12 +22,12 @@ FIXED, UNKNOWN = -1, -2
 class GroupingLimits:
     """When pixels show the same object."""
 
-    link: float = 0.5  # probability that neighbouring pixels show one object
-    vote: float = 0.05  # metres between the centres that neighbours vote for
-    core: int = 12  # pixels of two parts that only become one where they vote for one centre,
-    apart: float = 0.03  # metres between these
+    link: float = 0.35  # probability that neighbouring pixels show one object
+    vote: float = 0.04  # metres between the centres that neighbours vote for
+    core: int = 24  # pixels of two parts that only become one where they vote for one centre,
+    apart: float = 0.04  # metres between these
     same_centre: float = 0.035  # metres between the mean votes of two parts of one object
-    smallest: int = 16  # pixels of the network's output
+    smallest: int = 20  # pixels of the network's output
     smallest_area: float = 5e-4  # square metres, as seen
     smooth: float = 0.97  # cosine between normals of neighbours on one smooth surface
     step: float = 3.0  # pixels between neighbours on one smooth surface

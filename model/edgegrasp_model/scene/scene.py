@@ -42,6 +42,7 @@ from edgegrasp_model.scene.regions import (
 from edgegrasp_model.scene.segment import (
     Segmentation,
     segment,
+    with_clusters,
     with_risen,
     without_long,
 )
@@ -69,6 +70,8 @@ SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around an object in which a hand at it may meet something
 PLAN_CELL = 0.05  # metres
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
+CLOSE = 0.06  # metres within which no camera measures
+UNRECOGNISED = 0.7  # probability of an object that the network did not see
 LIKELY = 0.5  # probability of object or support from which what rises may be an object
 SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
 
@@ -146,14 +149,17 @@ def select_points(
         sent, number, inside = sent.take(above), number[above], inside[above]
         plan = support.plan(sent.points)
         if recognised is not None:
-            # Callers who cut the support off have left little but objects.
             likely = (recognised.object + recognised.support)[above] > LIKELY
-            likely |= math.isnan(support.spread)
             number = with_risen(number, plan, height[above], margin[above], likely)
+            if math.isnan(support.spread):
+                number = with_clusters(number, plan)
+                confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
     counts["above_support"] = int(inside.sum())
     if not given:
         if support is None and (viewpoints is None or not (number >= 0).any()):
-            number, confidence = np.zeros_like(number), {}  # one object, without what it stands on
+            # One object, without what it stands on; but no camera sees what touches it.
+            close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
+            number, confidence = np.full_like(number, FIXED if close else 0), {}
         number = without_long(number, sent.points, options.max_object_size)
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
     if counts["above_support"] and not given and not (number >= 0).any():

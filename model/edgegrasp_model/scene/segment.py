@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import load_file
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
@@ -37,6 +38,8 @@ WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 BESIDE = 0.012  # metres from an object to points that the network missed and that belong to it
 STANDS_OUT = 0.004  # metres that these rise at least over what belongs to the support
+FEWEST_CELLS, FEWEST_EACH = 5, 4  # of a cluster of such points, as wide as BESIDE; points in each
+MOST_CELLS = 2000  # along a side of the ground that is looked at
 REACH, REACH_GROWTH = 0.03, 0.01  # metres, and share of the depth, from a point to its pixel
 
 
@@ -142,8 +145,10 @@ def look(
         ways = functional.normalize(output.up[0], dim=0).numpy()
     seen = np.ascontiguousarray(points[::2, ::2])
     normals = features[5:8, ::2, ::2].transpose(1, 2, 0)
-    seen_up = _unit(ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64))
-    return Pixels(seen, normals, classes, votes, links, 2 * footprint), seen_up
+    seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
+    if not seen_up.any():  # nothing was seen: toward the camera
+        seen_up = np.array([0.0, 0.0, -1.0])
+    return Pixels(seen, normals, classes, votes, links, 2 * footprint), _unit(seen_up)
 
 
 def _unit(vector: Float64) -> Float64:
@@ -184,6 +189,34 @@ def with_risen(
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=BESIDE)
     near, number = np.isfinite(apart), number.copy()
     number[rows[near]] = number[held[np.asarray(nearest)[near]]]
+    return number
+
+
+def with_clusters(number: Int64, plan: Float64) -> Int64:
+    """The numbers (N,), where points in no recognised object that lie close together are one.
+
+    Of a cloud whose support was cut off little but objects is left, and the network sees them
+    without what they stand on.
+
+    Args:
+        number: (N,) as from `segment`.
+        plan: (N, 2) metres along the support.
+    """
+    rows = np.flatnonzero(number < 0)
+    if len(rows) == 0:
+        return number
+    cell = np.floor((plan[rows] - plan[rows].min(axis=0)) / BESIDE).astype(np.int64)
+    cell = np.minimum(cell, MOST_CELLS - 1)
+    points = np.zeros(cell.max(axis=0) + 1)
+    np.add.at(points, tuple(cell.T), 1)
+    cluster, count = ndimage.label(points > 0, np.ones((3, 3)))
+    which = np.arange(1, count + 1)
+    large = ndimage.sum_labels(points > 0, cluster, which) >= FEWEST_CELLS
+    large &= ndimage.mean(points, cluster, which) >= FEWEST_EACH
+    new = np.full(count + 1, UNKNOWN)
+    new[1:][large] = int(number.max(initial=-1)) + 1 + np.arange(large.sum())
+    number = number.copy()
+    number[rows] = new[cluster[tuple(cell.T)]]
     return number
 
 
