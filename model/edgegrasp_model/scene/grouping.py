@@ -24,6 +24,7 @@ class GroupingLimits:
 
     link: float = 0.35  # probability that neighbouring pixels show one object
     vote: float = 0.04  # metres between the centres that neighbours vote for
+    jump: float = 0.035  # metres of depth between neighbours, as to a wrong reading before it
     core: int = 24  # pixels of two parts that only become one where they vote for one centre,
     apart: float = 0.04  # metres between these
     same_centre: float = 0.035  # metres between the mean votes of two parts of one object
@@ -62,6 +63,7 @@ def group(pixels: Pixels) -> Int64:
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
         near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
+        near &= np.abs(points[first][..., 2] - points[second][..., 2]) < LIMITS.jump
         joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
         pairs.append(np.stack([index[first][joined], index[second][joined]], axis=1))
         strength.append(link[first][joined])

@@ -44,7 +44,8 @@ def range_image(
     downward = [way for way in (None if up is None else -up, down) if way is not None]
     apart = points[:: max(len(points) // SAMPLE, 1)].astype(np.float64) - viewpoint
     sight = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
-    turn = _camera_axes(sight.mean(axis=0), downward)
+    # Rounded, so that the image does not depend on the order of the points.
+    turn = _camera_axes(sight.mean(axis=0).round(9), downward)
     for _ in range(2):
         low, high = _view(apart @ turn.T)
         turn = _camera_axes(np.array([*(low + high) / 2, 1.0]) @ turn, downward)
@@ -85,7 +86,7 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
         return np.full(2, -0.1), np.full(2, 0.1)
     low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
     edge = 0.02 * (high - low) + 1e-3
-    return np.maximum(low - edge, -WIDEST), np.minimum(high + edge, WIDEST)
+    return np.maximum(low - edge, -WIDEST).round(9), np.minimum(high + edge, WIDEST).round(9)
 
 
 def _pixel_size(points: Float64, low: Float64, high: Float64, count: int) -> float:
@@ -111,27 +112,33 @@ def _render(
 ) -> None:
     """Put into each pixel the point nearest to its middle, of the nearest surface."""
     height, width, _ = image.shape
+    nearest = np.full((height, width), np.inf, dtype=np.float32)
     best = np.full((height, width), np.inf, dtype=np.float32)
-    for n in range(len(points)):
-        a = points[n, 0] - viewpoint[0]
-        b = points[n, 1] - viewpoint[1]
-        c = points[n, 2] - viewpoint[2]
-        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c
-        if z < NEAREST:
-            continue
-        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c
-        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c
-        u = (x / z - corner[0]) / pixel_size
-        v = (y / z - corner[1]) / pixel_size
-        if u < 0 or v < 0 or u >= width or v >= height:
-            continue
-        i, j = int(v), int(u)
-        pixel[n] = i * width + j
-        off = (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
-        there = image[i, j, 2]
-        if np.isnan(there) or z < there - SURFACE or (z < there + SURFACE and off < best[i, j]):
-            image[i, j, 0], image[i, j, 1], image[i, j, 2] = x, y, z
-            best[i, j] = off
+    for choosing in (False, True):
+        for n in range(len(points)):
+            if choosing and pixel[n] < 0:
+                continue
+            a = points[n, 0] - viewpoint[0]
+            b = points[n, 1] - viewpoint[1]
+            c = points[n, 2] - viewpoint[2]
+            z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c
+            if z < NEAREST:
+                continue
+            x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c
+            y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c
+            u = (x / z - corner[0]) / pixel_size
+            v = (y / z - corner[1]) / pixel_size
+            if u < 0 or v < 0 or u >= width or v >= height:
+                continue
+            i, j = int(v), int(u)
+            if not choosing:
+                pixel[n] = i * width + j
+                nearest[i, j] = min(nearest[i, j], z)
+                continue
+            off = (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2
+            if z < nearest[i, j] + SURFACE and off < best[i, j]:
+                image[i, j, 0], image[i, j, 1], image[i, j, 2] = x, y, z
+                best[i, j] = off
 
 
 @compiled("contract")

@@ -136,7 +136,7 @@ def select_points(
         views = _views(sent, viewpoints, options)
         shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
     support = choose_support(seen, inside, shown, options, warnings)
-    up = _up(options, support, shown)
+    up = _up(options, support, None if viewpoints is None else shown)
     recognised = None if given else shown
     number = _given_numbers(sent) if recognised is None else recognised.number
     confidence = {} if recognised is None else dict(enumerate(recognised.confidence.tolist()))
@@ -361,7 +361,7 @@ def _fitted_support(
 def _up(options: DetectOptions, support: Support | None, shown: Segmentation | None) -> Float64:
     """Unit vector (3,) away from gravity: as sent, else the support's normal, else the network's.
 
-    +z where there is none of them.
+    +z where there is none of them, or no camera.
     """
     up = np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
     if support is not None:

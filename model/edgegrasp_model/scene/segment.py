@@ -40,7 +40,7 @@ BESIDE = 0.012  # metres from an object to points that the network missed and th
 STANDS_OUT = 0.004  # metres that these rise at least over what belongs to the support
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # of a cluster of such points, as wide as BESIDE; points in each
 MOST_CELLS = 2000  # along a side of the ground that is looked at
-REACH, REACH_GROWTH = 0.03, 0.01  # metres, and share of the depth, from a point to its pixel
+REACH, REACH_GROWTH = 0.012, 0.012  # metres, and share of the depth, from a point to its pixel
 
 
 class Segmentation(NamedTuple):
