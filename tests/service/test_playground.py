@@ -110,7 +110,7 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
     page.mouse.up()
     center = page.locator("#region_center")
     drawn = center.input_value()
-    page.locator("[data-edit=region][data-mode=move]").click()
+    page.locator("[data-edit=region][data-mode=translate]").click()
     center.fill(",".join(f"{float(part) + 0.005:.3f}" for part in drawn.split(",")))
     center.press("Tab")
     page.locator("#debug").check()
@@ -247,7 +247,8 @@ def test_grasps_of_a_real_camera_are_seen(real_server, open_page, shared_dir, na
     assert with_hands > bright(page) + 500
     page.locator("#min_score").fill("0")
     if name == "milk_clorox":
-        page.get_by_text("The camera is at 0, 0, 0").click()
+        page.locator("#viewpoint").fill("0,0,0")
+        page.get_by_text("Find grasps").click()
         page.locator("#warnings li").wait_for(state="detached")
         assert len(shown(page)) == 12
 

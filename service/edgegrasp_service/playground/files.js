@@ -18,11 +18,7 @@ const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
  * @property {string} note - where what is sent comes from, if not from a file as it is
  */
 
-/** Read one cloud, or a depth image with or without its colours.
- * @param {File[]} files
- * @param {{intrinsics: string, depth_scale: string}} camera - of a depth image
- * @returns {Promise<Scene>}
- */
+/** The Scene of one cloud, or of a depth image with or without its colours, whose camera is given as text. */
 export async function readScene(files, camera) {
   const images = files.filter((file) => /\.png$/i.test(file.name));
   if (images.length) return readImages(images, files, camera);

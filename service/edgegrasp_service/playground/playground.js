@@ -116,27 +116,11 @@ function rounded(shape, digits = 5) {
   return JSON.parse(JSON.stringify(shape, (_, value) => (typeof value === "number" ? +value.toFixed(digits) : value)));
 }
 
-/** A request, as `fetch` takes it. */
-function request(asked) {
+/** The parts of the form that is sent. */
+function parts(asked) {
   const { cloud, image } = state.scene;
-  if (cloud) {
-    const format = cloud.name.split(".").pop().toLowerCase();
-    return { path: `/v1/grasps${query(asked)}`, headers: { "content-type": `application/x-${format}` }, body: cloud };
-  }
-  const body = new FormData();
-  body.append("depth", image.depth, image.depth.name);
-  body.append("intrinsics", image.intrinsics);
-  if (image.depth_scale) body.append("depth_scale", image.depth_scale);
-  body.append("options", JSON.stringify(asked));
-  return { path: "/v1/grasps", headers: {}, body };
-}
-
-function query(asked) {
-  const parts = Object.entries(asked).map(([name, value]) => {
-    const text = typeof value === "string" ? value : JSON.stringify(value);
-    return `${name}=${encodeURIComponent(text).replace(/%2C/g, ",")}`;
-  });
-  return parts.length ? `?${parts.join("&")}` : "";
+  const all = { ...(cloud ? { cloud } : image), options: Object.keys(asked).length ? JSON.stringify(asked) : "" };
+  return Object.entries(all).filter(([, value]) => value);
 }
 
 /** Ask for grasps, and show them; the newest request wins. */
@@ -154,8 +138,9 @@ async function ask() {
   try {
     showCode(asked);
     const start = performance.now();
-    const { path, ...rest } = request(asked);
-    const answer = await call(path, { method: "POST", signal: stop.signal, ...rest });
+    const body = new FormData();
+    for (const [name, value] of parts(asked)) body.append(name, value);
+    const answer = await call("/v1/grasps", { method: "POST", signal: stop.signal, body });
     answer.grasps.sort((one, other) => other.score - one.score);
     [state.answer, state.gripper] = [answer, gripperOf(asked, answer.model)];
     view.showAnswer(answer, state.gripper, state.fresh);
@@ -313,21 +298,13 @@ function showCode(asked) {
   const { cloud, image, note } = state.scene;
   const token = $("token").value.trim();
   const file = (cloud ?? image.depth).name;
-  const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
-  const { path, headers } = request(asked);
-  const parts = [`curl -sS ${quoted(API + path)}`];
-  if (token) parts.push('-H "Authorization: Bearer $EDGEGRASP_CLIENT_TOKEN"');
-  if (cloud) parts.push(`-H 'Content-Type: ${headers["content-type"]}'`, `--data-binary ${quoted(`@${file}`)}`);
-  else {
-    parts.push(`-F ${quoted(`depth=@${file}`)}`, `-F intrinsics=${image.intrinsics}`);
-    if (image.depth_scale) parts.push(`-F depth_scale=${image.depth_scale}`);
-    if (Object.keys(asked).length) parts.push(`-F ${quoted(`options=${JSON.stringify(asked)}`)}`);
-  }
-  $("curl").textContent = (note ? `# ${note}\n` : "") + parts.join(" \\\n  ");
-  const scale = image?.depth_scale ? `, "depth_scale": ${image.depth_scale}` : "";
-  const what = cloud
-    ? `"${file}"`
-    : `depth_images=[{"depth": "${file}", "intrinsics": (${image.intrinsics.split(",").map(Number).join(", ")})${scale}}]`;
+  const quoted = (text) => (/^[\w=,.@:/-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
+  const sent = parts(asked).map(([name, value]) => `-F ${quoted(`${name}=${value instanceof File ? `@${value.name}` : value}`)}`);
+  if (token) sent.unshift('-H "Authorization: Bearer $EDGEGRASP_CLIENT_TOKEN"');
+  $("curl").textContent = (note ? `# ${note}\n` : "") + [`curl -sS ${API}/v1/grasps`, ...sent].join(" \\\n  ");
+  const { intrinsics, depth_scale: scale } = image ?? {};
+  const camera = { intrinsics: JSON.parse(`[${intrinsics ?? ""}]`), ...(scale && { depth_scale: Number(scale) }) };
+  const what = cloud ? `"${file}"` : `depth_images=[${inPython({ depth: file, ...camera })}]`;
   const given = Object.entries(asked).map(([name, value]) => `,\n        ${name}=${inPython(value)}`).join("");
   $("python").textContent = `${note ? `# ${note}\n` : ""}${token ? "import os\n\n" : ""}from edgegrasp_client import GraspClient
 
@@ -412,11 +389,13 @@ function setShape(name, shape) {
   else delete state.shapes[name];
   view.setShape(name, shape);
   $(`${name}_row`).hidden = !shape;
-  const clear = document.querySelector(`[data-clear="${name}"]`);
-  if (clear) clear.disabled = !shape;
   if (name === "cone" && !shape && $("approach").value === "cone") $("approach").value = "";
   press(null);
   writeShape(name);
+}
+
+function typed(name) {
+  return name === "cone" ? ["direction"] : ["center", "half_extents"];
 }
 
 /** Put what the mouse made of a shape into its fields. */
@@ -428,22 +407,19 @@ function readShape(name) {
 function writeShape(name) {
   const shape = state.shapes[name];
   if (!shape) return;
-  const fields = name === "cone" ? ["direction"] : ["center", "half_extents"];
-  for (const field of fields) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(3)).join(",");
+  for (const field of typed(name)) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(4)).join(",");
 }
 
 /** Take a shape from its fields. */
 function typeShape(name) {
   const shape = { ...state.shapes[name] };
-  for (const field of name === "cone" ? ["direction"] : ["center", "half_extents"]) {
+  for (const field of typed(name)) {
     const values = numbers($(`${name}_${field}`).value, 3);
     if (!values) return say("Three numbers are needed: x, y, z.", true);
     shape[field] = values;
   }
   if (name === "cone") shape.max_angle = (Number($("cone_angle").value) * Math.PI) / 180;
-  state.shapes[name] = shape;
-  view.setShape(name, shape);
-  press(null);
+  setShape(name, shape);
 }
 
 function takeDrawn(points) {
@@ -475,10 +451,6 @@ $("token").addEventListener("change", async () => (await listModels()) && !state
 for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
   $(name).addEventListener("change", () => state.files.length && open(state.files));
 }
-$("at_origin").addEventListener("click", async () => {
-  $("viewpoint").value = "0,0,0";
-  if (state.files.length && (await open(state.files))) await ask();
-});
 for (const name of ["min_score", "count"]) $(name).addEventListener("input", filter);
 $("point_size").addEventListener("input", ({ target }) => view.setPointSize(Number(target.value)));
 $("all").addEventListener("click", () => {
@@ -519,7 +491,7 @@ document.addEventListener("click", ({ target, detail }) => {
     press(on ? target : null);
     if (on) view.edit(edit, mode);
   } else if (clear) setShape(clear, null);
-  else if (copy) copyText(target, $(copy).textContent);
+  else if (copy) copyText($(copy).textContent);
   else if (look && state.scene) view.look(look);
   else if (kind) save(kind);
 });
@@ -540,15 +512,13 @@ async function take(files) {
   if (await open(files)) await ask();
 }
 
-async function copyText(button, text) {
-  const before = button.textContent;
+async function copyText(text) {
   try {
     await navigator.clipboard.writeText(text);
-    button.textContent = "Copied";
+    say("Copied.");
   } catch {
-    button.textContent = "Not allowed"; // no clipboard without TLS but on this machine
+    say("The browser does not allow copying.", true); // no clipboard without TLS but on this machine
   }
-  setTimeout(() => (button.textContent = before), 1200);
 }
 
 function numbers(text, count) {

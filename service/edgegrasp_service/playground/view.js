@@ -8,17 +8,15 @@ import { TransformControls } from "./vendor/TransformControls.js";
 
 const UP = new THREE.Vector3(0, 0, 1);
 const MOST_POINTS = 500_000; // drawn; more would only hide each other
-const BAR = 0.004; // metres, thickness of a hand's outline
 const STEM = 0.04; // metres drawn behind the palm
 const NEAR = 10; // pixels from a hand or a point within which a click means it
 const CONE = 0.12; // metres, length of the approach cone
 const FRUSTUM = 0.06; // metres, length of the camera's pyramid
 const AXES = 0.1; // metres, length of the cloud's axes
-const RIM = 0.0009; // metres of dark rim around a bar: hands stand out from things of any colour
 const HUES = { region: "#4cc9f0", workspace: "#f4f4f5", cone: "#ff9f1c" };
 const BOX = new THREE.BoxGeometry(1, 1, 1);
 const EDGES = new THREE.EdgesGeometry(BOX);
-const DARK = new THREE.MeshBasicMaterial({ color: "#0a0d13", side: THREE.BackSide });
+const DARK = new THREE.LineBasicMaterial({ color: "#0a0d13" }); // hands stand out from things of any colour
 
 /** The colour of a score from 0 to 1: cyan to magenta, which things rarely have. */
 export function colorOf(score) {
@@ -33,12 +31,8 @@ export function partsOf(pose) {
   return { position: position.toArray(), quaternion: quaternion.toArray() };
 }
 
-/** The picture.
- * @param {HTMLElement} stage - it fills this
- * @param {{picked: (index: number | null) => void, edited: (name: string) => void,
- *   drawn: (points: number[]) => void, aimed: (place: number[] | null) => void,
- *   object: (number: number) => void}} tell
- */
+/** The picture, which fills `stage`. `tell` has functions: picked(row | null), edited(shape's name),
+ * drawn(points), aimed(place | null) and object(number). */
 export class View {
   constructor(stage, tell) {
     this.stage = stage;
@@ -143,9 +137,7 @@ export class View {
     this.look("camera");
   }
 
-  /** Draw points so large.
-   * @param {number} size - pixels
-   */
+  /** Draw points so large, pixels. */
   setPointSize(size) {
     this.pointSize = size;
     const [points] = this.groups.cloud.children;
@@ -157,21 +149,17 @@ export class View {
   _showFrame({ camera }) {
     this.groups.frame.add(new THREE.AxesHelper(AXES));
     if (!this.eye) return;
-    const { fx, fy, cx, cy, width, height } = camera ?? { fx: 1, fy: 1, cx: 0.5, cy: 0.4, width: 1, height: 0.8 };
-    const corners = [[0, 0], [width, 0], [width, height], [0, height]].map(([column, row]) =>
-      new THREE.Vector3((column - cx) / fx, (row - cy) / fy, 1).multiplyScalar(FRUSTUM));
-    const ends = corners.flatMap((corner, row) => [new THREE.Vector3(), corner, corner, corners[(row + 1) % 4]]);
-    const geometry = new THREE.BufferGeometry().setFromPoints(ends);
-    const frustum = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color: "#f4f4f5" }));
-    frustum.position.set(...this.eye);
-    const forward = new THREE.Vector3(...this.middle).sub(frustum.position).normalize();
-    if (!camera) frustum.quaternion.setFromUnitVectors(UP, forward);
-    this.groups.frame.add(frustum);
+    const { width, height } = camera ?? { width: 5, height: 4 };
+    const lens = new THREE.PerspectiveCamera(this.camera.fov, width / height, 0.001, FRUSTUM);
+    lens.position.set(...this.eye);
+    lens.up.set(0, camera ? -1 : 0, camera ? 0 : 1);
+    lens.lookAt(...(camera ? [0, 0, 1] : this.middle));
+    lens.updateMatrixWorld();
+    const white = new THREE.Color("#f4f4f5");
+    this.groups.frame.add(new THREE.CameraHelper(lens).setColors(white, white, white, white, white));
   }
 
-  /** Look at the objects.
-   * @param {"camera" | "top" | "side"} from - where the camera is not known, "camera" is aslant
-   */
+  /** Look at the objects from "camera", "top" or "side"; a camera that is not known is aslant. */
   look(from) {
     const target = this._outside(this.target ?? this.middle);
     const eye = this._outside(this.eye ?? [0, 0, 0]);
@@ -200,22 +188,18 @@ export class View {
 
   // The answer
 
-  /** Show what was found.
-   * @param {Object} answer - the API's
-   * @param {Object} gripper - its boxes and lengths
-   * @param {boolean} first - of this scene: look at what was found
-   */
+  /** Show the API's answer; look at what was found where it is the first of this scene. */
   showAnswer(answer, gripper, first) {
     this.gripper = gripper;
     this.hands = answer.grasps.map((grasp) =>
       this._lines([grasp.T_cloud_hand], grasp.width, { color: colorOf(grasp.score) }));
-    fill(this.groups.hands, this.hands);
+    this.groups.hands.clear();
+    for (const hand of this.hands) this.groups.hands.add(hand);
     this.groups.rejected.clear();
     this._showObjects(answer.objects);
-    const middles = answer.objects.map((object) => object.center);
-    const target = middles.length ? [0, 1, 2].map((axis) => mean(middles.map((m) => m[axis]))) : this.middle;
-    this._showPlane(answer.support, target);
-    this.target = target;
+    const middles = new THREE.Box3().setFromPoints(answer.objects.map(({ center }) => new THREE.Vector3(...center)));
+    this.target = middles.isEmpty() ? this.middle : middles.getCenter(new THREE.Vector3()).toArray();
+    this._showPlane(answer.support);
     this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...answer.up), UP);
     this.root.updateMatrixWorld();
     if (first) this.look("camera");
@@ -248,21 +232,21 @@ export class View {
     });
   }
 
-  _showPlane(support, target) {
+  _showPlane(support) {
     this.groups.plane.clear();
     if (!support) return;
     const normal = new THREE.Vector3(...support.normal);
     const grid = new THREE.GridHelper(0.6, 12, "#6ea8fe", "#6ea8fe");
     Object.assign(grid.material, { transparent: true, opacity: 0.35 });
     grid.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), normal);
-    const foot = new THREE.Vector3(...target);
+    const foot = new THREE.Vector3(...this.target);
     grid.position.copy(foot.addScaledVector(normal, support.offset - foot.dot(normal)));
     this.groups.plane.add(grid);
   }
 
   /** Hands as thin lines, of poses `T_cloud_hand`: stem, palm and the fingers at their opening. */
   _lines(poses, width, look) {
-    const [half, palm, tip] = this._reach(width);
+    const [half, palm, tip] = [width / 2, this.gripper.palm_z, this.gripper.tip_z + this._advance(width)];
     const ends = [[0, palm - STEM], [0, palm], [-half, palm], [half, palm], [-half, palm], [-half, tip],
       [half, palm], [half, tip]];
     const places = poses.flatMap((pose) =>
@@ -271,31 +255,6 @@ export class View {
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.Float32BufferAttribute(places, 3));
     return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial(look));
-  }
-
-  /** The chosen hand: stem, palm and the fingers at their opening. */
-  _outline(grasp, color) {
-    const look = new THREE.MeshStandardMaterial({ color, roughness: 0.55, emissive: color, emissiveIntensity: 0.45 });
-    const [half, palm, tip] = this._reach(grasp.width);
-    const hand = new THREE.Group();
-    const bar = (y, z, dy, dz) => {
-      const mesh = new THREE.Mesh(BOX, look);
-      mesh.position.set(0, y, z);
-      mesh.scale.set(BAR, dy, dz);
-      const rim = new THREE.Mesh(BOX, DARK);
-      rim.scale.set(...mesh.scale.toArray().map((size) => 1 + (2 * RIM) / size));
-      mesh.add(rim);
-      hand.add(mesh);
-    };
-    bar(0, palm - STEM / 2, BAR, STEM);
-    bar(0, palm, 2 * half + 2 * BAR, BAR);
-    for (const side of [-1, 1]) bar(side * (half + BAR / 2), (palm + tip) / 2, BAR, tip - palm);
-    return placed(hand, grasp.T_cloud_hand);
-  }
-
-  /** Half the opening, the palm, and the fingertips at that opening, metres. */
-  _reach(width) {
-    return [width / 2, this.gripper.palm_z, this.gripper.tip_z + this._advance(width)];
   }
 
   /** How far swinging fingertips are ahead of where they are in the open gripper, metres. */
@@ -307,25 +266,25 @@ export class View {
     return Math.sqrt(radius ** 2 - outward ** 2) - Math.sqrt(radius ** 2 - reach ** 2);
   }
 
-  /** The gripper's own boxes at a grasp, as collisions are checked with. */
+  /** The gripper's own boxes at a grasp, as collisions are checked with: the hand seen through, fingers not. */
   _body(grasp, color) {
-    const look = new THREE.MeshStandardMaterial({ color, transparent: true, opacity: 0.08, depthWrite: false });
-    const line = new THREE.LineBasicMaterial({ color, transparent: true, opacity: 0.5 });
     const hand = new THREE.Group();
-    const add = ([low, high], y, z) => {
-      for (const part of [new THREE.Mesh(BOX, look), new THREE.LineSegments(EDGES, line)]) {
+    const add = ([low, high], y, z, opacity) => {
+      const look = { color, emissive: color, emissiveIntensity: 0.45, opacity, transparent: opacity < 1, depthWrite: opacity === 1 };
+      for (const part of [new THREE.Mesh(BOX, new THREE.MeshStandardMaterial(look)), new THREE.LineSegments(EDGES, DARK)]) {
         part.position.set(...[0, y, z].map((shift, axis) => (low[axis] + high[axis]) / 2 + shift));
         part.scale.set(...low.map((value, axis) => high[axis] - value));
         hand.add(part);
       }
     };
-    for (const box of this.gripper.hand_boxes) add(box, 0, 0);
+    for (const box of this.gripper.hand_boxes) add(box, 0, 0, 0.15);
+    const [half, ahead] = [grasp.width / 2, this._advance(grasp.width)];
     for (const [low, high] of this.gripper.finger_boxes) {
-      const mirrored = [[low[0], -high[1], low[2]], [high[0], -low[1], high[2]]];
-      add([low, high], grasp.width / 2, this._advance(grasp.width));
-      add(mirrored, -grasp.width / 2, this._advance(grasp.width));
+      add([low, high], half, ahead, 1);
+      add([[low[0], -high[1], low[2]], [high[0], -low[1], high[2]]], -half, ahead, 1);
     }
-    return placed(hand, grasp.T_cloud_hand);
+    hand.applyMatrix4(new THREE.Matrix4().set(...grasp.T_cloud_hand.flat()));
+    return hand;
   }
 
   /** Show the hands of these rows. */
@@ -340,11 +299,11 @@ export class View {
     const group = this.groups.chosen.clear();
     if (grasp) {
       const color = colorOf(grasp.score);
-      const outline = this._outline(grasp, color);
-      const tail = new THREE.Vector3(0, 0, this.gripper.palm_z - STEM).applyMatrix4(outline.matrix);
+      const hand = this._body(grasp, color);
+      const tail = new THREE.Vector3(0, 0, this.gripper.palm_z - STEM).applyMatrix4(hand.matrix);
       const way = new THREE.Vector3(...grasp.approach_direction);
       const arrow = new THREE.ArrowHelper(way, tail.addScaledVector(way, -0.08), 0.075, "white", 0.02, 0.012);
-      group.add(this._body(grasp, color), outline, arrow, ...ends(grasp));
+      group.add(hand, arrow, ...ends(grasp));
     }
     this.draw();
   }
@@ -363,10 +322,7 @@ export class View {
 
   // Shapes to edit
 
-  /** Show a box or the cone, or take it away.
-   * @param {"region" | "workspace" | "cone"} name
-   * @param {Object | null} shape - center, half_extents, quaternion; or direction, max_angle
-   */
+  /** Show a box (center, half_extents, quaternion) or the cone (direction, max_angle); null: take it away. */
   setShape(name, shape) {
     if (this.shapes[name]) {
       if (this.gizmo.object === this.shapes[name]) this.gizmo.detach();
@@ -409,17 +365,12 @@ export class View {
   edit(name, mode) {
     if (name && this.shapes[name]) {
       this.gizmo.attach(this.shapes[name]);
-      this.gizmo.setMode({ move: "translate", size: "scale", turn: "rotate" }[mode]);
-    } else {
-      this.gizmo.detach();
-    }
+      this.gizmo.setMode(mode);
+    } else this.gizmo.detach();
     this.draw();
   }
 
-  /** The box around points, turned as the picture is or as the cloud's frame.
-   * @param {number[][]} points - cloud frame
-   * @param {boolean} upright - along the picture's axes
-   */
+  /** The box around points of the cloud's frame, along its axes, or where `upright` the picture's. */
   boxAround(points, upright) {
     const turn = upright ? this.root.quaternion.clone() : new THREE.Quaternion();
     const box = new THREE.Box3();
@@ -481,35 +432,27 @@ export class View {
     });
   }
 
-  /** The row of the hand nearest to the mouse, if it is near. */
-  _handAt([x, y]) {
-    let [found, nearest] = [null, NEAR];
-    const [from, to] = [new THREE.Vector3(), new THREE.Vector3()];
-    (this.hands ?? []).forEach((hand, row) => {
-      const places = hand.geometry.attributes.position;
-      for (let end = 0; hand.visible && end < places.count; end += 2) {
-        for (const along of [0, 0.25, 0.5, 0.75, 1]) {
-          from.fromBufferAttribute(places, end).lerp(to.fromBufferAttribute(places, end + 1), along);
-          const pixel = this._pixel(from);
-          const away = Math.hypot(pixel.x - x, pixel.y - y);
-          if (away < nearest) [found, nearest] = [row, away];
-        }
-      }
-    });
-    return found;
+  /** What lies under the mouse, nearest first. */
+  _under([x, y], objects) {
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    const spread = 2 * Math.tan((this.camera.fov * Math.PI) / 360) / height; // of a pixel
+    const threshold = NEAR * spread * this.camera.position.distanceTo(this.orbit.target);
+    const ray = new THREE.Raycaster();
+    ray.params = { Line: { threshold }, Points: { threshold: threshold / 2 } };
+    ray.setFromCamera(new THREE.Vector2((2 * x) / width - 1, 1 - (2 * y) / height), this.camera);
+    return ray.intersectObjects(objects, false);
+  }
+
+  /** The row of the hand at the mouse. */
+  _handAt(place) {
+    const [first] = this._under(place, (this.hands ?? []).filter(({ visible }) => visible));
+    return first ? this.hands.indexOf(first.object) : null;
   }
 
   /** The point of the cloud that is seen at the mouse, cloud frame. */
-  _pointAt([x, y]) {
-    let [found, nearest] = [null, 1];
-    const place = new THREE.Vector3();
-    for (let at = 0; at < this.places.length; at += 3) {
-      const pixel = this._pixel(place.fromArray(this.places, at));
-      if (pixel.z < nearest && Math.hypot(pixel.x - x, pixel.y - y) < NEAR / 2) {
-        [found, nearest] = [place.toArray(), pixel.z];
-      }
-    }
-    return found;
+  _pointAt(place) {
+    const [first] = this._under(place, this.groups.cloud.children);
+    return first ? [...this.places.subarray(3 * first.index, 3 * first.index + 3)] : null;
   }
 
   /** The points in a rectangle, pixels: of what is in front, and not of the plane. */
@@ -545,12 +488,6 @@ function greyOf(points) {
   };
 }
 
-function placed(hand, pose) {
-  hand.matrixAutoUpdate = false;
-  hand.matrix.set(...pose.flat());
-  return hand;
-}
-
 function boxShape({ center, half_extents, quaternion }, color) {
   const look = { color, transparent: true, opacity: 0.16, depthWrite: false };
   const box = new THREE.Mesh(BOX, new THREE.MeshBasicMaterial(look));
@@ -559,11 +496,6 @@ function boxShape({ center, half_extents, quaternion }, color) {
   box.quaternion.set(...quaternion);
   box.scale.set(...half_extents).multiplyScalar(2);
   return box;
-}
-
-function fill(group, children) {
-  group.clear();
-  for (const child of children) group.add(child);
 }
 
 /** The approach point and the contact point of a grasp. */
@@ -578,8 +510,4 @@ function ends({ approach_point, contact_point }) {
 
 function median(values) {
   return values.sort()[values.length >> 1]; // typed arrays sort by number
-}
-
-function mean(values) {
-  return values.reduce((sum, value) => sum + value, 0) / values.length;
 }
