@@ -123,7 +123,8 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
     region = np.array([float(part) for part in center.input_value().split(",")])
     contacts = np.array([grasp["contact_point"] for grasp in answer["grasps"]])
     assert 0 < len(contacts) <= 50
-    assert np.linalg.norm(contacts - region, axis=1).max() < 0.1
+    half = [float(part) for part in page.locator("#region_half_extents").input_value().split(",")]
+    assert np.linalg.norm(contacts - region, axis=1).max() < np.linalg.norm(half) + 0.002
 
     for text, command in (("#curl", ["bash", "-c"]), ("#python", [sys.executable, "-c"])):
         code = page.locator(text).text_content()
