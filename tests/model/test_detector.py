@@ -50,13 +50,13 @@ def test_several_depth_images_give_grasps_with_the_defaults() -> None:
     depths = [render(boxes, pose)[..., 2] for pose in poses]
     network = ModelCatalogue.load().get("edgegrasp-plus")
     found = []
-    for number in (1, 3):
-        cloud, cameras = fuse_depth_images(depths[:number], views[:number])
+    for some in (slice(0, 1), slice(1, 2), slice(2, 3), slice(0, 3)):
+        cloud, cameras = fuse_depth_images(depths[some], views[some])
         options = DetectOptions.model_validate({"viewpoint": cameras})
         found.append(network.detect(cloud, options))
-    one, three = found
-    assert len(three.grasps) >= len(one.grasps) > 0
-    assert len(three.objects) == len(one.objects) == 4
+    *each, three = found
+    assert len(three.grasps) >= max(len(one.grasps) for one in each) > 0
+    assert len(three.objects) == 4
 
 
 def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:

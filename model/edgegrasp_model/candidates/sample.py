@@ -34,7 +34,8 @@ FURTHER_ATTEMPTS = 3  # with other approach points, where few hands are free
 FEW = 16  # hands free of collision, of a scene
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
-MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene
+MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
+MOST_VIEWS = 4  # that bring further approach points
 FEWEST_EACH = 4  # of an object, however many there are
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
 NEAR, TURNED = 0.004, math.radians(10)  # TCPs and turns of hands that one score stands for
@@ -215,7 +216,8 @@ def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> 
         wanted = np.clip(size // POINTS_PER_APPROACH, *APPROACH_POINTS_EACH)
         wanted = np.maximum(wanted, MIN_APPROACH_POINTS // len(objects))
         wanted = np.floor(wanted * min(MAX_APPROACH_POINTS / wanted.sum(), 1.0)).astype(np.int64)
-        return objects, np.maximum(wanted, FEWEST_EACH)
+        views = 1 if scene.viewpoints is None else min(len(scene.viewpoints), MOST_VIEWS)
+        return objects, np.maximum(wanted, FEWEST_EACH) * views
     # The largest objects first where there are fewer approach points than objects.
     most = most or MAX_APPROACH_POINTS
     share = np.sqrt(size) / np.sqrt(size).sum() * most
