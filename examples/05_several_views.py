@@ -25,9 +25,7 @@ def views(simulation: ClutterSimulation, rng: np.random.Generator) -> list[Depth
     for T_world_camera in EVALUATION_VIEWS.sample(rng, views=3):
         depth = simulation.world.render_depth(T_world_camera, CAMERA)
         depth[depth > 0.99 * CAMERA.far] = np.nan
-        images.append(
-            {"depth": depth, "intrinsics": INTRINSICS, "T_cloud_camera": T_world_camera}
-        )
+        images.append({"depth": depth, "intrinsics": INTRINSICS, "T_cloud_camera": T_world_camera})
     return images
 
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,25 +42,27 @@ Grippers = Annotated[
 Cloud = Annotated[
     Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
 ]
-Depth = Annotated[
-    Path | None, Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy.")
-]
 DepthScale = Annotated[
     float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
 ]
 Color = Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")]
-Intrinsics = Annotated[
-    str | None,
-    Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
-]
 Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
 
 
 @takes_flags(connection=CONNECTION, options=option_flags("robot"))
 def detect(
     file: Cloud = None,
-    depth: Depth = None,
-    intrinsics: Intrinsics = None,
+    depth: Annotated[
+        list[Path] | None,
+        Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy. May be repeated."),
+    ] = None,
+    intrinsics: Annotated[
+        list[str] | None,
+        Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
+    ] = None,
+    pose: Annotated[
+        list[str] | None, Option(help="Camera of each --depth: 4 x 4 JSON, to the cloud's frame.")
+    ] = None,
     depth_scale: DepthScale = None,
     color: Color = None,
     mask: Annotated[
@@ -103,6 +106,8 @@ def detect(
     edgegrasp detect --depth depth.png --intrinsics 615,615,320,240 --at 310,250
 
     edgegrasp detect cloud.ply --robot fr3 --joints 0,-0.8,0,-2.4,0,1.6,0.8 --base 1,0,0,0.3,…
+
+    edgegrasp detect --depth a.png --depth b.png --intrinsics 615,615,320,240 --pose A --pose B
     """
     from rich.console import Console
 
@@ -111,7 +116,7 @@ def detect(
     fields = _options(options_file, options) | _robot_option(robot, joints, base)
     if trajectory is not None and "robot" not in fields:
         raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
-    images = _depth_images(file, depth, intrinsics, depth_scale)
+    images = _depth_images(file, depth or [], intrinsics or [], pose or [], depth_scale)
     colors = None if color is None else _pixels(color)[..., :3]
     if mask is not None:
         from edgegrasp_client import on_mask
@@ -256,8 +261,9 @@ def draw(
     if shades is not None and shades.dtype.kind == "f":
         shades = 255 * shades
     shown, image = detection.grasps[:DRAWN], None
-    view = View.of_image(np.asarray(sent.points)) if len(shape) == 3 else None
-    if view is not None:
+    view, moved = None, any("T_cloud_camera" in each for each in depth_images or ())
+    if len(shape) == 3 and not moved:
+        view = View.of_image(np.asarray(sent.points))
         image = None if shades is None else shades.reshape(shape).astype(np.uint8)
     else:
         seen = points[np.isfinite(points).all(axis=1)]
@@ -326,20 +332,31 @@ def _write_trajectory(file: Path, detection: Any) -> None:
 
 
 def _depth_images(
-    file: Path | None, depth: Path | None, intrinsics: str | None, scale: float | None
+    file: Path | None,
+    depths: list[Path],
+    intrinsics: list[str],
+    poses: list[str],
+    scale: float | None,
 ) -> "list[DepthImage] | None":
-    """The image of --depth with its camera; None where a cloud is given."""
+    """The images of --depth with their cameras; None where a cloud is given."""
     from edgegrasp_service.worker.http_bodies import value_of_text
 
-    if (file is None) == (depth is None):
+    if (file is None) != bool(depths):
         raise ValueError("give a cloud file, or --depth and --intrinsics")
-    if depth is None:
+    if file is not None:
         return None
-    if intrinsics is None:
-        raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depth}, in pixels.")
-    camera: Any = value_of_text("intrinsics", intrinsics)
-    image: DepthImage = {"depth": depth, "intrinsics": camera}
-    return [image if scale is None else {**image, "depth_scale": scale}]
+    if not intrinsics:
+        raise ValueError(f"--intrinsics: got nothing. Give fx,fy,cx,cy of {depths[0]}, in pixels.")
+    if len(intrinsics) == 1:
+        intrinsics = intrinsics * len(depths)
+    if len(depths) > 1 and not len(poses) == len(intrinsics) == len(depths):
+        raise ValueError(f"--pose: got {len(poses)}. Give one for each of {len(depths)} images.")
+    images: list[DepthImage] = []
+    for depth, camera, pose in zip_longest(depths, intrinsics, poses[: len(depths)]):
+        image: Any = {"depth": depth, "intrinsics": value_of_text("intrinsics", camera)}
+        image |= {} if pose is None else {"T_cloud_camera": value_of_text("pose", pose)}
+        images.append(image if scale is None else {**image, "depth_scale": scale})
+    return images
 
 
 def _pixels(file: Path) -> NDArray[Any]:

@@ -9,6 +9,7 @@ import importlib.metadata
 import io
 import json
 import re
+import sys
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -18,8 +19,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.errors import EdgeGraspError
+from edgegrasp_camera.files import read_file
 from edgegrasp_camera.poses import quaternion_from_matrix
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
@@ -254,30 +256,18 @@ class _Inputs:
         intrinsics: list[float] | None,
         scale: float | None,
         T_base_camera: list[list[float]] | None,
-    ) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
-        """Points (N, 3) and colours (N, 3) to draw; None: what only the server can read."""
+    ) -> tuple[NDArray[Any], NDArray[Any] | None]:
+        """Points (N, 3) and colours (N, 3), if there are any, to draw."""
         path = self._path(str(cloud or depth))
-        arrays: dict[str, Any] = {}
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        elif cloud is None:
-            arrays = {"depth": _pixels(path), "intrinsics": intrinsics}
-        elif path.suffix == ".npy":
-            arrays = {"points": np.load(path, allow_pickle=False)}
-        if "depth" in arrays:
-            camera = intrinsics_of(np.ravel(arrays["intrinsics"]))
-            arrays["points"] = unproject(metres(arrays["depth"], scale), camera)
-        if "points" not in arrays:
-            return None, None
-        points = arrays["points"].reshape(-1, 3)
-        if T_base_camera is not None:
-            pose = np.asarray(T_base_camera)
-            points = points @ pose[:3, :3].T + pose[:3, 3]
-        colors = arrays.get("rgb")
-        if colors is None or colors.dtype != np.uint8 or colors.size != points.size:
-            return points, None
-        return points, colors.reshape(-1, 3)
+        if cloud is not None:
+            sent = read_file(path.suffix[1:].lower(), path.read_bytes(), sys.maxsize)
+        else:
+            pose = np.eye(4) if T_base_camera is None else np.asarray(T_base_camera)
+            view = DepthView(intrinsics_of(intrinsics), pose, scale)
+            sent, _ = fuse_depth_images([_pixels(path)], [view])
+        points, colors = (None if a is None else np.asarray(a) for a in (sent.points, sent.colors))
+        assert points is not None
+        return points.reshape(-1, 3), None if colors is None else colors.reshape(-1, 3)
 
     def _path(self, name: str) -> Path:
         path = (self._folder / name).resolve()
@@ -360,16 +350,16 @@ def _pixels(path: Path) -> NDArray[Any]:
 
 
 def _picture(
-    found: "Detection", points: NDArray[Any] | None, colors: NDArray[Any] | None, eye: Any
+    found: "Detection", points: NDArray[Any], colors: NDArray[Any] | None, eye: Any
 ) -> bytes:
-    """The cloud near the grasps, or else the processed one, and the grasps as PNG."""
+    """The cloud near the grasps, and the grasps, as PNG."""
     from edgegrasp_sim.picture import Picture, View
 
     assert found.debug is not None
-    seen = found.debug.points
-    if points is not None:
-        near = np.linalg.norm(points - np.median(seen, axis=0), axis=1) < AROUND
-        seen, colors = points[near], None if colors is None else colors[near]
+    near = np.linalg.norm(points - np.median(found.debug.points, axis=0), axis=1) < AROUND
+    seen = points[near]
+    if colors is not None:
+        colors = np.multiply(colors[near], 255 if colors.dtype.kind == "f" else 1)
     file = io.BytesIO()
     title = f"{len(found.grasps)} grasps of {found.model}"
     picture = Picture(View.of(seen, eye, found.up), seen, colors, title=title)

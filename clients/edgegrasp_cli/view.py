@@ -11,15 +11,15 @@ from typing import Annotated
 
 import typer
 
-from edgegrasp_cli.detect import Cloud, Color, Depth, DepthScale, Intrinsics
+from edgegrasp_cli.detect import Cloud, Color, DepthScale
 
 Option = typer.Option
 
 
 def view(
     file: Cloud = None,
-    depth: Depth = None,
-    intrinsics: Intrinsics = None,
+    depth: Annotated[Path | None, Option(help="Depth image in place of a cloud: .png.")] = None,
+    intrinsics: Annotated[str | None, Option(help="Camera of --depth: fx,fy,cx,cy.")] = None,
     depth_scale: DepthScale = None,
     color: Color = None,
     viewpoint: Annotated[str | None, Option(help="Camera position of a cloud: x,y,z.")] = None,

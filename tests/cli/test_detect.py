@@ -138,6 +138,14 @@ def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tm
         assert told in " ".join(shown.split())
 
 
+def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, refused) -> None:
+    depth, _, _, *camera = camera_files
+    pose = "--pose", json.dumps(np.eye(4).tolist())
+    asked = ("detect", depth, depth, *camera, *pose, "--server", dummy_server.grpc_address)
+    assert json.loads(run(*asked, *pose, "--json"))["counts"]["points"] == 2 * 768
+    assert "Give one for each of 2 images" in " ".join(refused(*asked).split())
+
+
 def test_a_file_with_a_depth_image_and_its_camera(dummy_server, run, tmp_path) -> None:
     depth = np.random.default_rng(0).integers(500, 700, (24, 32)).astype(np.uint16)
     rgb = np.full((24, 32, 3), (200, 30, 30), np.uint8)

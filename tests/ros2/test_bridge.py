@@ -287,6 +287,17 @@ def test_a_mask_is_of_the_image_it_was_made_of_and_grows_old(make_image, camera)
         inbox.scene(1.5)
 
 
+def test_images_of_several_cameras_are_one_cloud(asked, make_image, camera) -> None:
+    inbox, aside = Inbox(), make_image(DEPTH, "16UC1")
+    aside.header.frame_id = "link8"
+    inbox.take("camera", camera, 0.0)
+    for image in (aside, make_image(DEPTH, "16UC1")):
+        inbox.take("depth", image, 0.0)
+    bridge.detect(asked, inbox.scene(0.0), Settings(), {}, lookup)
+    poses = [image["T_cloud_camera"] for image in asked.given["depth_images"]]
+    np.testing.assert_allclose(poses, [np.eye(4), np.linalg.inv(T_base_camera) @ PANDA_LINK8])
+
+
 def test_every_option_is_a_parameter(client, make_cloud, cloud) -> None:
     parameters = bridge.parameters()
     assert {f"options.{name}" for name in DetectOptions.__annotations__} < set(parameters)

@@ -100,6 +100,7 @@ class Scene(NamedTuple):
     depth: Any = None  # sensor_msgs/Image, rectified
     camera: Any = None  # sensor_msgs/CameraInfo of `depth`
     mask: Any = None  # sensor_msgs/Image: not 0 on what is to be grasped
+    others: tuple[tuple[Any, Any], ...] = ()  # images and their cameras, beside `depth`
 
     @property
     def header(self) -> Any:
@@ -114,13 +115,13 @@ class Inbox:
     def __init__(self) -> None:
         self._clouds: deque[Any] = deque(maxlen=KEPT)
         self._depths: deque[Any] = deque(maxlen=KEPT)
-        self._camera: Any = None
+        self._cameras: dict[str, Any] = {}  # by their frames
         self._mask: Any = None
 
     def take(self, field: str, message: Any, mask_age: float) -> bool:
         """Keep a message of a field of Scene; whether there is something new to detect in."""
         if field == "camera":
-            self._camera = message
+            self._cameras[message.header.frame_id] = message
         elif field == "mask":
             self._mask = message
         else:
@@ -129,7 +130,7 @@ class Inbox:
         return field == "mask" if masked else field in ("cloud", "depth")
 
     def scene(self, mask_age: float) -> Scene:
-        """The newest cloud, or else depth image; or that of the mask, where masks come.
+        """The newest cloud, or else depth image of each camera; or that of the mask, if any comes.
 
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.
@@ -149,7 +150,15 @@ class Inbox:
             source = same[-1]
         if sources is self._clouds:
             return Scene(cloud=source, mask=mask)
-        return Scene(depth=source, camera=self._camera, mask=mask)
+        latest = {each.header.frame_id: each for each in self._depths} if mask is None else {}
+        latest.pop(source.header.frame_id, None)
+        others = tuple((each, self._camera_of(each)) for each in latest.values())
+        return Scene(depth=source, camera=self._camera_of(source), mask=mask, others=others)
+
+    def _camera_of(self, depth: Any) -> Any:
+        """The CameraInfo of an image: that of its frame, or the only one."""
+        only = next(iter(self._cameras.values())) if len(self._cameras) == 1 else None
+        return self._cameras.get(depth.header.frame_id, only)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +220,15 @@ def detect(
     elif cloud is not None:
         found = client.detect(cloud, **cast("DetectOptions", asked))
     else:
-        image: DepthImage = {
-            "depth": depth_array(scene.depth),
-            "intrinsics": camera_matrix(scene.camera),
-        }
-        found = client.detect(depth_images=[image], **cast("DetectOptions", asked))
+        images: list[DepthImage] = [
+            {
+                "depth": depth_array(depth),
+                "intrinsics": camera_matrix(camera),
+                "T_cloud_camera": lookup(frame_id, depth.header.frame_id, depth.header.stamp),
+            }
+            for depth, camera in ((scene.depth, scene.camera), *scene.others)
+        ]
+        found = client.detect(depth_images=images, **cast("DetectOptions", asked))
     target = settings.target_frame or frame_id
     T_target_cloud = lookup(target, frame_id, stamp)
     grasps = [_moved(grasp, T_target_cloud) for grasp in found.grasps]
