@@ -7,15 +7,10 @@ import { PLYLoader } from "./vendor/PLYLoader.js";
 const CLOUD_ARRAYS = ["points", "normals", "colors", "segment_ids", "view_ids"]; // of an .npz file
 const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
 
-/** A scene that can be shown and sent.
+/** A scene that can be shown and sent: `points` (N, 3), metres, NaN where there is no reading; `colors` (N, 3) from
+ * 0 to 1, or null; `camera`, which is at the origin, or null; what is sent, a file `cloud` or else an `image` with depth,
+ * intrinsics and depth_scale; and a `note` on where that file comes from, if it is not one of the user's.
  * @typedef {Object} Scene
- * @property {string} name
- * @property {Float32Array} points - (N, 3) metres, NaN where there is no reading
- * @property {Float32Array | null} colors - (N, 3) from 0 to 1, as the screen has them
- * @property {{fx, fy, cx, cy, width, height} | null} camera - at the origin, where it is known
- * @property {File | null} cloud - what is sent: a cloud
- * @property {{depth: File, intrinsics: string, depth_scale: string} | null} image - or an image
- * @property {string} note - where what is sent comes from, if not from a file as it is
  */
 
 /** The Scene of one cloud, or of a depth image with or without its colours, whose camera is given as text. */
@@ -84,7 +79,8 @@ async function readImages(images, files, camera) {
 
 /** The fields of a Scene that a depth image (H, W) has. */
 function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
-  const [fx, fy, cx, cy] = fourOf(intrinsics.replace(/[[\]\s]/g, "").split(",").map(Number));
+  const given = intrinsics.replace(/[[\]\s]/g, "").split(",").map(Number);
+  const [fx, fy, cx, cy] = given.length === 9 ? [0, 4, 2, 5].map((place) => given[place]) : given; // of a matrix
   if (![fx, fy, cx, cy].every(Number.isFinite) || !fx || !fy) {
     throw new NeedsCamera(`${file.name}: give the camera's fx, fy, cx, cy in pixels.`);
   }
@@ -100,11 +96,6 @@ function fromDepth(array, file, colors, { intrinsics, depth_scale }) {
   const camera = { fx, fy, cx, cy, width, height };
   const image = { depth: file, intrinsics: [fx, fy, cx, cy].join(), depth_scale };
   return { points: found, colors, camera, cloud: null, image, note: "" };
-}
-
-/** fx, fy, cx, cy of these four numbers, or of the nine of a matrix. */
-function fourOf(values) {
-  return values.length === 9 ? [0, 4, 2, 5].map((place) => values[place]) : values;
 }
 
 /** Intrinsics are missing or wrong. */

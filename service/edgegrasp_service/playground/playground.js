@@ -10,6 +10,8 @@ const REASONS = {
   collision: "collides", "not-scored": "left out, not scored", "low-score": "scores too low",
   suppressed: "near a better one", "beyond-top-k": "beyond top_k",
 };
+const BOX = ["center", "half_extents"];
+const FIELDS = { region: BOX, workspace: BOX, cone: ["direction"] }; // of shapes, typed as three numbers
 const $ = (id) => document.getElementById(id);
 const state = {
   files: [], scene: null, answer: null, fresh: true, // answer: its grasps by score; fresh: the first of its scene
@@ -22,7 +24,7 @@ start();
 
 function picture() {
   try {
-    return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn, aimed: takePoint, object: takeObject });
+    return new View($("stage"), { picked: choose, edited: readShape, drawn: takeDrawn, aimed: takePoint, object: (number) => aim({ objects: { include: [number] } }) });
   } catch (error) {
     say("The picture needs WebGL, which this browser does not have or has switched off.", true);
     throw error;
@@ -31,9 +33,8 @@ function picture() {
 
 async function start() {
   state.grippers = await (await fetch("grippers.json")).json();
-  for (const name of Object.keys(state.grippers)) $("gripper").add(new Option(name, name));
-  $("gripper").add(new Option("default", ""), 0);
-  $("gripper").value = "";
+  const names = Object.keys(state.grippers).map((name) => new Option(name, name));
+  $("gripper").replaceChildren(new Option("default", ""), ...names);
   await listSamples();
   if (await listModels()) await openSample();
 }
@@ -189,8 +190,7 @@ async function listModels() {
     await new Promise((done) => setTimeout(done, 1000));
     return listModels();
   }
-  const names = state.models.map(({ name, default: first }) => new Option(name, first ? "" : name));
-  $("model").replaceChildren(...names);
+  $("model").replaceChildren(...state.models.map(({ name, default: first }) => new Option(name, first ? "" : name)));
   $("model").value = "";
   return true;
 }
@@ -208,7 +208,6 @@ function showAnswer() {
   for (const { number, reason } of answer?.objects ?? []) {
     if (reason) $("warnings").append(element("li", `Object ${number} has no good grasp: ${reason.replace("-", " ")}.`));
   }
-  if (answer && !answer.support) $("warnings").append(element("li", "No support plane was found."));
   if (answer) $("count").max = Math.max(grasps.length, 12);
   $("grasps").replaceChildren(...grasps.map(line));
   const counts = Object.entries(answer?.counts ?? {});
@@ -346,8 +345,8 @@ function isaacGrasps() {
     const postures = { cspace_position: joints(0), pregrasp_cspace_position: joints(grasp.width) };
     return [`grasp_${row}`, { confidence: grasp.score, position, orientation: { w, xyz: [x, y, z] }, ...postures }];
   });
-  const frames = { object_frame_link: "cloud", gripper_frame_link: "hand" };
-  const file = { format: "isaac_grasp", format_version: 1.0, ...frames, grasps: Object.fromEntries(grasps) };
+  const file = { format: "isaac_grasp", format_version: 1.0, object_frame_link: "cloud", gripper_frame_link: "hand",
+    grasps: Object.fromEntries(grasps) };
   return JSON.stringify(rounded(file, 6), null, 1).replace('"format_version": 1,', '"format_version": 1.0,');
 }
 
@@ -360,14 +359,14 @@ function showTargets() {
   $("objects").replaceChildren(...all.map((number) => {
     const button = Object.assign(element("button", number), { type: "button", title: `object ${number} only` });
     button.setAttribute("aria-pressed", String(number === asked));
-    button.addEventListener("click", () => takeObject(number));
+    button.addEventListener("click", () => aim({ objects: { include: [number] } }));
     return button;
   }));
 }
 
-/** Ask for the grasps of one object. */
-function takeObject(number) {
-  state.target = { objects: { include: [number] } };
+/** Ask for the grasps of a target: options; none: of all objects. */
+function aim(target) {
+  state.target = target;
   return ask();
 }
 
@@ -377,9 +376,8 @@ function takePoint(point) {
   if (!point) return say("No point there; click one of the cloud.", true);
   const [x, y, z] = point;
   const { camera, image } = state.scene;
-  if (image) state.target = { at: [Math.round((camera.fx * x) / z + camera.cx), Math.round((camera.fy * y) / z + camera.cy)] };
-  else state.target = { near: rounded(point) };
-  return ask();
+  if (image) return aim({ at: [Math.round((camera.fx * x) / z + camera.cx), Math.round((camera.fy * y) / z + camera.cy)] });
+  return aim({ near: rounded(point) });
 }
 
 // Shapes: region and workspace are boxes, the cone is one of directions
@@ -394,10 +392,6 @@ function setShape(name, shape) {
   writeShape(name);
 }
 
-function typed(name) {
-  return name === "cone" ? ["direction"] : ["center", "half_extents"];
-}
-
 /** Put what the mouse made of a shape into its fields. */
 function readShape(name) {
   Object.assign(state.shapes[name], view.shape(name));
@@ -407,13 +401,13 @@ function readShape(name) {
 function writeShape(name) {
   const shape = state.shapes[name];
   if (!shape) return;
-  for (const field of typed(name)) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(4)).join(",");
+  for (const field of FIELDS[name]) $(`${name}_${field}`).value = shape[field].map((value) => +value.toFixed(4)).join(",");
 }
 
 /** Take a shape from its fields. */
 function typeShape(name) {
   const shape = { ...state.shapes[name] };
-  for (const field of typed(name)) {
+  for (const field of FIELDS[name]) {
     const values = numbers($(`${name}_${field}`).value, 3);
     if (!values) return say("Three numbers are needed: x, y, z.", true);
     shape[field] = values;
@@ -453,20 +447,14 @@ for (const name of ["intrinsics", "depth_scale", "viewpoint"]) {
 }
 for (const name of ["min_score", "count"]) $(name).addEventListener("input", filter);
 $("point_size").addEventListener("input", ({ target }) => view.setPointSize(Number(target.value)));
-$("all").addEventListener("click", () => {
-  state.target = {};
-  ask();
-});
+$("all").addEventListener("click", () => aim({}));
 $("pick").addEventListener("click", ({ target }) => {
   if (!state.scene) return;
   const on = target.getAttribute("aria-pressed") !== "true";
   press(on ? target : null);
   if (on) say("Click a point of the object that is meant.");
 });
-$("keep").addEventListener("click", () => {
-  $("debug").checked = true;
-  ask();
-});
+$("keep").addEventListener("click", () => ($("debug").checked = true) && ask());
 $("approach").addEventListener("change", ({ target }) => {
   const down = state.answer ? state.answer.up.map((value) => -value) : [0, 0, -1];
   setShape("cone", target.value === "cone" && state.scene ? { direction: down, max_angle: Math.PI / 6 } : null);
@@ -512,13 +500,9 @@ async function take(files) {
   if (await open(files)) await ask();
 }
 
-async function copyText(text) {
-  try {
-    await navigator.clipboard.writeText(text);
-    say("Copied.");
-  } catch {
-    say("The browser does not allow copying.", true); // no clipboard without TLS but on this machine
-  }
+function copyText(text) {
+  const copied = navigator.clipboard?.writeText(text) ?? Promise.reject(); // no clipboard without TLS but on this machine
+  return copied.then(() => say("Copied."), () => say("The browser does not allow copying.", true));
 }
 
 function numbers(text, count) {

@@ -125,7 +125,8 @@ export class View {
     const look = { vertexColors: true, sizeAttenuation: false };
     this.groups.cloud.add(new THREE.Points(geometry, new THREE.PointsMaterial(look)));
     this.setPointSize(this.pointSize);
-    this.middle = [0, 1, 2].map((axis) => median(this.places.filter((_, i) => i % 3 === axis)));
+    const half = Math.floor(places.length / 6); // typed arrays sort by number
+    this.middle = [0, 1, 2].map((axis) => this.places.filter((_, i) => i % 3 === axis).sort()[half]);
     this.root.quaternion.setFromUnitVectors(
       scene.camera ? new THREE.Vector3(0, -1, 0) : UP, UP);
     this.root.updateMatrixWorld();
@@ -401,13 +402,8 @@ export class View {
   _listen() {
     const band = this.stage.querySelector(".band");
     let from = null;
-    const place = ({ clientX, clientY }) => {
-      const { left, top } = this.canvas.getBoundingClientRect();
-      return [clientX - left, clientY - top];
-    };
-    this.canvas.addEventListener("pointerdown", (event) => {
-      from = place(event);
-    });
+    const place = ({ offsetX, offsetY }) => [offsetX, offsetY];
+    this.canvas.addEventListener("pointerdown", (event) => (from = place(event)));
     this.canvas.addEventListener("pointermove", (event) => {
       if (!this.drawing || !from) return;
       const to = place(event);
@@ -457,20 +453,17 @@ export class View {
 
   /** The points in a rectangle, pixels: of what is in front, and not of the plane. */
   _within(start, end) {
-    const [left, right] = [start[0], end[0]].sort((a, b) => a - b);
-    const [top, bottom] = [start[1], end[1]].sort((a, b) => a - b);
-    const found = [];
-    const grid = this.groups.plane.children[0];
+    const box = new THREE.Box2().setFromPoints([new THREE.Vector2(...start), new THREE.Vector2(...end)]);
+    const [grid] = this.groups.plane.children;
     const normal = grid && new THREE.Vector3(0, 1, 0).applyQuaternion(grid.quaternion);
-    const place = new THREE.Vector3();
+    const eye = this.root.worldToLocal(this.camera.position.clone());
+    const [found, place] = [[], new THREE.Vector3()];
     for (let at = 0; at < this.places.length; at += 3) {
       place.fromArray(this.places, at);
+      const pixel = this._pixel(place);
+      if (pixel.z > 1 || !box.containsPoint(pixel)) continue;
       if (grid && place.clone().sub(grid.position).dot(normal) < 0.006) continue;
-      const distance = this.root.localToWorld(place.clone()).distanceTo(this.camera.position);
-      const { x, y, z } = this._pixel(place);
-      if (z < 1 && x >= left && x <= right && y >= top && y <= bottom) {
-        found.push({ distance, point: [...this.places.subarray(at, at + 3)] });
-      }
+      found.push({ distance: place.distanceTo(eye), point: place.toArray() });
     }
     found.sort((a, b) => a.distance - b.distance);
     const nearest = found[Math.floor(found.length / 50)]?.distance ?? 0; // not a stray point
@@ -506,8 +499,4 @@ function ends({ approach_point, contact_point }) {
     made.position.set(...place);
     return made;
   });
-}
-
-function median(values) {
-  return values.sort()[values.length >> 1]; // typed arrays sort by number
 }
