@@ -12,7 +12,6 @@ const FORMATS = ["npy", "npz", "ply", "pcd", "xyz"];
  * intrinsics and depth_scale; and a `note` on where that file comes from, if it is not one of the user's.
  * @typedef {Object} Scene
  */
-
 /** The Scene of one cloud, or of a depth image with or without its colours, whose camera is given as text. */
 export async function readScene(files, camera) {
   const images = files.filter((file) => /\.png$/i.test(file.name));
