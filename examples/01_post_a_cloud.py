@@ -8,7 +8,7 @@ base install, `pip install edgegrasp`.
 
 import sys
 
-from edgegrasp_client import GraspClient, GraspClientError
+from edgegrasp_client import GraspClient
 
 
 def main(path: str, address: str = "127.0.0.1:50051") -> None:
@@ -24,9 +24,4 @@ def main(path: str, address: str = "127.0.0.1:50051") -> None:
 
 
 if __name__ == "__main__":
-    if not 2 <= len(sys.argv) <= 3:
-        sys.exit(__doc__)
-    try:
-        main(*sys.argv[1:])
-    except GraspClientError as error:
-        sys.exit(f"error: {error}")
+    main(*sys.argv[1:])

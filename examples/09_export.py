@@ -37,6 +37,4 @@ def main(folder: str, address: str = "127.0.0.1:50051") -> None:
 
 
 if __name__ == "__main__":
-    if not 2 <= len(sys.argv) <= 3:
-        sys.exit(__doc__)
     main(*sys.argv[1:])

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from PIL import Image
 
-from edgegrasp_client import GraspClient, GraspClientError, on_mask
+from edgegrasp_client import GraspClient, on_mask
 
 
 def main(depth: str, mask: str, camera: str, address: str = "127.0.0.1:50051") -> None:
@@ -30,9 +30,4 @@ def main(depth: str, mask: str, camera: str, address: str = "127.0.0.1:50051") -
 
 
 if __name__ == "__main__":
-    if not 4 <= len(sys.argv) <= 5:
-        sys.exit(__doc__)
-    try:
-        main(*sys.argv[1:])
-    except (GraspClientError, OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    main(*sys.argv[1:])

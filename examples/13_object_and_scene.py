@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from edgegrasp_client import GraspClient, GraspClientError, object_in_scene
+from edgegrasp_client import GraspClient, object_in_scene
 
 
 def main(object_file: str, scene_file: str, address: str = "127.0.0.1:50051") -> None:
@@ -28,9 +28,4 @@ def main(object_file: str, scene_file: str, address: str = "127.0.0.1:50051") ->
 
 
 if __name__ == "__main__":
-    if not 3 <= len(sys.argv) <= 4:
-        sys.exit(__doc__)
-    try:
-        main(*sys.argv[1:])
-    except (GraspClientError, OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    main(*sys.argv[1:])
