@@ -261,7 +261,7 @@ def draw(
     if shades is not None and shades.dtype.kind == "f":
         shades = 255 * shades
     shown, image = detection.grasps[:DRAWN], None
-    view, moved = None, any("T_cloud_camera" in each for each in depth_images or ())
+    moved = any("T_cloud_camera" in each for each in depth_images or ())
     if len(shape) == 3 and not moved:
         view = View.of_image(np.asarray(sent.points))
         image = None if shades is None else shades.reshape(shape).astype(np.uint8)
@@ -355,7 +355,8 @@ def _depth_images(
     for depth, camera, pose in zip_longest(depths, intrinsics, poses[: len(depths)]):
         image: Any = {"depth": depth, "intrinsics": value_of_text("intrinsics", camera)}
         image |= {} if pose is None else {"T_cloud_camera": value_of_text("pose", pose)}
-        images.append(image if scale is None else {**image, "depth_scale": scale})
+        image |= {} if scale is None else {"depth_scale": scale}
+        images.append(image)
     return images
 
 
