@@ -262,8 +262,8 @@ def draw(
         shades = 255 * shades
     shown, image = detection.grasps[:DRAWN], None
     moved = any("T_cloud_camera" in each for each in depth_images or ())
-    if len(shape) == 3 and not moved:
-        view = View.of_image(np.asarray(sent.points))
+    view = View.of_image(np.asarray(sent.points)) if len(shape) == 3 and not moved else None
+    if view is not None:
         image = None if shades is None else shades.reshape(shape).astype(np.uint8)
     else:
         seen = points[np.isfinite(points).all(axis=1)]
