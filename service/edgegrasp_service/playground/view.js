@@ -198,8 +198,8 @@ export class View {
     for (const hand of this.hands) this.groups.hands.add(hand);
     this.groups.rejected.clear();
     this._showObjects(answer.objects);
-    const middles = new THREE.Box3().setFromPoints(answer.objects.map(({ center }) => new THREE.Vector3(...center)));
-    this.target = middles.isEmpty() ? this.middle : middles.getCenter(new THREE.Vector3()).toArray();
+    const middle = answer.objects.reduce((sum, { center }) => sum.add(new THREE.Vector3(...center)), new THREE.Vector3());
+    this.target = answer.objects.length ? middle.divideScalar(answer.objects.length).toArray() : this.middle;
     this._showPlane(answer.support);
     this.root.quaternion.setFromUnitVectors(new THREE.Vector3(...answer.up), UP);
     this.root.updateMatrixWorld();
