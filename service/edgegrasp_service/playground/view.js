@@ -150,14 +150,14 @@ export class View {
   _showFrame({ camera }) {
     this.groups.frame.add(new THREE.AxesHelper(AXES));
     if (!this.eye) return;
-    const { width, height } = camera ?? { width: 5, height: 4 };
-    const lens = new THREE.PerspectiveCamera(this.camera.fov, width / height, 0.001, FRUSTUM);
-    lens.position.set(...this.eye);
-    lens.up.set(0, camera ? -1 : 0, camera ? 0 : 1);
-    lens.lookAt(...(camera ? [0, 0, 1] : this.middle));
-    lens.updateMatrixWorld();
-    const white = new THREE.Color("#f4f4f5");
-    this.groups.frame.add(new THREE.CameraHelper(lens).setColors(white, white, white, white, white));
+    const { width, height, fx, fy } = camera ?? { width: 5, height: 4, fx: 5, fy: 5 };
+    const pyramid = new THREE.ConeGeometry(Math.SQRT1_2, 1, 4).rotateY(Math.PI / 4); // its tip goes to 0, open toward z
+    const edges = new THREE.EdgesGeometry(pyramid.translate(0, -0.5, 0).rotateX(-Math.PI / 2));
+    const frustum = new THREE.LineSegments(edges, new THREE.LineBasicMaterial({ color: "#f4f4f5" }));
+    frustum.scale.set(width / fx, height / fy, 1).multiplyScalar(FRUSTUM);
+    frustum.position.set(...this.eye);
+    if (!camera) frustum.lookAt(...this.middle);
+    this.groups.frame.add(frustum);
   }
 
   /** Look at the objects from "camera", "top" or "side"; a camera that is not known is aslant. */
