@@ -161,7 +161,7 @@ def _cloud(
     T_base_scene: Float64,
 ) -> Thing | None:
     """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
-    flat = np.asarray(points, dtype=np.float32).reshape(-1, 3)
+    flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     seen = scene.frame.points(flat[np.isfinite(flat).all(axis=1)])
     base = np.linalg.inv(T_base_scene)[:3, 3]
     seen = seen[np.abs(seen - base).max(axis=1) < AROUND]
