@@ -140,9 +140,9 @@ class _Arm:
         self._robot, self._scene, self._options = robot, scene, options
         self._start = np.array(asked.joints)
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
-        self._to_pregrasp = self._solver(robot.scene, restarts=3)
+        self._to_pregrasp = self._solver(robot.scene, restarts=2)
         self._along = self._solver(robot.straight, restarts=0)
-        self._ignoring = self._solver(robot.straight, restarts=3, check=False)
+        self._ignoring = self._solver(robot.straight, restarts=2, check=False)
 
     def reach(self, grasp: Grasp) -> _Pick:
         """Joints at the pregrasp and on straight to the grasp."""
@@ -189,7 +189,7 @@ class _Arm:
     def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> SimpleIk:
         """Inverse kinematics that a seed decides, and no clock."""
         options = SimpleIkOptions(
-            GROUP, max_iters=60, max_time=10.0, max_restarts=restarts, step_size=0.5,
+            GROUP, max_iters=40, max_time=10.0, max_restarts=restarts, step_size=0.5,
             max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
             check_collisions=check,
         )  # fmt: skip

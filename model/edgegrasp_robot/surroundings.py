@@ -162,9 +162,9 @@ def _cloud(
 ) -> Thing | None:
     """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
     flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    seen = scene.frame.points(flat[np.isfinite(flat).all(axis=1)])
+    seen = scene.frame.points(flat[np.isfinite(flat @ np.ones(3))])
     base = np.linalg.inv(T_base_scene)[:3, 3]
-    seen = seen[np.abs(seen - base).max(axis=1) < AROUND]
+    seen = seen[np.einsum("ij,ij->i", seen - base, seen - base) < AROUND**2]
     if scene.support is not None:
         seen = seen[scene.support.heights(seen) > CELL / 2]
     if len(seen) == 0:

@@ -5,6 +5,7 @@ import operator
 from pathlib import Path
 from types import SimpleNamespace
 
+import httpx
 import numpy as np
 import pytest
 
@@ -112,3 +113,9 @@ def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
     error = ask(robot, "grpc", joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])[0].error
     assert (error.code, error.field) == ("INVALID_ARGUMENT", "options.robot.joints")
     assert "the support" in error.value
+
+
+def test_a_server_lists_its_robots(start_dummy, robot):
+    with start_dummy("--robots", "fr3") as server:
+        listed = httpx.get(f"{server.http_url}/v1/robots").json()
+    assert listed == {"robots": [robot.describe()]}

@@ -136,6 +136,7 @@ def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, http) -> None:
     scoring = check(http.post("/v1/grasps:score", json=body), "Scoring")
     assert [evaluation["grasp"] is None for evaluation in scoring["evaluations"]] == [False, True]
     check(http.get("/v1/models"), "Models")
+    check(http.get("/v1/robots"), "Robots")
     check(http.post("/v1/grasps", json={}), "Problem")
 
 

@@ -51,6 +51,7 @@ METHODS = {
     **WORK,
     "/v1/models": "ListModels",
     "/v1/models:reload": "ReloadModels",
+    "/v1/robots": "ListRobots",
     "/health/live": "Live",
     "/health/ready": "Ready",
     "/metrics": "Metrics",
@@ -164,6 +165,10 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
     @app.get("/v1/models")
     async def list_models() -> Response:
         return JSONResponse({"models": service.models()})
+
+    @app.get("/v1/robots")
+    async def list_robots() -> Response:
+        return JSONResponse({"robots": service.robots()})
 
     @app.post("/v1/models:reload")
     async def reload() -> Response:

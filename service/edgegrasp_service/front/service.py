@@ -81,6 +81,11 @@ class GraspService:
         self.check_ready()
         return self.pool.models
 
+    def robots(self) -> list[dict[str, Any]]:
+        """The robots that a request can name; raises NotReady."""
+        self.check_ready()
+        return self.pool.robots
+
     def check_ready(self) -> None:
         """Raise NotReady while weights are loading, and when the server is stopping."""
         if self.stopping.is_set():

@@ -47,17 +47,17 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
         settings.weights, settings.default_model, device, settings.grippers, settings.max_voxels
     )
     catalogue.warm_up()
-    _robots(settings)
+    load_robots(settings)
     return catalogue
 
 
-def _robots(settings: Settings) -> "Mapping[str, Robot]":
+def load_robots(settings: Settings) -> "Mapping[str, Robot]":
     """The robots that the settings name; loaded once, before the workers fork."""
     if not settings.robots:
         return {}
-    from edgegrasp_robot import load_robots  # half a gigabyte, which few servers need
+    import edgegrasp_robot  # half a gigabyte, which few servers need
 
-    return load_robots(settings.robots)
+    return edgegrasp_robot.load_robots(settings.robots)
 
 
 def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
@@ -139,7 +139,7 @@ class _Work:
         self, detector: Any, cloud: CloudInput, options: DetectOptions, name: str
     ) -> Detection:
         """The detection, with how a robot's arm gets to the grasps."""
-        robots = _robots(self._settings)
+        robots = load_robots(self._settings)
         if name not in robots:
             fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
             raise InvalidRequest("options.robot.name", repr(name), fix)

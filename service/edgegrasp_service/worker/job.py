@@ -55,6 +55,7 @@ class Ready:
     pid: int
     models: list[dict[str, Any]]  # what a catalogue tells of its weights; of workers
     failure: str = ""  # why there is none after all
+    robots: list[dict[str, Any]] = field(default_factory=list)  # what a robot tells of itself
 
 
 MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}

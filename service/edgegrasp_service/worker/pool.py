@@ -55,6 +55,7 @@ class WorkerPool:
         self._nursery_command = nursery
         self._replaced = replaced
         self.models: list[dict[str, Any]] = []
+        self.robots: list[dict[str, Any]] = []
         self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
@@ -98,7 +99,7 @@ class WorkerPool:
         self._nursery, self._workers = nursery, set(workers)
         while not self._idle.empty():
             self._idle.get_nowait()
-        self.models = workers[0].models
+        self.models, self.robots = workers[0].models, workers[0].robots
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._spawn(self._tend(worker))
@@ -320,6 +321,7 @@ class _Worker:
         self.nursery = nursery
         self.pid = 0
         self.models: list[dict[str, Any]] = []
+        self.robots: list[dict[str, Any]] = []
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
@@ -332,7 +334,7 @@ class _Worker:
         ready = await self.receive()
         if ready is None or ready.failure:
             raise InvalidSettings(ready.failure if ready else "a worker died as it started")
-        self.pid, self.models = ready.pid, ready.models
+        self.pid, self.models, self.robots = ready.pid, ready.models, ready.robots
 
     async def receive(self) -> Any:
         """Its next message; None: it has ended."""

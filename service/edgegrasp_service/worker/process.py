@@ -74,7 +74,7 @@ def _tell_of_ended(pool: socket.socket) -> None:
 
 
 def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
-    """Import and load; returns what gives each worker its `answer` and facts of its models.
+    """Import and load; returns what gives each worker its `answer`, facts of models and robots.
 
     A GPU's context cannot be forked: with one, every worker loads the weights for itself.
     """
@@ -83,9 +83,14 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
     load = load or answer.load_catalogue
     catalogue = load(settings) if settings.device == "cpu" else None
 
-    def start() -> tuple[Any, list[dict[str, Any]]]:
+    def start() -> tuple[Any, list[dict[str, Any]], list[dict[str, Any]]]:
         loaded = catalogue or load(settings)
-        return partial(answer.answer, catalogue=loaded, settings=settings), loaded.describe()
+        robots = [robot.describe() for robot in answer.load_robots(settings).values()]
+        return (
+            partial(answer.answer, catalogue=loaded, settings=settings),
+            loaded.describe(),
+            robots,
+        )
 
     return start
 
@@ -93,12 +98,12 @@ def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Call
 def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> None:
     """Answer jobs, one after the other, until the pool closes the socket."""
     try:
-        work, models = start()
+        work, models, robots = start()
     except EdgeGraspError as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
     with limited_memory(settings.max_worker_bytes):
-        _send(pool, Ready(os.getpid(), models))
+        _send(pool, Ready(os.getpid(), models, robots=robots))
         _answer_jobs(pool, work)
 
 
