@@ -23,6 +23,7 @@ from edgegrasp_robot.surroundings import surrounded
 Float64 = NDArray[np.float64]
 
 TRIED = 200  # grasps that the arm may be asked for, in their order
+SPARE = 4  # more than asked for that are brought within reach, as some may get no motion
 LINE_STEP = 0.01  # metres between the poses of a straight way
 MAX_JUMP = 0.4  # radians that a joint turns between two of them at most
 OFF_LINE = 0.002  # metres that the hand leaves a straight way by at most
@@ -97,22 +98,18 @@ def plan_picks(
         grasps = [grasp for grasp in detection.grasps if grasp.object not in own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
         arm = _Arm(robot, asked, scene, options)
+        wanted = options.top_k + (SPARE if asked.plan == "motion" else 0)
         for grasp in grasps:
-            if failures["reachable"] == options.top_k or time.monotonic() > until:
+            if failures["reachable"] == wanted or time.monotonic() > until:
                 break
             pick = arm.reach(grasp)
             failures[pick.outcome] += 1
             picks.append(pick)
         untried = [_Pick(grasp, None, "untried") for grasp in grasps[len(picks) :]]
-        picks = _preferred(picks, np.array(asked.joints), options)[: options.top_k]
+        picks = _preferred(picks, np.array(asked.joints), options)
         if asked.plan == "motion":
-            for row, pick in enumerate(picks):
-                if pick.line is None or time.monotonic() > until:
-                    break
-                picks[row] = arm.motion(pick)
-    picks.sort(key=lambda pick: pick.tier)
-    picks = [*picks, *untried]
-    picks = sorted(picks, key=lambda pick: pick.tier)[: options.top_k]
+            picks = _with_motions(arm, picks, options.top_k, until)
+    picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
     return _told(detection, picks, failures, asked, time.perf_counter() - start)
 
 
@@ -131,6 +128,17 @@ class _Pick:
         if self.plan is None:
             return 2
         return 3 if not self.plan.reachable else int(self.plan.trajectory is None)
+
+
+def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> list[_Pick]:
+    """The picks, in their order, up to `most` of those within reach with trajectories."""
+    tried: list[_Pick] = []
+    for pick in picks:
+        enough = sum(one.tier == 0 for one in tried) == most
+        if pick.line is None or enough or time.monotonic() > until:
+            break
+        tried.append(arm.motion(pick))
+    return [*tried, *picks[len(tried) :]]
 
 
 class _Arm:
