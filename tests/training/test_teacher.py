@@ -52,7 +52,7 @@ def test_a_teacher_scores_candidates_above_the_table(made_up_view, networks, vie
 
     # Hands of the view's own labels get the scores of the network itself.
     tried = tried_grasps(view, networks["hands"]).candidates
-    hands = hand_batch(view, tried, view.camera_position, networks["hands"].hand_points)
+    hands = hand_batch(view, tried, view.camera_position[None], networks["hands"].hand_points)
     with torch.inference_mode():
         own = torch.sigmoid(teacher.network(hands) / teacher.metadata.temperature).numpy()
     pairs = list(zip(labels.approach_index.tolist(), labels.contact_index.tolist(), strict=True))
