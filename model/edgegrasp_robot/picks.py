@@ -27,7 +27,9 @@ SPARE = 4  # more than asked for that are brought within reach, as some may get 
 LINE_STEP = 0.01  # metres between the poses of a straight way
 MAX_JUMP = 0.4  # radians that a joint turns between two of them at most
 OFF_LINE = 0.002  # metres that the hand leaves a straight way by at most
+SHARE = 0.99  # of the limits, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
+FINE = 0.002  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
 CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
 TRAVEL_COST = 0.02  # of a score, for each radian of the joint that turns the most
@@ -279,22 +281,26 @@ class _Arm:
     def _timed(
         self, scene: core.Scene, joints: Sequence[Float64], kind: str | None
     ) -> core.JointTrajectory | None:
-        """A path with times, from rest to rest, each row of which is checked."""
+        """A path with times, from rest to rest, checked all along."""
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         modes = SplineFittingMode
         mode = modes.Adaptive if kind is None else modes.Cubic
-        options = TOPPRAOptions(dt=DT, mode=mode)
+        options = TOPPRAOptions(dt=DT, mode=mode, velocity_scale=SHARE, acceleration_scale=SHARE)
         try:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
         except RuntimeError:
             return None
         way = None if kind is None else [self._robot.hand_pose(joints[at])[:3, 3] for at in (0, -1)]
+        before = np.array(joints[0])
         for row in np.array(found.positions):
-            if not self._within_limits(row) or scene.hasCollisions(row):
+            if not self._within_limits(row):
+                return None
+            if core.hasCollisionsAlongPath(scene, before, row, FINE):
                 return None
             if way is not None and _off_line(self._robot.hand_pose(row)[:3, 3], *way) > OFF_LINE:
                 return None
+            before = row
         return found
 
 
