@@ -71,11 +71,11 @@ def group(pixels: Pixels) -> Int64:
     component = np.arange(held.size)
     flat = np.nan_to_num(centre.reshape(-1, 3)).astype(np.float64)
     _join(np.concatenate(pairs)[order], component, flat.copy(), LIMITS.core, LIMITS.apart)
-    pixels = np.flatnonzero(held)
-    _, part, count = np.unique(component[pixels], return_inverse=True, return_counts=True)
-    flat = flat[pixels]
+    rows = np.flatnonzero(held)
+    _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
+    flat = flat[rows]
     mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
-    area = np.bincount(part, (points[..., 2].reshape(-1)[pixels] * footprint) ** 2)
+    area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
     large = np.flatnonzero((count >= LIMITS.smallest) & (area >= LIMITS.smallest_area))
     if len(large) == 0:
         return number
@@ -84,7 +84,7 @@ def group(pixels: Pixels) -> Int64:
     _, merged = connected_components(apart < LIMITS.same_centre, directed=False)
     of_part = np.full(len(count), UNKNOWN)
     of_part[large] = merged
-    number.reshape(-1)[pixels] = of_part[part]
+    number.reshape(-1)[rows] = of_part[part]
     return number
 
 
