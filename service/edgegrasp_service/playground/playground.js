@@ -33,8 +33,7 @@ function picture() {
 
 async function start() {
   state.grippers = await (await fetch("grippers.json")).json();
-  const names = Object.keys(state.grippers).map((name) => new Option(name, name));
-  $("gripper").replaceChildren(new Option("default", ""), ...names);
+  $("gripper").replaceChildren(new Option("default", ""), ...Object.keys(state.grippers).map((name) => new Option(name)));
   await listSamples();
   if (await listModels()) await openSample();
 }
@@ -204,10 +203,9 @@ function showAnswer() {
   $("summary").textContent = answer
     ? `${grasps.length} grasp${grasps.length === 1 ? "" : "s"} on ${answer.objects.filter((o) => o.best_score !== null).length} of ${answer.objects.length} objects`
     : "No grasps yet";
-  $("warnings").replaceChildren(...(answer?.warnings ?? []).map((text) => element("li", text)));
-  for (const { number, reason } of answer?.objects ?? []) {
-    if (reason) $("warnings").append(element("li", `Object ${number} has no good grasp: ${reason.replace("-", " ")}.`));
-  }
+  const failed = (answer?.objects ?? []).filter(({ reason }) => reason);
+  const told = failed.map(({ number, reason }) => `Object ${number} has no good grasp: ${reason.replace("-", " ")}.`);
+  $("warnings").replaceChildren(...[...(answer?.warnings ?? []), ...told].map((text) => element("li", text)));
   if (answer) $("count").max = Math.max(grasps.length, 12);
   $("grasps").replaceChildren(...grasps.map(line));
   const counts = Object.entries(answer?.counts ?? {});
@@ -216,7 +214,6 @@ function showAnswer() {
     row.append(element("td", name.replaceAll("_", " ")), element("td", count.toLocaleString("en")));
     return row;
   }));
-  $("merged").hidden = !answer?.objects.length;
   if (!Object.keys(state.target).length) state.objects = answer?.objects ?? [];
   showReasons();
   showTargets();
@@ -228,8 +225,8 @@ function line(grasp, row) {
   button.type = "button";
   const meter = Object.assign(element("meter", ""), { min: 0, max: 1, value: grasp.score });
   meter.style.setProperty("--tint", `#${colorOf(grasp.score).getHexString()}`);
-  const where = grasp.object === null ? "" : `object ${grasp.object}`;
-  button.append(element("span", row + 1), element("span", grasp.score.toFixed(3)), meter, element("small", where));
+  const cells = [row + 1, grasp.score.toFixed(3)].map((text) => element("span", text));
+  button.append(...cells, meter, element("small", grasp.object === null ? "" : `object ${grasp.object}`));
   button.addEventListener("click", () => choose(row));
   const item = element("li", "");
   item.append(button);
