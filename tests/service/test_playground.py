@@ -141,9 +141,9 @@ def test_objects_and_points_are_asked_for_and_answers_saved(
 ) -> None:
     page = open_page(real_server.http_url)
     open_touching(page, real_server.http_url)
+    number = int(page.locator("#grasps small").first.inner_text().removeprefix("object "))
     with page.expect_response(f"{real_server.http_url}/v1/grasps") as answered:
-        page.locator("#objects button").nth(1).click()
-    number = int(page.locator("#objects button").nth(1).inner_text())
+        page.locator("#objects").get_by_text(str(number), exact=True).click()
     assert {grasp["object"] for grasp in answered.value.json()["grasps"]} == {number}
     page.locator("#pick").click()
     stage = page.locator("#stage").bounding_box()
