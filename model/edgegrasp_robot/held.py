@@ -39,18 +39,17 @@ def can_leave(
     near = cKDTree(points[held]).query(points, distance_upper_bound=BESIDE)[0] <= BESIDE
     others = points[~near]
     tree = cKDTree(others) if len(others) else None
-    heights = scene.support and scene.support.heights(scene.frame.points(points[held])).min()
+    lowest = _lowest(scene, points[held])
     steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
     for share in np.arange(1, steps + 1) / steps:
         there = points[held] + share * way
         if tree is not None and np.isfinite(tree.query(there, distance_upper_bound=MEETS)[0]).any():
             return False
-        if scene.support is not None and (
-            scene.support.heights(scene.frame.points(there)).min() < heights - SINKS
-        ):
+        if _lowest(scene, there) < lowest - SINKS:
             return False
         for T_cloud_box, half in map(box_pose, collision.obstacles):
-            inside = np.abs(moved(np.linalg.inv(T_cloud_box), there)) < half
+            T_box_cloud = np.linalg.inv(T_cloud_box.astype(np.float64))
+            inside = np.abs(moved(T_box_cloud, there)) < half
             if inside.all(axis=1).any():
                 return False
     return True
@@ -63,6 +62,13 @@ def _held(grasp: Grasp, scene: Scene, gripper: Gripper) -> NDArray[np.bool_]:
     between = (x < gripper.pad_half_width) & (y < gripper.max_opening / 2)
     between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
     if grasp.object is None:
-        return between
+        return np.asarray(between)
     held: NDArray[np.bool_] = between | (scene.object_of_point == grasp.object)
     return held
+
+
+def _lowest(scene: Scene, points: NDArray[np.float64]) -> float:
+    """How high the lowest of points (N, 3), cloud frame, is over the support; 0 without one."""
+    if scene.support is None:
+        return 0.0
+    return float(scene.support.heights(scene.frame.points(points)).min())
