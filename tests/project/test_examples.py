@@ -145,7 +145,7 @@ def test_pick_and_place(start_server) -> None:
     pytest.importorskip("roboplan", reason="the extra robot is not installed")
     with start_server("--workers", "1", "--robots", "fr3") as server:
         shown = example("06_pick_and_place.py", server.grpc_address)
-    inside = re.search(r"(\d) of 4 things in the tray", shown)
+    inside = re.search(r"(\d) of 4 objects in the tray", shown)
     assert inside is not None
     assert int(inside[1]) >= 2
 
