@@ -84,7 +84,7 @@ def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> N
     best = here.grasps[0]
     contact = turn.apply(best.contact_point) + shift
     apart = [np.linalg.norm(grasp.contact_point - contact) for grasp in there.grasps]
-    assert min(apart) < 0.02  # voxels lie otherwise
+    assert min(apart) < 0.05  # voxels lie otherwise, and so do approach points
 
 
 @pytest.mark.parametrize("polar", [0.05, 0.4])
