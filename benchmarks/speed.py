@@ -96,7 +96,7 @@ def camera() -> dict[str, float]:
     """
     ours, seen = ModelCatalogue.load().get(""), demo_view()
     sent = {"the demo's scene": (seen.cloud, seen.camera_position)}
-    for scene in load_scenes(SHARED) if SHARED.exists() else []:
+    for scene in load_scenes([SHARED]) if SHARED.exists() else []:
         if len(scene.points) == math.prod(IMAGE):
             image = scene.points.reshape(*IMAGE, 3)
             sent[f"640 x 480, {scene.name}"] = image, np.zeros(3)
