@@ -7,8 +7,9 @@ from scipy.spatial import cKDTree
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision
 from edgegrasp_model.results import Grasp
+from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_robot.surroundings import box_pose, moved
+from edgegrasp_robot.surroundings import moved
 
 STEP = 0.005  # metres along the way
 BESIDE = 0.01  # metres: what is nearer than that to the held object touches it already

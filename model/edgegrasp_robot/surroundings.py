@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
+from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.robot import HAND, Robot, touching
 
@@ -127,18 +128,6 @@ def _near_robot(
 def _obstacle(row: int, box: Box | OrientedBox, T_base_cloud: Float64) -> Thing:
     T_cloud_box, half = box_pose(box)
     return f"collision.obstacles.{row}", core.Box(*(2 * half)), T_base_cloud @ T_cloud_box
-
-
-def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
-    """Pose T_cloud_box (4, 4) and half extents (3,) of a box."""
-    pose = np.eye(4)
-    if isinstance(box, OrientedBox):
-        pose[:3, :3] = Rotation.from_quat(box.quaternion).as_matrix()
-        pose[:3, 3] = box.center
-        return pose, np.array(box.half_extents)
-    low, high = np.array(box.min), np.array(box.max)
-    pose[:3, 3] = (low + high) / 2
-    return pose, (high - low) / 2
 
 
 def _support(scene: Scene, T_base_scene: Float64) -> Thing:

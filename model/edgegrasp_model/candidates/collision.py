@@ -28,9 +28,9 @@ TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to 
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet something, may meet it where nobody looked, or close on furniture.
+    """Which open hands meet the cloud, the support plane or an obstacle, or close on background.
 
-    They meet the cloud, the support plane or an obstacle.
+    In space that no camera saw they may meet something, and count as colliding too.
 
     Checked at the grasp, on the straight way in and on the way out, with each box of the hand
     grown by the margin on every side.
@@ -50,13 +50,13 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     if scene.obstacles is not None:
         hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
     free = np.flatnonzero(~hit)
-    hit[free] = closes_on_furniture(scene, T_cloud_hand[free], gripper)
+    hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
     depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
     hit[free] |= enters_unseen(depths, T_cloud_hand[free], gripper)
     return hit
 
 
-def closes_on_furniture(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
+def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
     """Which hands have a wall, a rim or another fixed thing between their fingers.  # (E,)."""
     fixed = scene.cloud.points[scene.object_of_point == FIXED]
     half, opening = gripper.pad_half_width, gripper.max_opening

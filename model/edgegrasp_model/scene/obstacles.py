@@ -34,12 +34,8 @@ class SolidBoxes:
         """Boxes of a request in the canonical frame."""
         centers, halves = np.empty((len(shapes), 3)), np.empty((len(shapes), 3, 3))
         for row, shape in enumerate(shapes):
-            if isinstance(shape, OrientedBox):
-                turn = Rotation.from_quat(shape.quaternion).as_matrix()  # T_cloud_box
-                centers[row], halves[row] = shape.center, np.diag(shape.half_extents) @ turn.T
-            else:
-                low, high = np.asarray(shape.min), np.asarray(shape.max)
-                centers[row], halves[row] = (low + high) / 2, np.diag((high - low) / 2)
+            T_cloud_box, half = box_pose(shape)
+            centers[row], halves[row] = T_cloud_box[:3, 3], np.diag(half) @ T_cloud_box[:3, :3].T
         return cls(frame.points(centers), frame.directions(halves))
 
     @classmethod
@@ -66,6 +62,18 @@ class SolidBoxes:
         """Distance (M,) of the corners from the middle."""
         radius: Float64 = np.linalg.norm(self.half, axis=(1, 2))
         return radius
+
+
+def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
+    """Pose T_cloud_box (4, 4) and half extents (3,) of a box."""
+    pose = np.eye(4)
+    if isinstance(box, OrientedBox):
+        pose[:3, :3] = Rotation.from_quat(box.quaternion).as_matrix()
+        pose[:3, 3] = box.center
+        return pose, np.array(box.half_extents)
+    low, high = np.array(box.min), np.array(box.max)
+    pose[:3, 3] = (low + high) / 2
+    return pose, (high - low) / 2
 
 
 def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = None) -> Float64:
