@@ -135,10 +135,11 @@ def select_points(
     if len(sent.points) and wanted:
         views = _views(sent, viewpoints, options)
         shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
-    support = choose_support(seen, inside, shown, options, warnings)
-    up = _up(options, support, None if viewpoints is None else shown)
     recognised = None if given else shown
     number = _given_numbers(sent) if recognised is None else recognised.number
+    named = number if sent.segment_ids is not None or shown is None else shown.number
+    support = choose_support(seen, inside, shown, named >= 0, options, warnings)
+    up = _up(options, support, None if viewpoints is None else shown)
     confidence = {} if recognised is None else dict(enumerate(recognised.confidence.tolist()))
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     plan = sent.points[:, :2].astype(np.float64)
@@ -307,10 +308,11 @@ def choose_support(
     seen: Seen,
     inside: Bools,
     shown: Segmentation | None,
+    objects: Bools,
     options: DetectOptions,
     warnings: list[str],
 ) -> Support | None:
-    """The support plane: given, or fitted to what the network calls a support."""
+    """The support plane: given, or fitted to what the network calls a support near objects."""
     request = options.support
     if request is None or len(seen.points) == 0:
         return None
@@ -329,7 +331,7 @@ def choose_support(
             found = None if plane is None else measured(seen, plane, request.distance)
             found = None if found is None or found.share < request.min_share else found
         else:
-            found = _fitted_support(seen, shown, up, rng)
+            found = _fitted_support(seen, shown, objects, up, rng)
         if found is None:
             warnings.append(
                 "no support plane is seen: objects are returned without one. Send support, or the "
@@ -343,15 +345,24 @@ def choose_support(
 
 
 def _fitted_support(
-    seen: Seen, shown: Segmentation | None, up: Float64 | None, rng: np.random.Generator
+    seen: Seen,
+    shown: Segmentation | None,
+    objects: Bools,
+    up: Float64 | None,
+    rng: np.random.Generator,
 ) -> Support | None:
     """The plane of the points that the network calls a support, those near objects above all."""
     assert shown is not None
     on = np.flatnonzero(shown.support > 0.5)
     on = on[:: max(len(on) // SUPPORT_POINTS, 1)]
     part = Seen(seen.points[on], seen.viewpoint)
-    weight = near_objects(part.points, seen.points[shown.number >= 0])
+    held = seen.points[objects]
+    weight = near_objects(part.points, held)
     plane = fit_plane(part, weight, rng, shown.up if up is None else up)
+    if plane is not None and len(held) and np.median(plane.heights(held)) < -PLANE_LIMITS.margin[1]:
+        # The top of something larger: they stand on what lies below it.
+        weight[plane.heights(part.points) > -PLANE_LIMITS.margin[1]] = 0.0
+        plane = fit_plane(part, weight, rng, shown.up if up is None else up)
     if plane is None:
         return None
     found = measured(part, plane, PLANE_LIMITS.margin[0])
