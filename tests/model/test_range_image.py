@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.scene.range_image import range_image
@@ -26,14 +27,11 @@ def test_pixels_hold_points_of_the_cloud_in_the_cameras_frame(seed: int) -> None
     points = cloud()
     moved = (turn.apply(points) + shift).astype(np.float32)
     image = range_image(moved, shift, None)
-    held = image.pixel >= 0
-    assert held.mean() > 0.95
-    pixels = image.points.reshape(-1, 3)[image.pixel[held]]
+    seen = image.points[np.isfinite(image.points[..., 2])]
     T = image.T_cloud_camera
-    in_cloud = pixels @ T[:3, :3].T + T[:3, 3]
-    apart = np.linalg.norm(in_cloud - moved[held], axis=1)
+    apart, _ = cKDTree(seen @ T[:3, :3].T + T[:3, 3]).query(moved)
     assert np.median(apart) < 0.004
-    assert np.percentile(apart, 99) < 0.05
+    assert np.percentile(apart, 95) < 0.01
 
 
 def test_up_is_upward_in_the_image() -> None:
@@ -63,4 +61,3 @@ def test_few_points_make_a_small_image_without_gaps() -> None:
 def test_points_that_make_no_picture_are_no_error(points: np.ndarray) -> None:
     image = range_image(points.astype(np.float32), np.zeros(3), None)
     assert image.points.shape[2] == 3
-    assert len(image.pixel) == len(points)

@@ -80,18 +80,19 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
             points = points.take(kept, axis=0)
             if len(points) == 0:
                 raise InvalidRequest("cloud", "holes only", "Send finite points among the holes.")
-    valid = _valid_points(points)
+    valid, low, high = _valid_points(points)
     row = np.arange(len(valid)) if kept is None else kept
     size = len(sent.points.reshape(-1, 3)) if isinstance(sent.points, np.ndarray) else len(valid)
     said = sent.warnings
-    near = _near_points(valid)
-    if near is not None:
+    if (high - low).max() > MAX_EXTENT:
+        near = _near_points(valid)
         said += (
             f"{len(valid) - len(near)} points are left out that lie more than "
             f"{MAX_EXTENT / 2:g} m from the middle of the cloud.",
         )
         valid, row = valid[near], row[near]
-    _check_place(valid, num_approach_points)
+        low, high = valid.min(axis=0), valid.max(axis=0)
+    _check_place(len(valid), float(np.maximum(-low, high).max()), num_approach_points)
     _floats("colors", sent.colors, size, None)
     return CheckedCloud(
         np.ascontiguousarray(valid, dtype=np.float32),
@@ -212,8 +213,10 @@ class Cloud:
     normals: Float32  # (N, 3)
 
 
-def _valid_points(cloud: object) -> NDArray[np.floating]:
-    """A caller's array (N, 3) float32 or float64, metres.
+def _valid_points(
+    cloud: object,
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+    """A caller's array (N, 3) float32 or float64, metres, and its low and high corner (3,).
 
     Raises:
         InvalidRequest: Wrong type, dtype or shape, no points, NaN or infinity.
@@ -228,7 +231,8 @@ def _valid_points(cloud: object) -> NDArray[np.floating]:
         raise InvalidRequest("cloud", f"dtype {cloud.dtype}", "Send float32 or float64 metres.")
     if len(cloud) == 0:
         raise InvalidRequest("cloud", "no points", "Send at least num_approach_points points.")
-    if not np.isfinite([(axis.min(), axis.max()) for axis in cloud.T]).all():
+    low, high = (np.array([end(axis) for axis in cloud.T]) for end in (np.min, np.max))
+    if not np.isfinite([low, high]).all():
         finite = _finite(cloud)
         bad = int(np.argmin(finite))
         raise InvalidRequest(
@@ -236,17 +240,15 @@ def _valid_points(cloud: object) -> NDArray[np.floating]:
             f"{int((~finite).sum())} points with NaN or infinity, the first in row {bad}",
             "Remove points without a finite x, y, z.",
         )
-    return cloud
+    return cloud, low, high
 
 
-def _near_points(points: NDArray[np.floating]) -> Int64 | None:
-    """Places of the points (N, 3) that are no stray readings far away; None: all of them.
+def _near_points(points: NDArray[np.floating]) -> Int64:
+    """Places of the points (N, 3) that are no stray readings far away.
 
     Raises:
         InvalidRequest: Most of the cloud has an extent that suggests millimetres.
     """
-    if max(float(axis.max()) - float(axis.min()) for axis in points.T) <= MAX_EXTENT:
-        return None
     distance = np.abs(points.astype(np.float64) - np.median(points, axis=0)).max(axis=1)
     bulk = 2 * float(np.median(distance))
     if bulk > MAX_EXTENT:
@@ -258,9 +260,8 @@ def _near_points(points: NDArray[np.floating]) -> Int64 | None:
     return np.flatnonzero(distance <= MAX_EXTENT / 2)
 
 
-def _check_place(points: NDArray[np.floating], num_approach_points: int) -> None:
-    """Refuse points (N, 3) too far from the origin, or fewer than approach points."""
-    furthest = max(float(np.abs(axis).max()) for axis in points.T)
+def _check_place(count: int, furthest: float, num_approach_points: int) -> None:
+    """Refuse points `furthest` metres from the origin, or fewer than approach points."""
     if furthest > MAX_DISTANCE:
         raise InvalidRequest(
             "cloud",
@@ -268,10 +269,10 @@ def _check_place(points: NDArray[np.floating], num_approach_points: int) -> None
             "Subtract an origin near the cloud from it and from every position of the request, and "
             "add it to the grasps.",
         )
-    if len(points) < num_approach_points:
+    if count < num_approach_points:
         raise InvalidRequest(
             "cloud",
-            f"{len(points)} points for num_approach_points = {num_approach_points}",
+            f"{count} points for num_approach_points = {num_approach_points}",
             "Send more points or lower options.num_approach_points.",
         )
 
@@ -309,8 +310,8 @@ class Voxels:
 
 def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
     """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
-    low = points.min(axis=0).astype(np.float64)
-    cells = [((points[:, d] - low[d]) / voxel_size).astype(np.int64) for d in range(3)]
+    # Axis by axis: three times as fast as all at once.
+    cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
     # Cube by cube: loops over hands then pass over many points that are far at a time.
     keys = np.zeros(len(points), dtype=np.int64)
     for cell in cells:

@@ -10,7 +10,6 @@ from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 SAMPLE = 6000  # points that decide what part of the view the image covers
 WIDEST = 1.2  # tangent of half of the widest view, 100 degrees
@@ -18,6 +17,7 @@ NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
 COARSE = 40  # cells across the view, which tell how densely points lie
 SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
+DENSE = 3  # points for each pixel, of which more show nothing new
 SURFACE = 0.02  # metres by which a nearer point of the same pixel hides another
 
 
@@ -27,7 +27,7 @@ class RangeImage(NamedTuple):
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
     footprint: float  # metres, width of a pixel at a depth of one metre
     T_cloud_camera: Float64  # (4, 4)
-    pixel: Int64  # (N,) row-major pixel of each point; -1: outside of the image
+    corner: Float64  # (2,) x / z and y / z of the upper left corner
 
 
 def range_image(
@@ -54,14 +54,14 @@ def range_image(
     width, height = (int(np.ceil(side / MULTIPLE)) * MULTIPLE for side in (high - low) / pixel_size)
     middle = (low + high) / 2
     image = np.full((height, width, 3), np.nan, dtype=np.float32)
-    pixel = np.full(len(points), -1, dtype=np.int64)
     corner = middle - pixel_size * np.array([width, height]) / 2
-    _render(points, viewpoint, turn, corner, pixel_size, image, pixel)
+    some = points[:: max(len(points) // (DENSE * width * height), 1)]
+    _render(some, viewpoint, turn, corner, pixel_size, image)
     filled = image.copy()
     _fill_holes(image, filled)
     T_cloud_camera = np.eye(4)
     T_cloud_camera[:3, :3], T_cloud_camera[:3, 3] = turn.T, viewpoint
-    return RangeImage(filled, float(pixel_size), T_cloud_camera, pixel)
+    return RangeImage(filled, float(pixel_size), T_cloud_camera, corner)
 
 
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
@@ -108,7 +108,6 @@ def _render(
     corner: Float64,
     pixel_size: float,
     image: Float32,
-    pixel: Int64,
 ) -> None:
     """Put into each pixel the point nearest to its middle, of the nearest surface."""
     height, width, _ = image.shape
@@ -116,8 +115,6 @@ def _render(
     best = np.full((height, width), np.inf, dtype=np.float32)
     for choosing in (False, True):
         for n in range(len(points)):
-            if choosing and pixel[n] < 0:
-                continue
             a = points[n, 0] - viewpoint[0]
             b = points[n, 1] - viewpoint[1]
             c = points[n, 2] - viewpoint[2]
@@ -132,7 +129,6 @@ def _render(
                 continue
             i, j = int(v), int(u)
             if not choosing:
-                pixel[n] = i * width + j
                 nearest[i, j] = min(nearest[i, j], z)
                 continue
             off = (u - j - 0.5) ** 2 + (v - i - 0.5) ** 2

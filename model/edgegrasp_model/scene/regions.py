@@ -86,7 +86,7 @@ def chosen_objects(
         options: objects, at and near.
         warnings: Gets what is asked for and not there.
     """
-    found = np.unique(number[number >= 0])
+    found = np.flatnonzero(np.bincount(number[number >= 0]))
     wanted, choice = found, options.objects
     if isinstance(choice, ObjectChoice):
         if unknown := sorted({*choice.include, *choice.exclude} - {*found.tolist()}):

@@ -26,7 +26,7 @@ from edgegrasp_model.scene.grouping import (
     joined,
 )
 from edgegrasp_model.scene.network import SceneNet, scene_features
-from edgegrasp_model.scene.range_image import range_image
+from edgegrasp_model.scene.range_image import NEAREST, range_image
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -120,7 +120,7 @@ def _segment_view(
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
     T_camera_cloud = np.linalg.inv(image.T_cloud_camera)
     arrays = pixels.points, of_pixel, pixels.classes, number, objects, support
-    _look_up(points, image.pixel, T_camera_cloud, image.points.shape[1], *arrays)
+    _look_up(points, T_camera_cloud, image.corner, 2 * image.footprint, *arrays)
     return Segmentation(number, objects, support, 1.0 / (1.0 + np.exp(-score)), turn @ seen_up)
 
 
@@ -241,9 +241,9 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
 @compiled("contract")
 def _look_up(
     points: Float32,
-    pixel: Int64,
     T_camera_cloud: Float64,
-    width: int,
+    corner: Float64,
+    pixel_size: float,
     seen: Float32,
     of_pixel: Int64,
     classes: Float32,
@@ -253,21 +253,28 @@ def _look_up(
 ) -> None:
     """Give each point what the nearest output pixel around it shows, if one is near enough."""
     rows, columns, _ = seen.shape
-    T = T_camera_cloud
+    T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
+    left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel
+    reach, growth = np.float32(REACH), np.float32(REACH_GROWTH)
     for n in range(len(points)):
-        if pixel[n] < 0:
-            continue
-        i, j = pixel[n] // width // 2, pixel[n] % width // 2
         a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if z < NEAREST:
+            continue
         x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
         y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
-        nearest = (REACH + REACH_GROWTH * z) ** 2
+        per_metre = per_pixel / z
+        u, v = x * per_metre - left, y * per_metre - top
+        if u < 0 or v < 0 or u >= columns or v >= rows:
+            continue
+        i, j = int(v), int(u)
+        nearest, row, column = (reach + growth * z) ** 2, -1, -1
         for k in range(i, min(i + 2, rows)):
             for m in range(j, min(j + 2, columns)):
                 dx, dy, dz = seen[k, m, 0] - x, seen[k, m, 1] - y, seen[k, m, 2] - z
                 away = dx * dx + dy * dy + dz * dz
                 if away < nearest:  # false for NaN
-                    nearest = away
-                    number[n] = of_pixel[k, m]
-                    objects[n], support[n] = classes[2, k, m], classes[1, k, m]
+                    nearest, row, column = away, k, m
+        if row >= 0:
+            number[n] = of_pixel[row, column]
+            objects[n], support[n] = classes[2, row, column], classes[1, row, column]
