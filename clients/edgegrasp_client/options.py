@@ -282,7 +282,7 @@ class DetectOptions(TypedDict, total=False):
     collision: Literal["avoid", "penalise", "ignore"] | Collision
     # the arm that is to execute a grasp; grasps within its reach come first; None: a hand alone
     robot: RobotArm | None
-    # lowest score returned
+    # lowest score returned; 0: all, however bad
     min_score: float
     # grasps returned at most
     top_k: int

@@ -635,7 +635,9 @@ class DetectOptions(Strict):
         description="the arm that is to execute a grasp; grasps within its reach come first; "
         "null: a hand alone",
     )
-    min_score: Number = Field(default=0.0, ge=0.0, le=1.0, description="lowest score returned")
+    min_score: Number = Field(
+        default=0.3, ge=0.0, le=1.0, description="lowest score returned; 0: all, however bad"
+    )
     top_k: Integer = Field(
         default=50, ge=1, le=MAX_CANDIDATES, description="grasps returned at most"
     )

@@ -128,51 +128,83 @@ def select_points(
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
-    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
-    given = sent.segment_ids is not None or by_rows or options.objects == "off"
-    shown = None
-    wanted = options.support is not None and (not given or isinstance(options.support, AutoPlane))
-    if len(sent.points) and wanted:
-        views = _views(sent, viewpoints, options)
-        shown = segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
-    recognised = None if given else shown
-    number = _given_numbers(sent) if recognised is None else recognised.number
-    named = number if sent.segment_ids is not None or shown is None else shown.number
+    shown = _segmentation(sent, viewpoints, options)
+    named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
     support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    confidence = {} if recognised is None else dict(enumerate(recognised.confidence.tolist()))
+    everywhere = np.ones(len(sent.points), dtype=np.float32)
+    height, margin = support.heights(seen) if support else (everywhere, 0 * everywhere)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
-    plan = sent.points[:, :2].astype(np.float64)
-    if support is not None:
-        height, margin = support.heights(seen)
-        labels[sent.row[np.abs(height) <= margin]] = SUPPORT
-        above = np.flatnonzero(height > margin)
-        sent, number, inside = sent.take(above), number[above], inside[above]
-        plan = support.plan(sent.points)
-        if recognised is not None:
-            likely = (recognised.object + recognised.support)[above] > LIKELY
-            number = with_risen(number, plan, height[above], margin[above], likely)
-            if math.isnan(support.spread):
-                number = with_clusters(number, plan)
-                confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
+    labels[sent.row[np.abs(height) <= margin]] = SUPPORT
+    above = np.flatnonzero(height > margin)
+    sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
-    if not given:
+    plan = support.plan(sent.points) if support else sent.points[:, :2].astype(np.float64)
+    number, confidence = _given_numbers(sent), dict[int, float]()
+    if not _objects_given(sent, options):
+        if shown is not None:
+            number, confidence = _recognised(shown, support, above, plan, height, margin)
         if support is None and (viewpoints is None or not (number >= 0).any()):
             # One object, without what it stands on; but no camera sees what touches it.
             close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
             number, confidence = np.full_like(number, FIXED if close else 0), {}
         number = without_long(number, sent.points, options.max_object_size)
+        if counts["above_support"] and not (inside & (number >= 0)).any():
+            warnings.append(
+                "no object was recognised above the support plane. Send objects: off to look for "
+                "grasps on everything above it."
+            )
     number = np.where(inside | (number == FIXED), number, UNKNOWN)
-    if counts["above_support"] and not given and not (number >= 0).any():
-        warnings.append(
-            "no object was recognised above the support plane. Send objects: off to look for "
-            "grasps on everything above it."
-        )
     labels[sent.row] = np.where(number >= 0, number, OBSTACLE)
     number = chosen_objects(number, sent, options, warnings)
     kept = near_objects_along(plan, number)
     near, number = sent.take(kept), number[kept]
     return SelectedPoints(near, number, support, up, viewpoints, labels, confidence)
+
+
+def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
+    """Whether the caller says what the objects are: by segments, by rows, or all is one."""
+    by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
+    return sent.segment_ids is not None or by_rows or options.objects == "off"
+
+
+def _segmentation(
+    sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
+) -> Segmentation | None:
+    """What the network says of the points; None where nothing of it is needed."""
+    needed = isinstance(options.support, AutoPlane) or not _objects_given(sent, options)
+    if len(sent.points) == 0 or options.support is None or not needed:
+        return None
+    views = _views(sent, viewpoints, options)
+    return segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
+
+
+def _recognised(
+    shown: Segmentation,
+    support: Support | None,
+    above: Int64,
+    plan: Float64,
+    height: Float32,
+    margin: Float32,
+) -> tuple[Int64, dict[int, float]]:
+    """The object (M,) of each point above the support, and the probability of each to be one.
+
+    Args:
+        shown: What N points show.
+        support: The plane.
+        above: (M,) which of them rise above it.
+        plan: (M, 2) places along it, metres.
+        height: (N,) metres over it.
+        margin: (N,) metres over it that belong to it.
+    """
+    number, confidence = shown.number[above], dict(enumerate(shown.confidence.tolist()))
+    if support is not None:
+        likely = (shown.object + shown.support)[above] > LIKELY
+        number = with_risen(number, plan, height[above], margin[above], likely)
+        if math.isnan(support.spread):
+            number = with_clusters(number, plan)
+            confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
+    return number, confidence
 
 
 def _known_up(options: DetectOptions) -> Float64 | None:
@@ -242,26 +274,20 @@ def build_scene(
         InvalidRequest: The cloud has too many voxels.
     """
     sent, support, viewpoints = selected.sent, selected.support, selected.viewpoints
+    obstacles = options.collision.obstacles
     if len(sent.points) == 0 or not (selected.number >= 0).any():
         counts |= {"voxels": 0, "kept": 0}
         return None
-    first_viewpoint = None if viewpoints is None else viewpoints[0]
-    frame = CanonicalFrame.of_scene(sent.points, selected.up, first_viewpoint)
-    canonical = frame.points(sent.points)
-    voxels = voxelise(canonical, voxel_size)
+    eye = None if viewpoints is None else viewpoints[0]
+    frame = CanonicalFrame.of_scene(sent.points, selected.up, eye)
+    voxels = voxelise(canonical := frame.points(sent.points), voxel_size)
     counts["voxels"] = len(voxels.size)
-    if counts["voxels"] > max_voxels:
-        raise _too_many_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
-    middles = voxels.mean(canonical)
-    near = Neighbors.within(middles)
-    kept = statistical_outlier_removal(near)
+    _check_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
+    cloud, kept = _clean_cloud(sent, canonical, voxels, frame, viewpoints)
     counts["kept"] = int(kept.sum())
-    if counts["kept"] < MIN_POINTS:
+    if cloud is None:
         return None
-    normals = estimate_normals(middles, near)[kept]
-    normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
-    cloud = Cloud(middles[kept], normals)
-    in_cloud = frame.points_in_cloud(middles)
+    in_cloud = frame.points_in_cloud(voxels.mean(canonical))
     number = voxels.commonest(selected.number)[kept]
 
     def allowed(region: Region | None) -> Bools:
@@ -271,15 +297,11 @@ def build_scene(
 
     approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
-    place = np.where(kept, np.cumsum(kept) - 1, -1)
-    point_of_row = np.full(sent.rows_sent, -1, dtype=np.int64)
-    point_of_row[sent.row] = place[voxels.voxel]
-    obstacles = options.collision.obstacles
     return Scene(
         frame=frame,
         cloud=cloud,
         points_in_cloud=in_cloud[kept],
-        point_of_row=point_of_row,
+        point_of_row=_point_of_row(sent, voxels, kept),
         approach_allowed=approach,
         contact_allowed=allowed(options.contact_region),
         object_of_point=number,
@@ -291,12 +313,48 @@ def build_scene(
     )
 
 
-def _too_many_voxels(
+def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
+    """The kept voxel (R,) that each row of the cloud as sent went into; -1: none."""
+    place = np.where(kept, np.cumsum(kept) - 1, -1)
+    point = np.full(sent.rows_sent, -1, dtype=np.int64)
+    point[sent.row] = place[voxels.voxel]
+    return point
+
+
+def _clean_cloud(
+    sent: CheckedCloud,
+    points: Float64,
+    voxels: Voxels,
+    frame: CanonicalFrame,
+    viewpoints: Float64 | None,
+) -> tuple[Cloud | None, Bools]:
+    """The voxels without outliers, and which (V,) these are; no cloud where too few are left.
+
+    Args:
+        sent: M points.
+        points: (M, 3) the same in the canonical frame, metres.
+        voxels: V of them.
+        frame: The canonical frame.
+        viewpoints: (W, 3) cloud frame.
+    """
+    middles = voxels.mean(points)
+    near = Neighbors.within(middles)
+    kept = statistical_outlier_removal(near)
+    if kept.sum() < MIN_POINTS:
+        return None, kept
+    normals = estimate_normals(middles, near)[kept]
+    normals = _turned_normals(sent, middles[kept], normals, kept, voxels, frame, viewpoints)
+    return Cloud(middles[kept], normals), kept
+
+
+def _check_voxels(
     count: int, most: int, voxel_size: float, sent: CheckedCloud, options: DetectOptions
-) -> InvalidRequest:
+) -> None:
+    if count <= most:
+        return
     size = " x ".join(f"{length:.2g}" for length in np.ptp(sent.points, axis=0))
     cropped = "no workspace" if options.workspace is None else "the workspace"
-    return InvalidRequest(
+    raise InvalidRequest(
         "options.workspace",
         f"{cropped}, which leaves {count} voxels of {1000 * voxel_size:g} mm in {size} m",
         "Send a workspace around the objects, or a support plane: at most "

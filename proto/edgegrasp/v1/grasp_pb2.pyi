@@ -611,7 +611,7 @@ class DetectOptions(_message.Message):
     max_object_size: _builtins.float
     """Longest side of an object, metres; longer ones are obstacles."""
     min_score: _builtins.float
-    """Lowest score returned."""
+    """Lowest score returned; 0: all, however bad."""
     top_k: _builtins.int
     """Grasps returned at most."""
     order: _builtins.str
