@@ -103,7 +103,7 @@ def test_edges_along_the_normal_or_deeper_than_the_fingers_define_no_grasp() -> 
 
 def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
     cloud = box_on_table()
-    found = detector().detect(cloud, ask(collision="avoid"))
+    found = detector().detect(cloud, ask(collision="avoid", min_score=0.0))
     poses = np.stack([grasp.T_cloud_hand for grasp in found.grasps])
     scored = detector().score(cloud, ask(), hand_poses=poses)
     assert len(scored.evaluations) == len(poses) > 20
