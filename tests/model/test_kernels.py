@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.candidates.collision import hits_cloud
 from edgegrasp_model.candidates.edge_grasps import crop_balls
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_kernels import (
@@ -16,15 +14,12 @@ from edgegrasp_model.hand_kernels import (
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
-from edgegrasp_model.hand_view import hand_views, reach_of
+from edgegrasp_model.hand_view import reach_of
 from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import nearest_in_ball
-from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.options import Collision
-from edgegrasp_model.scene.cloud import Cloud
 
 from . import oracles
-from .scenes import PANDA, SEED, TINY, RandomScene, random_hands
+from .scenes import PANDA, SEED, random_hands
 
 HANDS = random_hands(150, seed=0)
 grippers = pytest.mark.parametrize("name", ["panda", "robotiq-2f-85"])
@@ -46,22 +41,6 @@ def test_hands_see_the_points_within_reach(seed: int) -> None:
     for pair in both:
         np.testing.assert_allclose(pairs[0][pair], pairs[1][pair], rtol=0, atol=1e-6)
     assert list(pairs[0]) == sorted(pairs[0])
-
-
-def test_near_duplicates_fall_to_the_better_one() -> None:
-    T_cloud_tcp = np.repeat(np.eye(4, dtype=np.float32)[None], 4, axis=0)
-    T_cloud_tcp[1, :3, 3] = 0.005  # near the first
-    T_cloud_tcp[2, 0, 3] = 0.05  # elsewhere
-    T_cloud_tcp[3, :3, :3] = Rotation.from_euler("x", 1.0).as_matrix()  # turned away
-    order = np.array([1, 0, 2, 3])
-    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.01, 0.5, 10)
-    assert (kept.tolist(), dropped.tolist()) == ([1, 2, 3], [0])
-    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.01, 0.5, 2)
-    assert (kept.tolist(), dropped.tolist()) == ([1, 2], [0])
-    kept, dropped = non_max_suppression(T_cloud_tcp, order, 0.0, 0.0, 10)
-    assert (kept.tolist(), dropped.tolist()) == ([1, 0, 2, 3], [])
-    kept, _ = non_max_suppression(T_cloud_tcp, order, 0.01, 3.2, 10)  # however they are turned
-    assert kept.tolist() == [1, 2]
 
 
 def test_of_hands_that_are_near_each_other_the_first_is_kept() -> None:
@@ -124,18 +103,6 @@ def test_neighbours_of_points_in_one_place_are_any_of_them() -> None:
     assert (nearest[:, 1:] > nearest[:, :-1]).all()
 
 
-def test_no_point_and_no_hand() -> None:
-    nothing, some = (Cloud(points, points) for points in (cloud(0, 0), cloud(0)))
-    for here, hands in ((nothing, HANDS), (some, HANDS[:0])):
-        assert len(hand_views(here, hands, reach_of(PANDA)).row) == 0
-        assert not hits_cloud(here, hands, PANDA, Collision()).any()
-        assert len(hits_cloud(here, hands, PANDA, Collision())) == len(hands)
-    none = np.empty(0, dtype=np.int64)
-    crop = crop_balls(cloud(1), none, 0.05)
-    assert (len(crop.ball_rows), len(crop.ball_of_point)) == (0, 0)
-    assert nearest_in_ball(cloud(1), none, crop).shape == (0, 16)
-
-
 @given(seed=st.integers(0, SEED), radius=st.floats(0.02, 0.1))
 def test_balls_hold_all_points_within_their_radius(seed: int, radius: float) -> None:
     points, approach = cloud(seed, 120), np.array([3, 50, 4, 3])
@@ -147,39 +114,3 @@ def test_balls_hold_all_points_within_their_radius(seed: int, radius: float) -> 
     neighbors = nearest_in_ball(points, approach, crop)
     assert (crop.ball_of_point[neighbors] == crop.ball_of_point[:, None]).all()
     np.testing.assert_array_equal(neighbors[:, 0], np.arange(len(row)))
-
-
-@pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
-def test_a_fused_convolution_is_the_plain_one(architecture: str) -> None:
-    layer = build_network(TINY[architecture]).conv2
-    batch = RandomScene.of_seed(1).batch(torch.float32)
-    shape = (len(batch.points), 8) if architecture == "edgegrasp" else (len(batch.points), 3, 8)
-    features = torch.randn(*shape, generator=torch.Generator().manual_seed(1))
-    with torch.inference_mode():
-        fused = layer(features, batch)
-    plain = layer(features, batch).detach()  # gradients are recorded
-    assert plain.std() > 0.01
-    # Of vector neurons, a near tie may fall to another vector.
-    assert torch.isclose(fused, plain, rtol=1e-4, atol=1e-5).float().mean() > 0.99
-    assert not torch.equal(fused, plain)  # two ways, not one twice
-
-
-def test_fused_ball_features_are_the_plain_ones_and_finite_where_vectors_vanish() -> None:
-    layer = build_network(TINY["vn-edgegrasp"]).ball_feature
-    batch = RandomScene.of_seed(1).batch(torch.float32)
-    local = torch.randn(len(batch.points), 3, 36, generator=torch.Generator().manual_seed(1))
-    for values in (local, torch.zeros_like(local)):
-        with torch.inference_mode():
-            fused = layer(values, batch)
-        torch.testing.assert_close(fused, layer(values, batch).detach(), rtol=1e-3, atol=1e-5)
-
-
-def test_fused_vector_layers_score_as_the_plain_ones() -> None:
-    network, close = build_network(TINY["vn-edgegrasp"]), 0
-    for seed in range(6):
-        batch = RandomScene.of_seed(seed).batch(torch.float32)
-        with torch.inference_mode():
-            fused = network(batch)
-        plain = network(batch).detach()
-        close += torch.allclose(fused, plain, rtol=0, atol=0.05 * float(plain.std()))
-    assert close >= 5  # in a scene at most

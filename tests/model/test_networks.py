@@ -12,13 +12,11 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.networks import layers
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network
-from edgegrasp_model.networks.config import EDGEGRASP, EDGEGRASP_SMALL, HAND
-from edgegrasp_model.networks.layers import PackedLinear
+from edgegrasp_model.networks.config import EDGEGRASP_SMALL
 
 from .scenes import SEED, TINY, RandomScene
 
 architectures = pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
-libraries = pytest.mark.parametrize("onednn", [False, True], ids=["mkl", "onednn"])
 has_onednn = pytest.mark.skipif(
     not hasattr(torch.ops.mkldnn, "_reorder_linear_weight"), reason="PyTorch has no oneDNN here"
 )
@@ -27,10 +25,6 @@ has_onednn = pytest.mark.skipif(
 def scores(network: torch.nn.Module, batch: BallBatch) -> torch.Tensor:
     with torch.inference_mode():
         return network(batch)
-
-
-def random(seed: int, *shape: int) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
 @settings(max_examples=8)
@@ -61,6 +55,7 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
         torch.testing.assert_close(alone, here, rtol=0, atol=1e-10)
 
 
+@pytest.mark.parametrize("onednn", [False, pytest.param(True, marks=has_onednn)])
 @pytest.mark.parametrize(
     "config",
     [
@@ -69,7 +64,10 @@ def test_scores_depend_neither_on_point_order_nor_on_other_balls(architecture, s
     ],
     ids=["edgegrasp", "vn-edgegrasp"],
 )
-def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(config):
+def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(
+    config, onednn, monkeypatch
+):
+    monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
     network, scene = build_network(config), RandomScene.of_seed(3)
     together = scores(network, scene.batch(torch.float32))
     for ball in range(len(scene.approach_index)):
@@ -82,11 +80,13 @@ def test_a_score_is_the_same_to_the_last_bit_whatever_is_scored_with_it(config):
 @architectures
 def test_neither_single_precision_nor_recorded_gradients_change_a_score(architecture):
     network, scene = build_network(TINY[architecture]), RandomScene.of_seed(3)
-    single = scores(network, scene.batch(torch.float32))
-    assert single.dtype == torch.float32
+    batch = scene.batch(torch.float32)
+    single = scores(network, batch)  # by fused loops
+    in_one_place = replace(batch, points=0 * batch.points, normals=0 * batch.normals)
+    assert scores(network, in_one_place).isfinite().all()
     network.double()
     exact = scores(network, scene.batch())
-    torch.testing.assert_close(single.double(), exact, rtol=0, atol=1e-5)
+    torch.testing.assert_close(single.double(), exact, rtol=0, atol=0.01 * float(exact.std()))
     recorded = network(scene.batch()).detach()
     torch.testing.assert_close(recorded, exact, rtol=0, atol=1e-12)
 
@@ -116,44 +116,3 @@ def test_one_seed_makes_one_network_and_leaves_the_global_stream_alone():
 def test_a_batch_without_grasps_has_no_scores(architecture):
     empty = replace(RandomScene.of_seed(1), edges=np.empty((0, 2), dtype=np.int64))
     assert scores(build_network(TINY[architecture]), empty.batch(torch.float32)).shape == (0,)
-
-
-@has_onednn
-@libraries
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_row_of_a_product_is_the_same_wherever_it_is(monkeypatch, onednn, threads):
-    monkeypatch.setattr(layers, "onednn_is_faster", lambda: onednn)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        for inputs, outputs in ((3, 32), (138, 512), (512, 1024)):
-            values = random(3, 256, inputs)
-            with torch.inference_mode():
-                product = PackedLinear(random(1, outputs, inputs), random(2, outputs))
-                whole = product(values)
-                for shift in (1, 7, 100):
-                    moved = product(torch.roll(values, shift, dims=0))
-                    assert torch.equal(torch.roll(moved, -shift, dims=0), whole)
-    finally:
-        torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize(
-    ("config", "change"),
-    [
-        (EDGEGRASP, {"architecture": "gpd"}),
-        (EDGEGRASP, {"conv_widths": (32, 64)}),
-        (EDGEGRASP, {"global_widths_2": (8, 0)}),
-        (EDGEGRASP, {"classifier_widths": ()}),
-        (EDGEGRASP, {"classifier_widths": (8.5,)}),
-        (EDGEGRASP, {"hand_widths": (8,)}),
-        (EDGEGRASP, {"hand_points": 0}),
-        (EDGEGRASP, {"k": 0}),
-        (EDGEGRASP, {"crop_radius": 50.0}),
-        (HAND, {"conv_widths": (8, 8, 8)}),
-        (HAND, {"hand_widths": ()}),
-    ],
-)
-def test_a_config_out_of_range_is_refused_by_field(config, change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        replace(config, **change)
