@@ -90,10 +90,12 @@ def test_files_of_depths(client, tmp_path) -> None:
     tenths = np.round(depth_image()["depth"] * 10000).astype(np.uint16)
     Image.fromarray(tenths).save(tmp_path / "depth.png")
     np.save(tmp_path / "depth.npy", tenths[..., None])
+    np.save(tmp_path / "metres.npy", (tenths / 10000).astype(np.float32))
     expected = contacts(client.detect(depth_images=[depth_image(depth=tenths / 10000)]))
-    for file in (str(tmp_path / "depth.png"), tmp_path / "depth.npy"):
-        image = depth_image(depth=file, depth_scale=0.0001)
-        np.testing.assert_allclose(contacts(client.detect(depth_images=[image])), expected)
+    for name, scale in (("depth.png", 0.0001), ("depth.npy", 0.0001), ("metres.npy", 1.0)):
+        image = depth_image(depth=tmp_path / name, depth_scale=scale)
+        found = contacts(client.detect(depth_images=[image]))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_edges_are_scored_in_their_order(client, cloud) -> None:

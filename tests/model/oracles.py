@@ -12,15 +12,6 @@ def in_hand(points: np.ndarray, T_cloud_hand: np.ndarray) -> np.ndarray:
     return shifted @ T_cloud_hand[:, :3, :3].astype(np.float64)
 
 
-def points_in_hand_boxes(
-    points: np.ndarray, T_cloud_hand: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Hand (P,), row (P,) and position (P, 3) of the points between two corners of hand frames."""
-    position = in_hand(points, T_cloud_hand)
-    hand, row = np.nonzero(((position > low) & (position < high)).all(axis=2))
-    return hand, row, position[hand, row]
-
-
 def any_point_in_boxes(
     points: np.ndarray, T_cloud_hand: np.ndarray, boxes: np.ndarray
 ) -> np.ndarray:

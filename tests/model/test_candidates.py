@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import (
     MAX_SHIFT,
@@ -156,13 +155,3 @@ def test_directions_are_ways_the_hand_moves(request_, angles, allowed) -> None:
     tilt = np.radians(angles)  # from straight down toward x
     ways = np.stack([np.sin(tilt), 0 * tilt, -np.cos(tilt)], axis=1)
     assert allowed_directions(ways, request_, UP).tolist() == [bool(value) for value in allowed]
-
-
-def test_cones_are_given_in_the_frame_of_the_cloud_and_presets_by_up() -> None:
-    turn = Rotation.from_euler("xyz", [1.0, 2.0, 3.0])
-    x, y, z = turn.inv().apply(DOWN[0])
-    cone = ApproachDirection(cones=(Cone(direction=(x, y, z), max_angle=0.01),))
-    assert allowed_directions(DOWN, cone, UP, turn.apply).tolist() == [True]
-    assert allowed_directions(DOWN, cone, UP).tolist() == [False]
-    sideways = ApproachDirection(preset="side")
-    assert allowed_directions(DOWN, sideways, [1.0, 0.0, 0.0]).tolist() == [True]

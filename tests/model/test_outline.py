@@ -10,11 +10,9 @@ from edgegrasp_model.candidates.outline import (
     outline_grasps,
     outlines,
 )
-from edgegrasp_model.hand_kernels import free_way
-from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import DetectOptions, SupportPlane
 
-from .scenes import PANDA, detector, random_hands
+from .scenes import PANDA, detector
 
 FLOOR = SupportPlane(normal=(0.0, 0.0, 1.0), offset=0.0)
 TOP = 0.3  # metres
@@ -132,50 +130,3 @@ def test_hands_also_come_from_a_camera_at_the_side() -> None:
     above = viewpoint * (0, 0, 1) + (0.05, 0, 0)
     _, none = grasps_of(level(0.05, 0.12, TOP), above, view=1)
     assert len(none) == 0  # it sees what is seen from above
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_spread_of_a_surface_is_that_of_the_points_not_far_below(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points = (rng.uniform(-0.04, 0.04, (400, 3)) * (1, 1, 0.3)).astype(np.float32)
-    toward = rng.normal(size=(400, 3))
-    toward = (toward / np.linalg.norm(toward, axis=1, keepdims=True)).astype(np.float32)
-    rows = np.arange(0, 400, 3)
-    least, offset, deviation = level_spread(points, rows, toward[rows], 0.016, 0.006)
-    np.testing.assert_allclose(np.linalg.norm(least, axis=1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(np.einsum("md,md->m", least, toward[rows]), 0.0, atol=1e-5)
-    for m, row in enumerate(rows):
-        away, up = points - points[row], toward[row]
-        near = away[(np.linalg.norm(away, axis=1) < 0.016) & (away @ up > -0.006)]
-        flat = near - np.outer(near @ up, up)
-        variances = np.linalg.eigvalsh(np.cov(flat.T, bias=True) + np.outer(up, up))
-        assert deviation[m] == pytest.approx(np.sqrt(variances[0]), abs=1e-5)
-        assert -flat.mean(axis=0) @ least[m] == pytest.approx(offset[m], abs=1e-6)
-        assert offset[m] >= 0
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_free_way_ends_at_the_first_point_ahead_of_a_box(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-0.15, 0.15, (300, 3)).astype(np.float32)
-    hands, boxes = random_hands(20, seed), PANDA.boxes(0.08)
-    way = free_way(points, hands, boxes, 0.05)
-    for pose, found in zip(hands.astype(np.float64), way, strict=True):
-        own = (points - pose[:3, 3]) @ pose[:3, :3]
-        ends = [np.inf]
-        for low, high in boxes:
-            ahead = ((own > low - (0, 0, 0.05)) & (own < high + np.array([0, 0, 9]))).all(axis=1)
-            ends += (own[ahead, 2] - high[2]).tolist()
-        assert found == pytest.approx(min(ends), abs=1e-6)
-
-
-def test_a_strip_of_surface_ends_at_a_gap() -> None:
-    x = np.array([-0.002, 0.0, 0.004, 0.009, 0.020, 0.024])
-    points = np.stack([-x, 0 * x, 0 * x], axis=1).astype(np.float32)  # into the object is -x
-    points = np.concatenate([points, np.float32([[0.005, 0.02, 0.0], [0.005, 0.0, -0.02]])])
-    frame = np.float32([[[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, -1]]])
-    rows, first, last = np.arange(len(points)), np.array([0]), np.array([len(points)])
-    for gap, end in ((0.007, 0.009), (0.012, 0.024)):
-        strip = np.float32([0.01, 0.08, 0.006, gap])
-        extent = extents_across(points, rows, first, last, frame, strip)
-        np.testing.assert_allclose(extent, [[-0.002, end]], atol=1e-6)
