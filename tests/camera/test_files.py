@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from tests.cloud_files import lzf_literals, npy, npz, pcd, ply, xyz
 
 from edgegrasp_camera.files import read_file, read_png
 from edgegrasp_model.errors import InvalidRequest
@@ -18,58 +19,6 @@ from edgegrasp_service.errors import PayloadTooLarge
 POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
 MANY = 1000
 MIB = 2**20
-
-
-def npy(array: np.ndarray, **options: object) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array, **options)
-    return stream.getvalue()
-
-
-def npz(**arrays: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    return stream.getvalue()
-
-
-def ply(points: np.ndarray, encoding: str = "binary_little_endian", promised: int = -1) -> bytes:
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding, "<")
-    record = np.dtype([("x", order + "f4"), ("c", "u1"), ("y", order + "f4"), ("z", order + "f4")])
-    rows = np.zeros(len(points), record)
-    for column, axis in enumerate("xyz"):
-        rows[axis] = points[:, column]
-    count = promised if promised >= 0 else len(points)
-    header = (
-        f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {count}\nproperty float x\n"
-        "property uchar c\nproperty float y\nproperty float z\nelement face 1\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
-    if encoding == "ascii":
-        lines = [" ".join(repr(value.item()) for value in row) for row in rows]
-        return (header + "\n".join(lines) + "\n3 0 1 2\n").encode()
-    return header.encode() + rows.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
-
-
-def pcd(points: np.ndarray, encoding: str = "binary", promised: int = -1) -> bytes:
-    record = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("n", "<f4", 2), ("i", "<u1")])
-    rows = np.zeros(len(points), record)
-    for column, axis in enumerate("xyz"):
-        rows[axis] = points[:, column]
-    count = promised if promised >= 0 else len(points)
-    header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z n i\nSIZE 4 4 4 4 1\nTYPE F F F F U\n"
-        f"COUNT 1 1 1 2 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\n"
-        f"DATA {encoding}\n"
-    )
-    if encoding == "ascii":
-        lines = [f"{x!r} {y!r} {z!r} 0 0 0" for x, y, z in points.astype(float).tolist()]
-        return (header + "\n".join(lines) + "\n").encode()
-    return header.encode() + rows.tobytes()
-
-
-def xyz(points: np.ndarray) -> bytes:
-    rows = [f"{x!r} {y!r}\t{z!r}" for x, y, z in points.astype(float).tolist()]
-    return ("# x y z\n\n" + "\n".join(rows) + "\n").encode()
 
 
 GOOD_FILES = {
@@ -83,6 +32,7 @@ GOOD_FILES = {
     "ply, text": ply(POINTS, "ascii"),
     "pcd": pcd(POINTS),
     "pcd, text": pcd(POINTS, "ascii"),
+    "pcd, compressed": pcd(POINTS, "binary_compressed"),
     "xyz": xyz(POINTS),
 }
 
@@ -170,10 +120,7 @@ def test_compressed_pcd_with_sizes_that_lie() -> None:
 
 
 def compressed_pcd(header: str, columns: bytes, packed: bytes | None = None) -> bytes:
-    packed = b"".join(
-        bytes([len(columns[start : start + 32]) - 1]) + columns[start : start + 32]
-        for start in range(0, len(columns), 32)
-    ) if packed is None else packed  # fmt: skip
+    packed = lzf_literals(columns) if packed is None else packed
     sizes = struct.pack("<II", len(packed), len(columns))
     return header.encode("latin-1") + b"DATA binary_compressed\n" + sizes + packed
 

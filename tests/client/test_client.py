@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cloud_files import ply
 
 import edgegrasp_client
 from edgegrasp_client import (
@@ -41,10 +42,7 @@ def test_both_transports_give_the_same_values(dummy_server, make_client, cloud) 
 def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", cloud)
     np.savez(tmp_path / "a.npz", points=cloud)
-    header = "ply\nformat ascii 1.0\nelement vertex 500\n"
-    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
-    rows = "\n".join(" ".join(map(repr, row)) for row in cloud.tolist())
-    (tmp_path / "a.PLY").write_text(header + rows)
+    (tmp_path / "a.PLY").write_bytes(ply(cloud, "ascii"))
     expected = client.detect(cloud)
     for given in (cloud.astype(np.float64), np.asfortranarray(cloud), cloud[::-1][::-1]):
         assert_same(client.detect(given), expected)

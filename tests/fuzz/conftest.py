@@ -1,7 +1,6 @@
 """Fuzzing: short in `make test`, long in `make fuzz` (--hypothesis-profile=fuzz)."""
 
 import base64
-import io
 import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 from hypothesis import strategies as st
+from tests.cloud_files import npy, npz, pcd, ply, xyz
 
 given = hypothesis.given  # `make fuzz` sets the profile with many examples
 
@@ -27,66 +27,21 @@ WORDS = [
 ]  # fmt: skip
 
 
-def npy(array: np.ndarray, order: str = "C") -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, np.asarray(array, order=order))
-    return stream.getvalue()
-
-
-def npz(compressed: bool, **arrays: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(stream, **arrays)
-    return stream.getvalue()
-
-
-def ply(encoding: str) -> bytes:
-    header = f"ply\nformat {encoding} 1.0\ncomment a\nelement vertex {len(POINTS)}\n"
-    header += "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
-    header += "property uchar green\nproperty uchar blue\nend_header\n"
-    if encoding == "ascii":
-        rows = "\n".join(f"{x} {y} {z} 1 2 3" for x, y, z in POINTS.tolist())
-        return header.encode() + rows.encode()
-    order = "<" if "little" in encoding else ">"
-    record = np.zeros(len(POINTS), [(axis, f"{order}f4") for axis in "xyz"] + [("c", "u1", 3)])
-    for column, axis in enumerate("xyz"):
-        record[axis] = POINTS[:, column]
-    return header.encode() + record.tobytes()
-
-
-def pcd(encoding: str, height: int = 1) -> bytes:
-    header = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-    header += f"WIDTH {len(POINTS) // height}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\n"
-    header += f"POINTS {len(POINTS)}\nDATA {encoding}\n"
-    if encoding == "ascii":
-        rows = "\n".join(f"{x} {y} {z} 255" for x, y, z in POINTS.tolist())
-        return header.encode() + rows.encode()
-    record = np.concatenate([POINTS, np.zeros((len(POINTS), 1), np.float32)], axis=1)
-    if encoding == "binary":
-        return header.encode() + record.tobytes()
-    plain = np.ascontiguousarray(record.T).tobytes()
-    packed = lzf_literals(plain)
-    sizes = np.array([len(packed), len(plain)], "<u4").tobytes()
-    return header.encode() + sizes + packed
-
-
-def lzf_literals(plain: bytes) -> bytes:
-    """LZF without a back reference: runs of up to 32 bytes, each after its length less one."""
-    runs = (plain[start : start + 32] for start in range(0, len(plain), 32))
-    return b"".join(bytes([len(run) - 1]) + run for run in runs)
-
-
 FILES: dict[str, list[bytes]] = {
     "npy": [
-        npy(POINTS), npy(POINTS.astype(">f8")), npy(POINTS, "F"), npy(POINTS.reshape(5, 8, 3)),
-        npy(np.zeros((0, 3))), npy(np.zeros(3, "i4,f8")),
+        npy(POINTS), npy(POINTS.astype(">f8")), npy(np.asfortranarray(POINTS)),
+        npy(POINTS.reshape(5, 8, 3)), npy(np.zeros((0, 3))), npy(np.zeros(3, "i4,f8")),
     ],
     "npz": [
-        npz(False, points=POINTS), npz(True, points=POINTS, normals=POINTS),
-        npz(True, points=POINTS, segment_ids=np.arange(40), colors=POINTS),
+        npz(False, points=POINTS), npz(points=POINTS, normals=POINTS),
+        npz(points=POINTS, segment_ids=np.arange(40), colors=POINTS),
     ],
-    "ply": [ply("ascii"), ply("binary_little_endian"), ply("binary_big_endian")],
-    "pcd": [pcd("ascii"), pcd("binary"), pcd("binary", 4), pcd("binary_compressed")],
-    "xyz": ["\n".join(f"{x} {y} {z}" for x, y, z in POINTS.tolist()).encode(), b"# c\n0 0 0\n"],
+    "ply": [ply(POINTS, kind) for kind in ("ascii", "binary_little_endian", "binary_big_endian")],
+    "pcd": [
+        *(pcd(POINTS, kind) for kind in ("ascii", "binary", "binary_compressed")),
+        pcd(POINTS, height=4),
+    ],
+    "xyz": [xyz(POINTS), b"# c\n0 0 0\n"],
 }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import pytest
 from benchmarks.dummy import DummyCatalogue
 from hypothesis import strategies as st
 from PIL import Image
+from tests.cloud_files import npy
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.options import DetectOptions
@@ -37,7 +38,6 @@ from .conftest import (
     files,
     given,
     mutated,
-    npy,
 )
 
 MAX_POINTS = 5000

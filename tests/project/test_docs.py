@@ -21,6 +21,7 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cloud_files import ply
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
@@ -182,10 +183,9 @@ def write_what_commands_read(folder: Path) -> None:
     """The files of a checkout in which `make demo` was run, as far as the pages name them."""
     (folder / "examples").symlink_to(ROOT / "examples")
     (folder / "demo_output").mkdir()
-    rows = "".join(f"{x} {y} 0.5\n" for x in range(20) for y in range(20))
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex 400\n{axes}end_header\n"
-    (folder / "demo_output" / "scene.ply").write_text(head + rows)
+    x, y = np.divmod(np.arange(400), 20)
+    level = np.stack([x, y, np.full(400, 0.5)], axis=1)
+    (folder / "demo_output" / "scene.ply").write_bytes(ply(level))
 
 
 def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> None:

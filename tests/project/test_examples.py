@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cloud_files import ply
 
 from edgegrasp_client.conversions import pose_from_moveit_grasp, read_isaac_grasps
 
@@ -22,10 +23,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def cloud_file(tmp_path: Path) -> Path:
     rng = np.random.default_rng(0)
     path = tmp_path / "cloud.ply"
-    rows = "\n".join(f"{x:.4f} {y:.4f} {z:.4f}" for x, y, z in rng.uniform(0.0, 0.2, (500, 3)))
-    header = "ply\nformat ascii 1.0\nelement vertex 500\n"
-    columns = "property float x\nproperty float y\nproperty float z\nend_header\n"
-    path.write_text(header + columns + rows + "\n")
+    path.write_bytes(ply(rng.uniform(0.0, 0.2, (500, 3))))
     return path
 
 

@@ -1,0 +1,67 @@
+"""Clouds as the bytes of files, written plainly: what readers are tested with."""
+
+import io
+import struct
+
+import numpy as np
+
+PLY = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def npy(array: np.ndarray, **options: object) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, **options)
+    return stream.getvalue()
+
+
+def npz(compressed: bool = True, **arrays: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+    return stream.getvalue()
+
+
+def ply(points: np.ndarray, encoding: str = "binary_little_endian", promised: int = -1) -> bytes:
+    """Points (N, 3) float32 with black colours, and one face."""
+    fields = {"x": "f4", "red": "u1", "y": "f4", "z": "f4", "green": "u1", "blue": "u1"}
+    order = PLY.get(encoding, "<")
+    rows = np.zeros(len(points), [(name, order + kind) for name, kind in fields.items()])
+    rows["x"], rows["y"], rows["z"] = points.T
+    count = promised if promised >= 0 else len(points)
+    header = f"ply\nformat {encoding} 1.0\ncomment none\nelement vertex {count}\n"
+    for name, kind in fields.items():
+        header += f"property {'float' if kind == 'f4' else 'uchar'} {name}\n"
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    if encoding == "ascii":
+        lines = [" ".join(repr(value.item()) for value in row) for row in rows]
+        return (header + "\n".join(lines) + "\n3 0 1 2\n").encode()
+    return header.encode() + rows.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
+
+
+def pcd(points: np.ndarray, encoding: str = "binary", promised: int = -1, height: int = 1) -> bytes:
+    """Points (N, 3) float32 with two numbers and a black colour each."""
+    count = promised if promised >= 0 else len(points)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z n rgb\nSIZE 4 4 4 4 4\nTYPE F F F F U\n"
+        f"COUNT 1 1 1 2 1\nWIDTH {count // height}\nHEIGHT {height}\n"
+        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {encoding}\n"
+    ).encode()
+    if encoding == "ascii":
+        lines = [f"{x!r} {y!r} {z!r} 0 0 0\n" for x, y, z in points.astype(float).tolist()]
+        return header + "".join(lines).encode()
+    rows = np.pad(points.astype("<f4"), ((0, 0), (0, 3)))
+    if encoding == "binary":
+        return header + rows.tobytes()
+    plain = np.ascontiguousarray(rows.T).tobytes()
+    packed = lzf_literals(plain)
+    return header + struct.pack("<II", len(packed), len(plain)) + packed
+
+
+def lzf_literals(plain: bytes) -> bytes:
+    """LZF without a back reference: runs of up to 32 bytes, each after its length less one."""
+    runs = (plain[start : start + 32] for start in range(0, len(plain), 32))
+    return b"".join(bytes([len(run) - 1]) + run for run in runs)
+
+
+def xyz(points: np.ndarray) -> bytes:
+    rows = [f"{x!r} {y!r}\t{z!r}" for x, y, z in points.astype(float).tolist()]
+    return ("# x y z\n\n" + "\n".join(rows) + "\n").encode()
