@@ -42,11 +42,3 @@ def test_a_new_option_reaches_the_message_the_client_and_the_page(
     assert int(written[1]) > max(field.number for field in DetectMessage.DESCRIPTOR.fields)
     assert "    # newtons; None: any\n    force: float | None\n" in script.client_types()
     assert "| `force` | number or null | `double` |" in script.page()
-
-
-def test_numbers_of_fields_are_those_that_were_promised(script: ModuleType) -> None:
-    """Number 10 was another field's once."""
-    proto = script.proto()
-    assert "  reserved 10;\n" in proto
-    assert "  optional double min_score = 11;\n" in proto
-    assert "  GripperChoice gripper = 14;\n" in proto

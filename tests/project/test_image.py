@@ -1,12 +1,25 @@
-"""The container image: what its start script does on processors that this machine is not."""
+"""The container image: its libraries, and its start script on processors of other machines."""
 
 import os
+import re
+import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
 
-DOCKER = Path(__file__).parents[2] / "docker"
+ROOT = Path(__file__).parents[2]
+
+
+def test_it_has_the_libraries_of_torch_and_not_those_of_open3d() -> None:
+    script = (ROOT / "scripts" / "system_packages.sh").read_text()
+    table = script.partition("<<'LIBRARIES'\n")[2].partition("LIBRARIES")[0]
+    looked_for = {line.split()[1] for line in table.splitlines()}
+    dockerfile = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+    lists = re.findall(r"apt-get (?:install|download) ([^&]*)", dockerfile)
+    installed = {word for words in lists for word in shlex.split(words)}
+    assert len(looked_for) == 5
+    assert looked_for & installed == {"libgomp1"}
 
 
 @pytest.mark.parametrize(
@@ -32,7 +45,7 @@ def test_the_server_starts_with_the_loops_of_its_processor(
         (tmp_path / name).chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CPU_NAME"}
     started = subprocess.run(
-        ["/bin/sh", str(DOCKER / "start.sh"), "--workers", "2"],
+        ["/bin/sh", str(ROOT / "docker" / "start.sh"), "--workers", "2"],
         env={**environment, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
