@@ -22,8 +22,8 @@ from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scen
 from edgegrasp_model.scene.segment import look
 from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
 
-UP_SHARE = 0.5  # of the images whose `up` the network is told
-UP_ERROR = 0.02  # radians, standard deviation of what it is told
+UP_SHARE = 0.5  # of the images whose `up` the network is given
+UP_ERROR = 0.02  # radians, standard deviation of the `up` that it is given
 BATCH = 16
 SIZES, SIZE_SHARES = ((240, 320), (192, 256), (144, 192)), (0.5, 0.3, 0.2)  # pixels, of batches
 CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
@@ -83,38 +83,38 @@ def image_points(image: SceneImage) -> NDArray[np.float32]:
 
 
 def make_batch(
-    images: Sequence[SceneImage], rng: np.random.Generator, told: bool | None = None
+    images: Sequence[SceneImage], rng: np.random.Generator, up_known: bool | None = None
 ) -> SceneBatch:
     """Features and targets; every other image is mirrored.
 
     Args:
         images: Of one size.
         rng: Of what differs each time.
-        told: Whether the network gets `up`; None: at random, and images mirrored too.
+        up_known: whether the network gets `up`; None: at random, and images are mirrored too.
     """
-    size = SIZES[0] if told is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
-    rows = [_example(image, rng, told, size) for image in images]
+    size = SIZES[0] if up_known is not None else SIZES[int(rng.choice(len(SIZES), p=SIZE_SHARES))]
+    rows = [_example(image, rng, up_known, size) for image in images]
     return SceneBatch(*(torch.from_numpy(np.stack(each)) for each in zip(*rows, strict=True)))
 
 
 def _example(
-    image: SceneImage, rng: np.random.Generator, told: bool | None, size: tuple[int, int]
+    image: SceneImage, rng: np.random.Generator, up_known: bool | None, size: tuple[int, int]
 ) -> tuple[NDArray[np.generic], ...]:
     points, label = image_points(image), image.label.astype(np.int64)
     centre, true_up = image.centre, image.up.astype(np.float64)
-    full, closer = label.shape, told is None and rng.random() < CLOSER_SHARE
+    full, closer = label.shape, up_known is None and rng.random() < CLOSER_SHARE
     step = 1.0 if closer else full[1] / size[1]
     corner = [int(rng.integers(full[d] - size[d] + 1)) if closer else 0 for d in (0, 1)]
     row, column = (corner[d] + ((np.arange(size[d]) + 0.5) * step).astype(np.int64) for d in (0, 1))
     points, label = points[row][:, column], label[row][:, column]
-    if told is None and rng.random() < CROPPED_SHARE:
+    if up_known is None and rng.random() < CROPPED_SHARE:
         points = _cropped(points, label, image.plane, rng)
     for turn, flip in ((_MIRROR, np.s_[:, ::-1]), (_HALF_TURN, np.s_[::-1, ::-1])):
-        if told is None and rng.random() < 0.5:
+        if up_known is None and rng.random() < 0.5:
             points, label = points[flip] * turn, label[flip]
             centre, true_up = centre * turn, true_up * turn
-    up = true_up if told is not None else true_up + rng.normal(0.0, UP_ERROR, 3)
-    known = rng.random() < UP_SHARE if told is None else told
+    up = true_up if up_known is not None else true_up + rng.normal(0.0, UP_ERROR, 3)
+    known = rng.random() < UP_SHARE if up_known is None else up_known
     footprint = step / float(image.camera[0])
     features = scene_features(points, up / np.linalg.norm(up) if known else None, footprint)
     points, label = points[::2, ::2], label[::2, ::2]
@@ -193,7 +193,7 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
     rows = range(0, len(images), max(len(images) // limit, 1))
     with torch.inference_mode():
         for number, start in enumerate(rows):
-            batch = make_batch([images[start]], rng, told=number % 2 == 0)
+            batch = make_batch([images[start]], rng, up_known=number % 2 == 0)
             output = network(batch.features)
             for name, value in scene_loss(output, batch).items():
                 losses[name] = losses.get(name, 0.0) + float(value) / len(rows)

@@ -140,6 +140,30 @@ def bullet_scene() -> BulletScene:
     return BulletScene()
 
 
+@pytest.mark.parametrize(
+    ("camera", "blocked"),
+    [((-0.6, 0.0, 0.0), True), ((0.6, 0.0, 0.0), False), (None, False)],
+    ids=["in front of the plate", "behind it, with the hand", "unknown"],
+)
+def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, blocked) -> None:
+    y, z = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
+    plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    every = np.ones(len(plate), dtype=bool)
+    behind = Scene(
+        frame=CanonicalFrame(np.eye(4)),
+        cloud=Cloud(plate, plate),
+        points_in_cloud=plate,
+        point_of_row=np.arange(len(plate)),
+        approach_allowed=every,
+        contact_allowed=every,
+        object_of_point=np.zeros(len(plate), dtype=np.int64),
+        support=None,
+        obstacles=None,
+        viewpoints=None if camera is None else np.array([camera], dtype=np.float32),
+    )
+    assert collides(behind, HAND, PANDA, Collision()).tolist() == [blocked]
+
+
 @pytest.mark.parametrize("margin", [0.0, 0.004])
 def test_hands_at_rest_collide_where_bullet_says_so(bullet_scene, margin) -> None:
     hands = hands_about_the_points(POSES, seed=2)

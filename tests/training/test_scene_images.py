@@ -91,7 +91,7 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
     generate(tmp_path / "data", [mesh], files=2, seed=1, part=0, parts=1)
     files = sorted((tmp_path / "data").glob("scenes-????.npz"))
     assert len(files) == 2
-    batch = make_batch([SceneImages(files)[0]], np.random.default_rng(0), told=True)
+    batch = make_batch([SceneImages(files)[0]], np.random.default_rng(0), up_known=True)
     train(tmp_path / "data", tmp_path / "run", seconds=2.0)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
