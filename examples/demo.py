@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
-from edgegrasp_client.local_server import local_server
+from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.engine import ENGINES, choose_engine
 from edgegrasp_sim.picture import Picture, View

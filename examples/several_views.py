@@ -1,6 +1,6 @@
 """One request of three views finds at least what the best of them does: one sees behind things.
 
-usage: python examples/05_several_views.py [ADDRESS] [SCENES]
+usage: python examples/several_views.py [ADDRESS] [SCENES]
 
 Packed and pile scenes in turn, rendered from three sides; a robot's camera would take the images
 from several poses, known from its arm. Says how many grasps each view and all three give, told

@@ -1,6 +1,6 @@
 """Grasps for a gripper of your own, which no weights were trained for.
 
-usage: python examples/03_your_gripper.py [ADDRESS]
+usage: python examples/your_gripper.py [ADDRESS]
 
 Lengths are metres in the hand frame: z out of the palm, y the closing direction. docs/frames.md
 describes the fields; `edgegrasp serve --grippers FILE.toml` gives them a name.

@@ -1,6 +1,6 @@
 """A planner of your own in the benchmark: here, from above onto the highest point.
 
-usage: PYTHONPATH=examples edgegrasp benchmark --planner 07_your_planner:plan --scene packed \
+usage: PYTHONPATH=examples edgegrasp benchmark --planner your_planner:plan --scene packed \
            --rounds 5 --output results/mine
 
 docs/benchmark.md says what an observation holds and what a planner may do besides.

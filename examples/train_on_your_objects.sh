@@ -2,7 +2,7 @@
 # Weights that know your objects: data made with them, training that goes on from those that ship,
 # and a benchmark of the result.
 #
-# usage: examples/08_train_on_your_objects.sh OBJECTS OUTPUT [SCENES] [STEPS]
+# usage: examples/train_on_your_objects.sh OBJECTS OUTPUT [SCENES] [STEPS]
 #
 # OBJECTS holds packed/train and packed/test, with .urdf, .obj or .stl files in metres.
 set -euo pipefail

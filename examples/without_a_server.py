@@ -1,6 +1,6 @@
 """Grasps of an array in this process: the pipeline as a library, no server.
 
-usage: python examples/11_without_a_server.py
+usage: python examples/without_a_server.py
 
 Needs the extra `service`. The cloud is a made-up box of 5 x 8 x 6 cm on a table at z = 0.
 """

@@ -1,6 +1,6 @@
 """Grasps of a mug by its handle: both points of every grasp lie in a region.
 
-usage: python examples/02_region_on_a_handle.py [ADDRESS]
+usage: python examples/region_on_a_handle.py [ADDRESS]
 
 The image is the playground's sample; a region is drawn there with the mouse, too.
 """

@@ -1,6 +1,6 @@
 """A depth camera's images, and the grasps in them.
 
-usage: python examples/04_depth_camera.py FOLDER [--sensor stereo] [--seed 0]
+usage: python examples/depth_camera.py FOLDER [--sensor stereo] [--seed 0]
 
 Renders a table as a depth camera of some kind sees it, writes depth.png (16 bits, millimetres) and
 color.png, and asks for grasps in them, as for images of a real camera.
@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from edgegrasp_client import DepthImage, GraspClient
-from edgegrasp_client.local_server import local_server
+from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.sensor import SENSORS
 from edgegrasp_sim.simulation import ClutterSimulation
