@@ -12,7 +12,7 @@ INSTALLED := $(VENV)/.installed
 TO_LOOK := $(VENV)/.to_look
 TOOLS := $(VENV)/.tools
 GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
-	proto/edgegrasp/v1/grasp.proto proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py docs/options.md
+	proto/edgegrasp/v1/openapi.json
 
 .DEFAULT_GOAL := help
 .PHONY: help venv lint format test bench fuzz view demo docs image-test proto constraints clean

@@ -1,37 +1,126 @@
-"""Writes the table of docs/settings.md from the server's settings: `python docs/make_tables.py`."""
+"""Writes the tables of docs/options.md and docs/settings.md: `python docs/make_tables.py`."""
 
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from edgegrasp_model.options import FARTHEST, DetectOptions
 from edgegrasp_service.settings import Settings
 
-PAGE = Path(__file__).parent / "settings.md"
-BLOCK = re.compile(r"(<!-- begin: settings -->\n).*?(<!-- end -->)", re.DOTALL)
+Schema = dict[str, Any]
+Rows = Iterator[list[str]]
+
+BLOCK = re.compile(r"(<!-- begin: table -->\n).*?(<!-- end -->)", re.DOTALL)
+BOUNDS = (
+    ("minimum", ""),
+    ("exclusiveMinimum", "over "),
+    ("maximum", "to "),
+    ("exclusiveMaximum", "to under "),
+)
 
 
 def pages() -> dict[Path, str]:
-    """The text of the page with its table."""
-    lines = [["setting", "default", "range", "meaning"], ["---"] * 4]
+    """The text of each page with its table."""
+    made: dict[str, Callable[[], Rows]] = {"options.md": _options, "settings.md": _settings}
+    found = {}
+    for name, rows in made.items():
+        page = Path(__file__).parent / name
+        header, *lines = rows()
+        table = "".join(f"| {' | '.join(line)} |\n" for line in (header, ["---"] * 4, *lines))
+        found[page] = BLOCK.sub(
+            lambda match, table=table: f"{match[1]}\n{table}\n{match[2]}",  # type: ignore[misc]
+            page.read_text(),
+        )
+    return found
+
+
+def _options() -> Rows:
+    """Options, then each object that they are made of."""
+    yield ["option", "value", "default", "meaning"]
+    schema = DetectOptions.model_json_schema()
+    objects, todo = {"DetectOptions": schema}, [schema]
+    while todo:
+        for name in re.findall(r'"#/\$defs/(\w+)"', json.dumps(todo.pop(0)["properties"])):
+            if name not in objects:
+                objects[name] = schema["$defs"][name]
+                todo.append(objects[name])
+    for name, part in objects.items():
+        prefix = "" if name == "DetectOptions" else f"{name}."
+        if prefix:
+            yield [f"**{name}**", "object", "", _text(part)]
+        required = part.get("required", ())
+        for field, value in part["properties"].items():
+            if field == "kind":
+                yield [f"`{prefix}kind`", f'`"{value["const"]}"`', "", ""]
+                continue
+            default = "required" if field in required else _default(value["default"])
+            yield [f"`{prefix}{field}`", _kind(value), default, _text(value)]
+
+
+def _settings() -> Rows:
+    yield ["setting", "value", "default", "meaning"]
     for name, field in Settings.model_json_schema()["properties"].items():
         default = field.get("default")
         shown = "none" if default in (None, [], "") else f"`{json.dumps(default)}`"
-        lines.append([f"`{name}`", shown, _range(field), field["description"]])
-    table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return {PAGE: BLOCK.sub(lambda match: f"{match[1]}\n{table}\n{match[2]}", PAGE.read_text())}
+        yield [f"`{name}`", _kind(field), shown, field["description"]]
 
 
-def _range(field: Mapping[str, Any]) -> str:
-    if "enum" in field:
-        return ", ".join(f"`{word}`" for word in field["enum"])
-    low = field.get("minimum", field.get("exclusiveMinimum"))
-    high = field.get("maximum")
-    above = "above " if "exclusiveMinimum" in field else ""
-    if low is None:
-        return ""
-    return f"{above}{low:g} and more" if high is None else f"{above}{low} to {high}"
+def _default(value: Any) -> str:
+    if isinstance(value, dict):
+        return f'`"{value["kind"]}"`' if value.keys() == {"kind"} else "those of the object"
+    return f"`{json.dumps(value)}`"
+
+
+def _text(schema: Schema) -> str:
+    first = schema.get("description", "").partition("\n\n")[0]
+    return str(first).replace("\n", " ").replace("|", "\\|")
+
+
+def _kind(schema: Schema) -> str:
+    """What a value may be."""
+    if "$ref" in schema:
+        return f"`{schema['$ref'].rpartition('/')[2]}`"
+    for union in ("anyOf", "oneOf"):
+        if union in schema:
+            return " or ".join(dict.fromkeys(_kind(part) for part in schema[union]))
+    if "enum" in schema or "const" in schema:
+        return " or ".join(f'`"{word}"`' for word in schema.get("enum", [schema.get("const")]))
+    if schema["type"] == "array":
+        return _list(schema)
+    names = {"null": "null", "boolean": "true or false"}
+    return names.get(schema["type"], f"{schema['type']}{_range(schema)}")
+
+
+def _list(schema: Schema) -> str:
+    parts = schema.get("prefixItems")
+    if parts is not None and all(part.get("type") == "number" for part in parts):
+        kind = {2: "Pixel", 3: "Vector", 4: "Quaternion"}[len(parts)]
+        return f"`{kind}`{_range(parts[0])}"
+    if parts is not None:
+        return f"[{', '.join(map(_kind, parts))}]"
+    low, high = schema.get("minItems", 0), schema.get("maxItems")
+    size = "" if high is None else f" of {low} to {high}" if low else f" of up to {high}"
+    return f"list{size}: {_kind(schema['items'])}"
+
+
+def _range(schema: Schema) -> str:
+    if schema["type"] == "string":
+        return f", up to {schema['maxLength']} characters" if "maxLength" in schema else ""
+    held = {bound: word for bound, word in BOUNDS if abs(schema.get(bound, FARTHEST)) != FARTHEST}
+    words = [f"{word}{_number(schema[bound])}" for bound, word in held.items()]
+    words += ["and more"] if held and not any("axi" in bound for bound in held) else []
+    return f", {' '.join(words)}" if words else ""
+
+
+def _number(bound: float) -> str:
+    if abs(bound) >= 2**31 and math.log2(abs(bound)).is_integer():
+        return f"{'-' if bound < 0 else ''}2^{int(math.log2(abs(bound)))}"
+    if math.isclose(bound, math.pi):
+        return "π"
+    return str(int(bound)) if float(bound).is_integer() else f"{bound:g}"
 
 
 if __name__ == "__main__":

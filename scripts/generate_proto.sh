@@ -1,6 +1,6 @@
 #!/bin/sh
-# Regenerates the interface: what follows from the options of a request, the Python stubs beside
-# proto/edgegrasp/v1/*.proto, the contract beside them, and the options in the OpenAPI document.
+# Regenerates the Python stubs beside proto/edgegrasp/*/*.proto, the contract beside them, and the
+# options in the OpenAPI document.
 # Into this checkout, or into the same places under the folder given.
 # PYTHON names the interpreter that has the dev extra.
 set -eu
@@ -9,10 +9,9 @@ python=${PYTHON:-$root/.venv/bin/python}
 out=${1:-$root}
 PATH=$(dirname "$python"):$PATH # protoc looks there for the mypy plugins
 mkdir -p "$out/proto"
-"$python" "$root/scripts/generate_options.py" "$out"
-"$python" -m grpc_tools.protoc --proto_path="$out/proto" --proto_path="$root/proto" --python_out="$out/proto" \
+"$python" -m grpc_tools.protoc --proto_path="$root/proto" --python_out="$out/proto" \
     --grpc_python_out="$out/proto" --mypy_out="quiet:$out/proto" \
-    --mypy_grpc_out="quiet:$out/proto" "$out"/proto/edgegrasp/v1/*.proto \
+    --mypy_grpc_out="quiet:$out/proto" "$root"/proto/edgegrasp/v1/*.proto \
     "$root"/proto/edgegrasp/oip/*.proto
 "$python" "$root/scripts/contract.py" "$out/proto"
 "$python" "$root/scripts/openapi.py" "$out/proto"

@@ -558,10 +558,7 @@ Global___Intrinsics: _TypeAlias = Intrinsics  # noqa: Y015
 
 @_typing.final
 class DetectOptions(_message.Message):
-    """The messages between the marks follow from DetectOptions in edgegrasp_model.options: edit that, and
-    run `make proto`.
-
-    generated: begin options
+    """Options have the fields of DetectOptions in edgegrasp_model.options.
 
     Options of one detection; the defaults suit a tabletop scene seen by one camera.
     """
@@ -1595,10 +1592,7 @@ Global___Obstacle: _TypeAlias = Obstacle  # noqa: Y015
 
 @_typing.final
 class Pixel(_message.Message):
-    """generated: end options
-
-    A place in an image, whose top left pixel has its centre at (0, 0); [column, row] in JSON.
-    """
+    """A place in an image, whose top left pixel has its centre at (0, 0); [column, row] in JSON."""
 
     DESCRIPTOR: _descriptor.Descriptor
 
