@@ -14,7 +14,7 @@ from typing import Any
 
 import psutil
 
-from edgegrasp_client.local_server import local_server
+from edgegrasp_client.connection import local_server
 from edgegrasp_service.settings import MIB
 
 RESULTS = Path(__file__).parent / "results"

@@ -10,14 +10,18 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
-from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
+from edgegrasp_cli.drawing import draw, pixels, sent_cloud
 from edgegrasp_cli.flags import (
     CONNECTION,
     Server,
     Timeout,
     connect,
+    given_flags,
+    model_flags,
     option_flags,
     parse_option_flags,
     takes_flags,
@@ -29,8 +33,6 @@ if TYPE_CHECKING:
 
 Option = typer.Option
 PICTURES = (".png", ".jpg", ".jpeg")
-DRAWN = 10  # grasps in a picture
-DRAWN_AROUND = 0.4  # metres from the grasps: what a picture of a cloud shows
 
 Weights = Annotated[
     list[Path] | None,
@@ -42,58 +44,61 @@ Grippers = Annotated[
 Cloud = Annotated[
     Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
 ]
-DepthScale = Annotated[
-    float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
-]
-Color = Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")]
 Device = Annotated[str, Option(help="auto, cpu, cuda or cuda:N, where there is no server.")]
 
 
-@takes_flags(connection=CONNECTION, options=option_flags("robot"))
+class DetectFlags(BaseModel):
+    """The flags of `edgegrasp detect` beside the options of the detection."""
+
+    depth: tuple[Path, ...] = Field(
+        (), description="Depth image in place of a cloud: .png of 16 bits, or .npy; repeatable"
+    )
+    intrinsics: tuple[str, ...] = Field(
+        (), description="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON"
+    )
+    pose: tuple[str, ...] = Field(
+        (), description="Camera of each --depth: 4 x 4 JSON, to the cloud's frame"
+    )
+    depth_scale: float | None = Field(
+        None, description="Metres for one unit of --depth (0.001; of floats 1)"
+    )
+    color: Path | None = Field(None, description="Colours of the same pixels: .png or .npy")
+    mask: Path | None = Field(
+        None, description="Grasp only where this is not 0: .png or .npy, same pixels"
+    )
+    picture: Path | None = Field(
+        None, description="Picture of the best grasps to write, .png or .jpg"
+    )
+    robot: str | None = Field(
+        None, description="The server's robot of that name; else one that ships, or a file"
+    )
+    joints: str | None = Field(None, description="The robot's joints now: j1,j2,… in radians")
+    base: str | None = Field(
+        None, description="T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"
+    )
+    trajectory: Path | None = Field(
+        None, description="JSON file to write the arm's motion to the best pick to"
+    )
+    server: str | None = Field(
+        None, description="host:port (gRPC) or http://host:port; else in this process"
+    )
+    timeout: float = Field(60.0, description="Seconds to wait for a server")
+    weights: tuple[Path, ...] = Field(
+        (), description="Weights file or folder besides those that ship, without a server"
+    )
+    grippers: tuple[Path, ...] = Field((), description="Gripper file (.toml), without a server")
+    device: str = Field("cpu", description="auto, cpu, cuda or cuda:N, without a server")
+
+
+@takes_flags(flags=model_flags(DetectFlags), connection=CONNECTION, options=option_flags("robot"))
 def detect(
     file: Cloud = None,
-    depth: Annotated[
-        list[Path] | None,
-        Option(help="Depth image in place of a cloud: .png of 16 bits, or .npy. May be repeated."),
-    ] = None,
-    intrinsics: Annotated[
-        list[str] | None,
-        Option(help="Camera of --depth: fx,fy,cx,cy in pixels, or its 3 x 3 matrix as JSON."),
-    ] = None,
-    pose: Annotated[
-        list[str] | None, Option(help="Camera of each --depth: 4 x 4 JSON, to the cloud's frame.")
-    ] = None,
-    depth_scale: DepthScale = None,
-    color: Color = None,
-    mask: Annotated[
-        Path | None, Option(help="Grasp only where this is not 0: .png or .npy, same pixels.")
-    ] = None,
-    server: Server = None,
-    timeout: Timeout = 60.0,
-    weights: Weights = None,
-    grippers: Grippers = None,
-    device: Device = "cpu",
-    picture: Annotated[
-        Path | None, Option(help="Picture of the best grasps to write, .png or .jpg.")
-    ] = None,
-    robot: Annotated[
-        str | None, Option(help="The server's robot of that name; else one that ships, or a file.")
-    ] = None,
-    joints: Annotated[
-        str | None, Option(help="The robot's joints now: j1,j2,… in radians.")
-    ] = None,
-    base: Annotated[
-        str | None,
-        Option(help="T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON."),
-    ] = None,
-    trajectory: Annotated[
-        Path | None, Option(help="JSON file to write the arm's motion to the best pick to.")
-    ] = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,
     options_file: Annotated[
         Path | None, Option("--options", help="JSON file with options; flags beside it win.")
     ] = None,
     *,
+    flags: dict[str, Any],
     connection: dict[str, Any],
     options: dict[str, Any],
 ) -> None:
@@ -111,24 +116,23 @@ def detect(
     """
     from rich.console import Console
 
-    if picture is not None:
-        _check_picture(picture)
-    fields = _options(options_file, options) | _robot_option(robot, joints, base)
-    if trajectory is not None and "robot" not in fields:
-        raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
-    images = _depth_images(file, depth or [], intrinsics or [], pose or [], depth_scale)
-    colors = None if color is None else _pixels(color)[..., :3]
-    if mask is not None:
+    asked = given_flags(DetectFlags, flags)
+    fields = _options(options_file, options) | _robot_option(asked)
+    _check_outputs(asked, fields)
+    images = _depth_images(file, asked)
+    colors = None if asked.color is None else pixels(asked.color)[..., :3]
+    if asked.mask is not None:
         from edgegrasp_client import on_mask
 
-        fields = dict(on_mask(_pixels(mask), fields))
+        fields = dict(on_mask(pixels(asked.mask), fields))
+    own = asked.weights, asked.grippers, asked.device
     waiting = Console(stderr=True).status("Looking for grasps…")
-    with waiting, open_client(server, timeout, connection, weights, grippers, device) as client:
+    with waiting, open_client(asked.server, asked.timeout, connection, *own) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
-    if picture is not None:
-        draw(picture, detection, fields, file, images, colors)
-    if trajectory is not None:
-        _write_trajectory(trajectory, detection)
+    if asked.picture is not None:
+        draw(asked.picture, detection, sent_cloud(file, images), fields, colors)
+    if asked.trajectory is not None:
+        _write_trajectory(asked.trajectory, detection)
     if as_document:
         from edgegrasp_service.worker.http_bodies import write
 
@@ -191,7 +195,21 @@ class OwnDetector:
         self, cloud: Any = None, *, depth_images: Any = None, colors: Any = None, **options: Any
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
-        sent, parsed = decode(cloud, depth_images, colors, options)
+        from edgegrasp_client.clouds import depth_image_fields, npy_bytes
+        from edgegrasp_model.options import parse_options
+        from edgegrasp_model.request_cloud import File, decode_cloud
+
+        fields: dict[str, Any] = {}
+        if colors is not None:
+            fields["colors"] = File("npy", npy_bytes(colors))
+        if depth_images is not None:
+            images = enumerate(depth_images)
+            fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
+        elif isinstance(cloud, Path):
+            fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
+        else:
+            fields["cloud"] = File("npy", npy_bytes(cloud))
+        sent, parsed = decode_cloud(fields, parse_options(options), sys.maxsize)
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)
@@ -217,71 +235,13 @@ class OwnDetector:
         return ModelCatalogue.load(weights, "", choose_device(device), grippers)
 
 
-def decode(cloud: Any, depth_images: Any, colors: Any, options: Mapping[str, Any]) -> Any:
-    """What a server makes of a request: a CloudInput and DetectOptions; raises as it does."""
-    from edgegrasp_client.clouds import depth_image_fields, npy_bytes
-    from edgegrasp_model.options import parse_options
-    from edgegrasp_model.request_cloud import File, decode_cloud
-
-    fields: dict[str, Any] = {}
-    if colors is not None:
-        fields["colors"] = File("npy", npy_bytes(colors))
-    if depth_images is not None:
-        images = enumerate(depth_images)
-        fields["depth_images"] = [depth_image_fields(image, row) for row, image in images]
-    elif isinstance(cloud, Path):
-        fields["cloud"] = File(cloud.suffix[1:].lower(), cloud.read_bytes())
-    else:
-        fields["cloud"] = File("npy", npy_bytes(cloud))
-    return decode_cloud(fields, parse_options(options), sys.maxsize)
-
-
-def draw(
-    path: Path,
-    detection: Any,
-    options: Mapping[str, Any],
-    cloud: Any = None,
-    depth_images: "list[DepthImage] | None" = None,
-    colors: NDArray[Any] | None = None,
-) -> None:
-    """Write a picture of a request and the best of its grasps.
-
-    What is organised as a camera's image is drawn as that camera saw it, in its colours where they
-    are given; another cloud from its viewpoint, or from above at a slant.
-
-    The request is given as for `decode`.
-    """
-    import numpy as np
-
-    from edgegrasp_sim.picture import Picture, View
-
-    sent, parsed = decode(cloud, depth_images, colors, options)
-    shape, points = np.shape(sent.points), np.reshape(sent.points, (-1, 3))
-    shades = None if sent.colors is None else np.reshape(sent.colors, (-1, 3))
-    if shades is not None and shades.dtype.kind == "f":
-        shades = 255 * shades
-    shown, image = detection.grasps[:DRAWN], None
-    moved = any("T_cloud_camera" in each for each in depth_images or ())
-    view = View.of_image(np.asarray(sent.points)) if len(shape) == 3 and not moved else None
-    if view is not None:
-        image = None if shades is None else shades.reshape(shape).astype(np.uint8)
-    else:
-        seen = points[np.isfinite(points).all(axis=1)]
-        middle = np.median([grasp.T_cloud_tcp[:3, 3] for grasp in shown] or seen, axis=0)
-        near = seen[np.linalg.norm(seen - middle, axis=1) < DRAWN_AROUND]
-        up = np.asarray(detection.up, dtype=np.float64)
-        aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
-        eye = np.ravel(parsed.viewpoint or middle + 0.6 * up - 0.5 * aside)[:3]
-        view = View.of(near if len(near) else seen, eye, up)
-    title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
-    picture = Picture(view, points, shades, image, title)
-    picture.regions(options)
-    picture.grasps(shown, (detection.gripper.palm_z, detection.gripper.tip_z))
-    picture.save(path)
-
-
-def _check_picture(path: Path) -> None:
-    """Raise ValueError, before any work, where a picture could not be written."""
+def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
+    """Raise ValueError, before any work, where a picture or a motion could not be written."""
+    if asked.trajectory is not None and "robot" not in fields:
+        raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
+    path = asked.picture
+    if path is None:
+        return
     if path.suffix.lower() not in PICTURES:
         raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
     if not path.absolute().parent.is_dir():
@@ -300,25 +260,23 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
     return fields | parse_option_flags(given)
 
 
-def _robot_option(robot: str | None, joints: str | None, base: str | None) -> dict[str, Any]:
+def _robot_option(asked: DetectFlags) -> dict[str, Any]:
     """The option `robot` of the flags; nothing where there is none of them."""
     from edgegrasp_service.worker.http_bodies import value_of_text
 
-    given = {"--robot": robot, "--joints": joints, "--base": base}
+    given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
     missing = [flag for flag, value in given.items() if value is None]
     if len(missing) == len(given):
         return {}
     if missing:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
-    numbers = [part for part in str(joints).split(",") if part]
-    pose = value_of_text("--base", str(base))
-    return {"robot": {"name": robot, "joints": list(map(float, numbers)), "T_base_cloud": pose}}
+    joints = [float(part) for part in str(asked.joints).split(",") if part]
+    pose = value_of_text("--base", str(asked.base))
+    return {"robot": {"name": asked.robot, "joints": joints, "T_base_cloud": pose}}
 
 
 def _write_trajectory(file: Path, detection: Any) -> None:
     """Write the motion to the best pick, and the pick; raises ValueError where there is none."""
-    import numpy as np
-
     moving = [one for one in detection.grasps if one.arm is not None and one.arm.trajectory]
     if not moving:
         counts = ", ".join(f"{count} {name}" for name, count in detection.counts.items())
@@ -331,16 +289,11 @@ def _write_trajectory(file: Path, detection: Any) -> None:
     file.write_text(json.dumps(motion))
 
 
-def _depth_images(
-    file: Path | None,
-    depths: list[Path],
-    intrinsics: list[str],
-    poses: list[str],
-    scale: float | None,
-) -> "list[DepthImage] | None":
+def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
     """The images of --depth with their cameras; None where a cloud is given."""
     from edgegrasp_service.worker.http_bodies import value_of_text
 
+    depths, intrinsics, poses = asked.depth, asked.intrinsics, asked.pose
     if (file is None) != bool(depths):
         raise ValueError("give a cloud file, or --depth and --intrinsics")
     if file is not None:
@@ -355,16 +308,9 @@ def _depth_images(
     for depth, camera, pose in zip_longest(depths, intrinsics, poses[: len(depths)]):
         image: Any = {"depth": depth, "intrinsics": value_of_text("intrinsics", camera)}
         image |= {} if pose is None else {"T_cloud_camera": value_of_text("pose", pose)}
-        image |= {} if scale is None else {"depth_scale": scale}
+        image |= {} if asked.depth_scale is None else {"depth_scale": asked.depth_scale}
         images.append(image)
     return images
-
-
-def _pixels(file: Path) -> NDArray[Any]:
-    """The values of an image file: (H, W), or (H, W, C) of several channels."""
-    from edgegrasp_model.request_cloud import File, decode_array
-
-    return decode_array(str(file), File(file.suffix[1:].lower(), file.read_bytes()), sys.maxsize)
 
 
 def _print_detection(detection: Any) -> None:

@@ -16,7 +16,7 @@ except ModuleNotFoundError:
 COMMANDS = {
     "serve": ("serve", "service", "Answer requests over HTTP and gRPC."),
     "detect": ("detect", "service,view", "Find grasps in a cloud or a depth image."),
-    "view": ("view", "service", "Look at a scene and its grasps in the browser."),
+    "view": ("serve", "service", "Look at a scene and its grasps in the browser."),
     "models": ("detect", "service", "List the weights that can be used."),
     "robot": ("robot", "robot,view", "Make a robot file of a URDF, and check one."),
     "mcp": ("mcp", "mcp", "Serve grasps to language-model agents."),

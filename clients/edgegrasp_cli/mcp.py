@@ -9,32 +9,27 @@ import importlib.metadata
 import io
 import json
 import re
-import sys
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
+from pydantic import Field
 
-from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.errors import EdgeGraspError
-from edgegrasp_camera.files import read_file
-from edgegrasp_camera.poses import quaternion_from_matrix
+from edgegrasp_cli.drawing import draw, pixels, sent_cloud
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
+from edgegrasp_client.conversions import quaternion_from_matrix
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
     from mcp.server.mcpserver.tools.base import Tool
 
-    from edgegrasp_client import Detection, GraspClient
+    from edgegrasp_client import DepthImage, Detection, GraspClient
 
 MOST_GRASPS = 20  # in one answer: some 5,000 characters
 BACK = 0.05  # metres from the pregrasp to the grasp
-AROUND = 0.4  # metres around the objects that a picture shows
-ABOVE = 0.6  # metres from the objects to the second picture's viewpoint
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
@@ -45,6 +40,10 @@ INSTRUCTIONS = (
 )
 
 Option = typer.Option
+NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
+Matrix = Annotated[
+    list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")
+]
 
 
 @takes_flags(connection=CONNECTION)
@@ -80,16 +79,33 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
 
     Files are named relative to the folder; no file outside of it is read.
     """
-    from mcp.server.mcpserver import Image, MCPServer
-    from pydantic import Field
+    from mcp.server.mcpserver import MCPServer
 
-    inputs = _Inputs(client, folder)
-    NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
-    Matrix = Annotated[
-        list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")
+    tools = _Tools(client, folder)
+    functions: list[Callable[..., Any]] = [
+        tools.generate_grasps_from_point_cloud,
+        tools.generate_grasps_from_depth,
+        tools.visualize_grasps,
+        tools.edgegrasp_health_check,
+        tools.edgegrasp_server_info,
     ]
+    return MCPServer(
+        "edgegrasp",
+        instructions=INSTRUCTIONS,
+        version=importlib.metadata.version("edgegrasp"),
+        log_level="WARNING",
+        tools=[_tool(function, folder) for function in functions],
+    )
+
+
+class _Tools:
+    """What an agent calls; docstrings and arguments are what it reads."""
+
+    def __init__(self, client: "GraspClient", folder: Path) -> None:
+        self._client, self._folder = client, folder
 
     def generate_grasps_from_point_cloud(
+        self,
         point_cloud_file: str,
         num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
@@ -100,9 +116,10 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         `viewpoint` is the camera's position: give it if you know it.
         """
         asked = _asked(options, num_grasps, viewpoint)
-        return _short(inputs.detect_in_file(point_cloud_file, asked))
+        return _short(self._client.detect(self._path(point_cloud_file), **asked))
 
     def generate_grasps_from_depth(
+        self,
         depth_file: str,
         intrinsics: list[float],
         mask_file: str | None = None,
@@ -118,11 +135,12 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         unit of the image (0.001 for whole numbers). With `T_base_camera` all that is asked and
         answered is in the base frame.
         """
-        asked = _asked(options, num_grasps)
-        camera = intrinsics, mask_file, depth_scale, T_base_camera
-        return _short(inputs.detect_in_depth(depth_file, *camera, asked))
+        image = self._image(depth_file, intrinsics, depth_scale, T_base_camera)
+        asked = self._in_image(_asked(options, num_grasps), mask_file, T_base_camera)
+        return _short(self._client.detect(depth_images=[image], **asked))
 
     def visualize_grasps(
+        self,
         point_cloud_file: str | None = None,
         depth_file: str | None = None,
         intrinsics: list[float] | None = None,
@@ -132,56 +150,73 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
         num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> list[str | Image]:
+    ) -> list[Any]:
         """Two pictures of the grasps in a cloud file or a depth image: from the camera, from above.
 
         The best five carry their rank in the answer.
 
         Arguments are those of the tools that generate grasps; the same ones give the same grasps.
         """
-        asked = _asked(options, num_grasps, viewpoint) | {"debug": True}
+        from mcp.server.mcpserver import Image
+
+        asked = _asked(options, num_grasps, viewpoint)
         if (point_cloud_file is None) == (depth_file is None):
             raise ValueError("Give point_cloud_file, or depth_file and intrinsics.")
+        file, images, eye = None, None, [0.0, 0.0, 0.0]
         if point_cloud_file is not None:
-            found = inputs.detect_in_file(point_cloud_file, asked)
+            file = self._path(point_cloud_file)
         else:
-            camera = intrinsics or [], mask_file, depth_scale, T_base_camera
-            found = inputs.detect_in_depth(str(depth_file), *camera, asked)
+            images = [self._image(str(depth_file), intrinsics or [], depth_scale, T_base_camera)]
+            asked = self._in_image(asked, mask_file, T_base_camera)
+            eye = eye if T_base_camera is None else [row[3] for row in T_base_camera[:3]]
+        found = self._client.detect(file, depth_images=images, **asked)
         best = found.grasps[0].score if found.grasps else 0.0
         text = f"{len(found.grasps)} grasps, the best {best:.2f}. {' '.join(found.warnings)}"
-        image = intrinsics, depth_scale, T_base_camera
-        points, colors = inputs.shown(point_cloud_file, depth_file, *image)
-        eye = np.zeros(3) if T_base_camera is None else np.asarray(T_base_camera)[:3, 3]
-        eye = np.reshape(asked.get("viewpoint", eye), (-1, 3))[0]
-        middle = np.median(found.debug.points, axis=0) if found.debug else eye
-        above = middle + ABOVE * found.up + 1e-3
-        drawn = [_picture(found, points, colors, place) for place in (eye, above)]
-        return [text.strip(), *(Image(data=each, format="png") for each in drawn)]
+        sent, pictures = sent_cloud(file, images), []
+        for from_above in (False, True):
+            drawn = io.BytesIO()
+            draw(drawn, found, sent, {"viewpoint": eye, **asked}, from_above=from_above)
+            pictures.append(Image(data=drawn.getvalue(), format="png"))
+        return [text.strip(), *pictures]
 
-    def edgegrasp_health_check() -> str:
+    def edgegrasp_health_check(self) -> str:
         """Whether the grasp server is there and answers requests."""
-        return "ready" if client.ready(timeout=5.0) else "not there, or still loading its weights"
+        ready = self._client.ready(timeout=5.0)
+        return "ready" if ready else "not there, or still loading its weights"
 
-    def edgegrasp_server_info() -> str:
+    def edgegrasp_server_info(self) -> str:
         """The weights that the option `model` can name, and the gripper that each is for."""
         names = ("name", "architecture", "gripper", "default", "device")
-        models = client.models()
+        models = self._client.models()
         return json.dumps([{name: getattr(model, name) for name in names} for model in models])
 
-    functions: list[Callable[..., Any]] = [
-        generate_grasps_from_point_cloud,
-        generate_grasps_from_depth,
-        visualize_grasps,
-        edgegrasp_health_check,
-        edgegrasp_server_info,
-    ]
-    return MCPServer(
-        "edgegrasp",
-        instructions=INSTRUCTIONS,
-        version=importlib.metadata.version("edgegrasp"),
-        log_level="WARNING",
-        tools=[_tool(function, folder) for function in functions],
-    )
+    def _image(
+        self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
+    ) -> "DepthImage":
+        image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
+        if scale is not None:
+            image["depth_scale"] = scale
+        if pose is not None:
+            image["T_cloud_camera"] = pose
+        return image
+
+    def _in_image(
+        self, asked: dict[str, Any], mask: str | None, pose: Matrix | None
+    ) -> dict[str, Any]:
+        """The options of a depth image: on its mask, and z up in a base frame."""
+        from edgegrasp_client import on_mask
+
+        if pose is not None:
+            asked = {"up": [0.0, 0.0, 1.0], **asked}
+        return asked if mask is None else dict(on_mask(pixels(self._path(mask)), asked))
+
+    def _path(self, name: str) -> Path:
+        path = (self._folder / name).resolve()
+        if not path.is_relative_to(self._folder):
+            raise ValueError(f"{name} is not below the folder. Name a file below it.")
+        if not path.is_file():  # a pipe would be waited for
+            raise ValueError(f"{name} is no file.")
+        return path
 
 
 def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
@@ -217,65 +252,6 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
                 definitions[name] = schemas[name]
                 todo.append(schemas[name])
     return options, definitions
-
-
-class _Inputs:
-    """Files below a folder, sent to the server."""
-
-    def __init__(self, client: "GraspClient", folder: Path) -> None:
-        self._client, self._folder = client, folder
-
-    def detect_in_file(self, name: str, options: dict[str, Any]) -> "Detection":
-        return self._client.detect(self._path(name), **options)
-
-    def detect_in_depth(
-        self,
-        name: str,
-        intrinsics: list[float],
-        mask: str | None,
-        scale: float | None,
-        T_base_camera: list[list[float]] | None,
-        options: dict[str, Any],
-    ) -> "Detection":
-        from edgegrasp_client import DepthImage, on_mask
-
-        if mask is not None:
-            options = dict(on_mask(_pixels(self._path(mask)), options))
-        image: DepthImage = {"depth": self._path(name), "intrinsics": intrinsics}
-        if scale is not None:
-            image["depth_scale"] = scale
-        if T_base_camera is not None:
-            image["T_cloud_camera"] = T_base_camera
-            options = {"up": [0.0, 0.0, 1.0], **options}
-        return self._client.detect(depth_images=[image], **options)
-
-    def shown(
-        self,
-        cloud: str | None,
-        depth: str | None,
-        intrinsics: list[float] | None,
-        scale: float | None,
-        T_base_camera: list[list[float]] | None,
-    ) -> tuple[NDArray[Any], NDArray[Any] | None]:
-        """Points (N, 3) and colours (N, 3), if there are any, to draw."""
-        path = self._path(str(cloud or depth))
-        if cloud is not None:
-            sent = read_file(path.suffix[1:].lower(), path.read_bytes(), sys.maxsize)
-        else:
-            pose = np.eye(4) if T_base_camera is None else np.asarray(T_base_camera)
-            view = DepthView(intrinsics_of(intrinsics), pose, scale)
-            sent, _ = fuse_depth_images([_pixels(path)], [view])
-        points, colors = (None if a is None else np.asarray(a) for a in (sent.points, sent.colors))
-        assert points is not None
-        return points.reshape(-1, 3), None if colors is None else colors.reshape(-1, 3)
-
-    def _path(self, name: str) -> Path:
-        path = (self._folder / name).resolve()
-        if not path.is_relative_to(self._folder):
-            raise ValueError(f"{name} is not below the folder. Name a file below it.")
-        if not path.is_file():  # a pipe would be waited for
-            raise ValueError(f"{name} is no file.")
-        return path
 
 
 def _asked(
@@ -338,31 +314,3 @@ def _short(found: "Detection") -> str:
 
 def _digits(vector: Any, digits: int) -> list[float]:
     return [round(float(value), digits) for value in vector]
-
-
-def _pixels(path: Path) -> NDArray[Any]:
-    from PIL import Image
-
-    if path.suffix == ".npy":
-        loaded: NDArray[Any] = np.load(path, allow_pickle=False)
-        return loaded
-    return np.asarray(Image.open(path))
-
-
-def _picture(
-    found: "Detection", points: NDArray[Any], colors: NDArray[Any] | None, eye: Any
-) -> bytes:
-    """The cloud near the grasps, and the grasps, as PNG."""
-    from edgegrasp_sim.picture import Picture, View
-
-    assert found.debug is not None
-    near = np.linalg.norm(points - np.median(found.debug.points, axis=0), axis=1) < AROUND
-    seen = points[near]
-    if colors is not None:
-        colors = np.multiply(colors[near], 255 if colors.dtype.kind == "f" else 1)
-    file = io.BytesIO()
-    title = f"{len(found.grasps)} grasps of {found.model}"
-    picture = Picture(View.of(seen, eye, found.up), seen, colors, title=title)
-    picture.grasps(found.grasps, (found.gripper.palm_z, found.gripper.tip_z))
-    picture.save(file)
-    return file.getvalue()

@@ -1,6 +1,12 @@
-"""`edgegrasp serve`: every setting of the server is a flag."""
+"""`edgegrasp serve`, and `view`: the playground of a server of one's own."""
 
+import json
 import os
+import shutil
+import signal
+import tempfile
+import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,15 +15,17 @@ import typer
 from edgegrasp_cli.flags import model_flags, takes_flags
 from edgegrasp_service.settings import Settings
 
+Option = typer.Option
+
 
 @takes_flags(settings=model_flags(Settings, panel="Settings"))
 def serve(
     config: Annotated[
         Path | None,
-        typer.Option(help="TOML file with settings, named as here with _ for -.", metavar="FILE"),
+        Option(help="TOML file with settings, named as here with _ for -.", metavar="FILE"),
     ] = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the settings in effect as JSON, and stop.")
+        bool, Option("--print-config", help="Print the settings in effect as JSON, and stop.")
     ] = False,
     *,
     settings: dict[str, Any],
@@ -39,3 +47,48 @@ def serve(
     from edgegrasp_service.server import run
 
     run(loaded)
+
+
+def view(
+    file: Annotated[
+        Path | None, typer.Argument(help="Cloud in metres: .npy, .npz, .ply, .pcd or .xyz.")
+    ] = None,
+    depth: Annotated[Path | None, Option(help="Depth image in place of a cloud: .png.")] = None,
+    intrinsics: Annotated[str | None, Option(help="Camera of --depth: fx,fy,cx,cy.")] = None,
+    depth_scale: Annotated[
+        float | None, Option(help="Metres for one unit of --depth (0.001; of floats 1).")
+    ] = None,
+    color: Annotated[Path | None, Option(help="Colours of the same pixels: .png or .npy.")] = None,
+    viewpoint: Annotated[str | None, Option(help="Camera position of a cloud: x,y,z.")] = None,
+    browser: Annotated[bool, Option(help="Open a browser, besides printing the address.")] = True,
+) -> None:
+    """Look at a scene and its grasps in the browser; Ctrl-C ends it.
+
+    An .npz file may also hold `depth`, `intrinsics` and `rgb`.
+    """
+    from rich.console import Console
+
+    from edgegrasp_client.connection import local_server
+
+    # A supervisor ends it as Ctrl-C does, also in the background: its server goes with it.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    given = {"intrinsics": intrinsics, "depth_scale": depth_scale, "viewpoint": viewpoint}
+    with tempfile.TemporaryDirectory() as folder:
+        flags = []
+        files = [each for each in (file, depth, color) if each is not None]
+        if files:
+            sample = {"name": files[0].name, "files": [each.name for each in files]}
+            sample |= {name: str(value) for name, value in given.items() if value is not None}
+            for each in files:
+                shutil.copy(each, folder)
+            (Path(folder) / "samples.json").write_text(json.dumps([sample]))
+            flags = ["--samples", folder]
+        starting = "Starting a server; the first one compiles for a minute…"
+        with Console(stderr=True).status(starting) as status, local_server(*flags) as own:
+            status.stop()
+            print(f"{own.http_url}/playground/ (Ctrl-C ends it)", flush=True)
+            if browser:
+                webbrowser.open(f"{own.http_url}/playground/")
+            with suppress(KeyboardInterrupt):
+                signal.pause()

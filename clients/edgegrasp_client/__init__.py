@@ -46,6 +46,8 @@ from edgegrasp_client.options import SupportPlane as SupportPlane
 from edgegrasp_client.options import Suppression as Suppression
 from edgegrasp_client.options import Workspace as Workspace
 from edgegrasp_client.requests import StreamRequest as StreamRequest
+from edgegrasp_client.requests import object_in_scene as object_in_scene
+from edgegrasp_client.requests import on_mask as on_mask
 from edgegrasp_client.results import DebugInfo as DebugInfo
 from edgegrasp_client.results import Detection as Detection
 from edgegrasp_client.results import Evaluation as Evaluation
@@ -54,5 +56,3 @@ from edgegrasp_client.results import GripperOutline as GripperOutline
 from edgegrasp_client.results import Model as Model
 from edgegrasp_client.results import Scoring as Scoring
 from edgegrasp_client.results import StreamAnswer as StreamAnswer
-from edgegrasp_client.targets import object_in_scene as object_in_scene
-from edgegrasp_client.targets import on_mask as on_mask

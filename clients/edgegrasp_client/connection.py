@@ -1,9 +1,14 @@
-"""How a client knows its server, what it shows it, and when it asks again; for both clients."""
+"""How a client knows its server and when it asks again; and a server of one's own."""
 
 import random
 import ssl
+import subprocess
+import sysconfig
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import grpc
 
@@ -25,6 +30,7 @@ CHANNEL_OPTIONS = (
 
 RETRIES = 4  # of a call to a server that is away; a busy one is asked until the timeout
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
+STOP_SECONDS = 15.0  # for a local server to drain
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,49 @@ def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
     if not (token.isascii() and token.isprintable() and token and " " not in token):
         raise invalid("token", f"{len(token)} letters", "Give printable ASCII without spaces.")
     return (("authorization", f"Bearer {token}"),)
+
+
+class Addresses(NamedTuple):
+    """Where a local server listens."""
+
+    http_url: str  # such as http://127.0.0.1:8000
+    grpc_address: str  # such as 127.0.0.1:50051
+    pid: int = 0  # of the front
+
+
+@contextmanager
+def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses]:
+    """Run `edgegrasp serve` on free ports while the context lasts.
+
+    Args:
+        flags: Further flags of `edgegrasp serve`.
+        program: What to run as `edgegrasp`; empty: the one that is installed here.
+
+    Yields:
+        Its addresses, once it is ready.
+
+    Raises:
+        ServerUnavailableError: It is not installed here or does not start; it says why on stderr.
+    """
+    installed = Path(sysconfig.get_path("scripts")) / "edgegrasp"
+    if not (program or installed.is_file()):
+        raise ServerUnavailableError(f"{installed} is missing: pip install 'edgegrasp[service]'")
+    ports = ("--http-port", "0", "--grpc-port", "0")
+    command = [*(program or [str(installed)]), "serve", *ports, "--log-level", "warning", *flags]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            # "EdgeGrasp serves HTTP <url> gRPC <address>", printed when it is ready.
+            words = server.stdout.readline().split()
+            if len(words) != 6:
+                raise ServerUnavailableError("the local server did not start; it says why above")
+            yield Addresses(words[3], words[5], server.pid)
+        finally:
+            server.terminate()
+            try:
+                server.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                server.kill()
 
 
 def _read(name: str, path: str | Path | None) -> bytes | None:

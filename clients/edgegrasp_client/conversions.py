@@ -1,6 +1,7 @@
 """Grasps in the conventions of other programs; nothing of theirs is imported.
 
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
+- Rotations as quaternions xyzw.
 - `moveit_msgs/Grasp`, as a dictionary of its fields.
 - `isaac_grasp` YAML 1.0, as Isaac Sim's Grasp Editor and as Isaac ROS have it; needs the extra
   `yaml`.
@@ -8,7 +9,7 @@
 Pictures of the frames stand in docs/frames.md.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, Literal
@@ -16,8 +17,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_camera.poses import matrix_from_quaternion as matrix_from_quaternion
-from edgegrasp_camera.poses import quaternion_from_matrix as quaternion_from_matrix
 from edgegrasp_client.results import Grasp
 
 Float64 = NDArray[np.float64]
@@ -181,23 +180,6 @@ def moveit_grasp(
     }
 
 
-def pose_from_moveit_grasp(
-    message: Mapping[str, Any], T_hand_link: ArrayLike | None = None
-) -> Float64:
-    """T_cloud_hand of a `moveit_msgs/Grasp` given as a dictionary of its fields.
-
-    Only its `grasp_pose` is read; `T_hand_link` (4, 4) is as for `moveit_grasp`.
-
-    Returns:
-        (4, 4).
-    """
-    pose = message["grasp_pose"]["pose"]
-    rotation = matrix_from_quaternion([pose["orientation"][axis] for axis in "xyzw"])
-    T_cloud_link = _transform(rotation, [pose["position"][axis] for axis in "xyz"])
-    T_cloud_hand: Float64 = T_cloud_link @ np.linalg.inv(_matrix(T_hand_link))
-    return T_cloud_hand
-
-
 @dataclass(frozen=True, eq=False)
 class IsaacGrasp:
     """One grasp of an `isaac_grasp` file."""
@@ -275,6 +257,52 @@ def read_isaac_grasps(text: str) -> list[IsaacGrasp]:
     if not isinstance(grasps, dict):
         raise ValueError(f"grasps: got a {type(grasps).__name__}. Give a mapping of names.")
     return [_isaac_grasp(name, grasp) for name, grasp in grasps.items()]
+
+
+def quaternion_from_matrix(rotation: ArrayLike) -> Float64:
+    """The unit quaternion of a rotation, its w not negative.
+
+    Args:
+        rotation: (3, 3) orthonormal up to rounding.
+
+    Returns:
+        (4,) x, y, z, w.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    multiples = np.empty((4, 4))  # of the quaternion, by 4x, 4y, 4z and 4w
+    multiples[:3, :3] = r + r.T + (1.0 - np.trace(r)) * np.eye(3)
+    multiples[:3, 3] = multiples[3, :3] = x, y, z
+    multiples[3, 3] = 1.0 + np.trace(r)
+    longest = multiples[np.argmax(np.diag(multiples))]  # the most precise
+    quaternion: Float64 = longest / np.linalg.norm(longest)
+    return -quaternion if quaternion[3] < 0 else quaternion
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Float64:
+    """The rotation of a quaternion.
+
+    Args:
+        quaternion: (4,) x, y, z, w; of any length but zero.
+
+    Returns:
+        (3, 3).
+
+    Raises:
+        ValueError: Its length is zero or not finite.
+    """
+    q = np.asarray(quaternion, dtype=np.float64)
+    length = np.linalg.norm(q)
+    if not np.isfinite(length) or length < 1e-12:
+        raise ValueError(f"quaternion: got {q.tolist()}. Give x, y, z, w that are not all zero.")
+    x, y, z, w = q / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _transform(rotation: Float64, position: ArrayLike) -> Float64:

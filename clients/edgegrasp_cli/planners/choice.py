@@ -107,7 +107,7 @@ def named_planner(name: str) -> Planner:
 @contextmanager
 def _server(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlanner]:
     from edgegrasp_cli.planners.detection import ServerPlanner, model_used
-    from edgegrasp_client.local_server import Addresses, local_server
+    from edgegrasp_client.connection import Addresses, local_server
 
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
-from edgegrasp_camera.poses import matrix_from_quaternion, quaternion_from_matrix
 from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_in_scene, on_mask
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
     Float64,
+    matrix_from_quaternion,
     moveit_grasp,
+    quaternion_from_matrix,
 )
 from edgegrasp_client.options import DetectOptions
 from edgegrasp_sim.picture import fork
