@@ -15,7 +15,6 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import httpx
 import numpy as np
@@ -69,9 +68,6 @@ def test_files_and_folders_that_pages_link_to_exist() -> None:
     for page in (*ROOT.glob("*.md"), *DOCS.glob("*.md")):
         for name in re.findall(r"\]\((?!https?:)([^)#]+)[^)]*\)", page.read_text()):
             assert (page.parent / name).exists(), f"{page.name}: {name}"
-    folders = re.findall(r"^\| `([a-z_/0-9]+/[a-z_/0-9]*)` \|", PAGES["README.md"], re.MULTILINE)
-    assert len(folders) >= 5
-    assert [name for name in folders if not (ROOT / name).exists()] == []
 
 
 def test_variables_that_the_pages_name_exist() -> None:
@@ -107,8 +103,6 @@ def test_the_python_of_the_pages_runs(dummy_server, tmp_path: Path, monkeypatch)
     given = {"depth": depth, "depth_scale": 0.001, "intrinsics": (60.0, 60.0, 15.5, 11.5)}
     given |= {"points": points, "mask": depth > 550, "T_base_camera": np.eye(4)}
     given |= {"camera": lambda: [points.reshape(-1, 3)], "use": print}
-    image = {"height": 24, "width": 32, "step": 64, "data": depth.tobytes(), "encoding": "16UC1"}
-    given |= {"message": SimpleNamespace(**image), "info": SimpleNamespace(k=np.eye(3))}
     addresses = r"127\.0\.0\.1:50051|unix:/run/edgegrasp/grpc\.sock"
     ran = 0
     for name in PAGES:
@@ -129,7 +123,7 @@ def test_the_python_of_the_pages_runs(dummy_server, tmp_path: Path, monkeypatch)
             with contextlib.redirect_stdout(io.StringIO()):
                 exec(compiled, names)
             ran += 1
-    assert ran >= 12
+    assert ran >= 10
 
 
 def test_the_commands_of_the_pages_exist_and_have_their_flags(monkeypatch) -> None:
