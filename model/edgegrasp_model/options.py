@@ -1,7 +1,7 @@
 """What a caller may ask of one detection: the one definition of every option.
 
-The command line's flags, the OpenAPI document and the table in the documentation are made from these
-models; the gRPC messages and the client's types have the same fields, which a test compares.
+The command line's flags, the OpenAPI document and the table in the documentation are made from
+these models; the gRPC messages and the client's types have the same fields, which a test compares.
 """
 
 import base64
