@@ -77,6 +77,18 @@ def camera(polar: float, azimuth: float, distance: float) -> np.ndarray:
     return T_world_camera
 
 
+def to_world(T_world_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (..., 3) of the camera's frame in the world's."""
+    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
+
+def seen_in_world(boxes: list[SolidBox], T_world_camera: np.ndarray) -> np.ndarray:
+    """The points (N, 3) of boxes that a camera sees, in the world's frame."""
+    cloud = render(boxes, T_world_camera).reshape(-1, 3)
+    seen = cloud[np.isfinite(cloud).all(axis=1)]
+    return to_world(T_world_camera, seen).astype(np.float32)
+
+
 def render(boxes: list[SolidBox], T_world_camera: np.ndarray, seed: int = 0) -> np.ndarray:
     """The organised cloud (HEIGHT, WIDTH, 3) in the camera's frame, NaN where nothing is seen."""
     row, column = np.indices((HEIGHT, WIDTH))

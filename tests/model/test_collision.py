@@ -5,14 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.collision import (
-    FINGER_CLEARANCE,
     clearances,
     collides,
     hits_cloud,
-    met_first,
-    required_openings,
 )
-from edgegrasp_model.hand_view import APPROACH_LENGTH, hand_views, reach_of
+from edgegrasp_model.hand_view import APPROACH_LENGTH
 from edgegrasp_model.options import Collision, OrientedBox, SupportPlane
 from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes
@@ -54,19 +51,6 @@ def cloud_of(*points: tuple[float, float, float]) -> Cloud:
 )
 def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hits: bool) -> None:
     assert hits_cloud(cloud_of(point), HAND, PANDA, Collision()).tolist() == [hits]
-
-
-def test_the_opening_is_what_lies_between_the_fingers_and_clearance() -> None:
-    for points, opening in (
-        (
-            [(0.0, 0.012, 0.10), (0.0, -0.02, 0.09), (0.0, 0.03, 0.12)],
-            2 * (0.02 + FINGER_CLEARANCE),
-        ),
-        ([(0.0, 0.039, 0.10)], PANDA.max_opening),
-    ):
-        view = hand_views(cloud_of(*points), HAND, reach_of(PANDA))
-        met = met_first(view, PANDA)
-        np.testing.assert_allclose(required_openings(met, PANDA), opening, atol=1e-6)
 
 
 def scene() -> Scene:

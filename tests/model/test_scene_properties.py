@@ -9,7 +9,7 @@ from edgegrasp_model.results import SUPPORT, Detection
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_sim.segmentation import Segmentation, compare
 
-from .rendered import BACKGROUND, SolidBox, box, boxes_on_table, camera, render, table
+from .rendered import BACKGROUND, SolidBox, box, boxes_on_table, camera, render, table, to_world
 from .scenes import detector
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -38,8 +38,7 @@ def told_apart(
     return compare(truth, np.maximum(found.debug.labels + 1, 0))
 
 
-@pytest.mark.parametrize("added", sorted(ADDED))
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(("seed", "added"), [(1, "wall"), (2, "floor"), (3, "carton")])
 def test_a_wall_a_floor_or_a_carton_changes_no_object(seed: int, added: str) -> None:
     objects, pose = boxes_on_table(seed), camera(0.75, -1.4 + 0.2 * seed, 0.85)
     for others in ([table()], [table(), *ADDED[added]]):
@@ -57,7 +56,7 @@ def test_a_camera_turned_about_its_axis_sees_the_same_objects(roll: float) -> No
     for T_world_camera in (pose, pose @ turn):
         found = ask(render(scene, T_world_camera))
         centers = np.array([one.center for one in found.objects])
-        places.append(centers @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+        places.append(to_world(T_world_camera, centers))
         assert found.support is not None
         planes.append(T_world_camera[:3, :3] @ found.support.normal)
     assert len(places[0]) == len(places[1]) == 4
