@@ -49,13 +49,13 @@ def _options() -> Rows:
                 todo.append(objects[name])
     for name, part in objects.items():
         prefix = "" if name == "DetectOptions" else f"{name}."
+        fields = dict(part["properties"])
         if prefix:
-            yield [f"**{name}**", "object", "", _text(part)]
+            tag = fields.pop("kind", None)
+            shown = "object" if tag is None else f'object, `"kind": "{tag["const"]}"`'
+            yield [f"**{name}**", shown, "", _text(part)]
         required = part.get("required", ())
-        for field, value in part["properties"].items():
-            if field == "kind":
-                yield [f"`{prefix}kind`", f'`"{value["const"]}"`', "", ""]
-                continue
+        for field, value in fields.items():
             default = "required" if field in required else _default(value["default"])
             yield [f"`{prefix}{field}`", _kind(value), default, _text(value)]
 
