@@ -20,7 +20,6 @@ from pydantic import Field
 from edgegrasp_camera.errors import EdgeGraspError
 from edgegrasp_cli.drawing import draw, pixels, sent_cloud
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
-from edgegrasp_client.conversions import quaternion_from_matrix
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -283,6 +282,8 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
 
 def _short(found: "Detection") -> str:
     """What an agent needs of a detection, as JSON in few digits."""
+    from edgegrasp_client.conversions import quaternion_from_matrix
+
     grasps = [
         {
             "score": round(grasp.score, 3),
