@@ -254,23 +254,11 @@ def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[i
                     models.check(request.model_name, request.model_version)
                 return models.infer(request.model_name, tensors, parameters, seconds, wanted)
 
-            answer = _or_abort(context, infer)
-            outputs = [
-                messages.ModelInferResponse.InferOutputTensor(
-                    name=name, datatype=OUTPUTS[name][0], shape=array.shape
-                )
-                for name, array in answer.outputs.items()
-            ]
             return messages.ModelInferResponse(
                 model_name=request.model_name,
                 model_version=VERSION,
                 id=request.id,
-                parameters={
-                    name: messages.InferParameter(string_param=text)
-                    for name, text in answer.parameters.items()
-                },
-                outputs=outputs,
-                raw_output_contents=[array.tobytes() for array in answer.outputs.values()],
+                **_grpc_answer(_or_abort(context, infer)),
             )
 
     options = [("grpc.max_receive_message_length", max_body_bytes)]
@@ -314,6 +302,17 @@ def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
+def _grpc_answer(answer: Answer) -> dict[str, Any]:
+    """Fields of a ModelInferResponse."""
+    told = {name: {"string_param": text} for name, text in answer.parameters.items()}
+    outputs = [
+        {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
+        for name, array in answer.outputs.items()
+    ]
+    raw = [array.tobytes() for array in answer.outputs.values()]
+    return {"parameters": told, "outputs": outputs, "raw_output_contents": raw}
+
+
 def http_app(models: Models, max_body_bytes: int) -> "Starlette":
     """The REST paths of the protocol."""
     from starlette.applications import Starlette
@@ -348,12 +347,7 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
         return JSONResponse({"name": request.path_params["name"], "ready": True})
 
     async def infer(request: Request) -> Response:
-        body = bytearray()
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > max_body_bytes:
-                why = f"The body is over {max_body_bytes:,} bytes."
-                raise RefusedError("RESOURCE_EXHAUSTED", 413, why)
+        body = await _body(request, max_body_bytes)
         header = request.headers.get("inference-header-content-length")
         name = request.path_params["name"]
         if "version" in request.path_params:
@@ -378,6 +372,16 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
             Route(f"{path}/infer", infer, methods=["POST"]),
         ]
     return Starlette(routes=routes, exception_handlers={RefusedError: refused})
+
+
+async def _body(request: Any, most: int) -> bytearray:
+    """The body of a request; raises RefusedError where it is too large."""
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > most:
+            raise RefusedError("RESOURCE_EXHAUSTED", 413, f"The body is over {most:,} bytes.")
+    return body
 
 
 def _http_infer(models: Models, name: str, body: bytearray, header: str | None) -> dict[str, Any]:
