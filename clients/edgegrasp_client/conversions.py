@@ -89,20 +89,6 @@ def to_frame(T_cloud_hand: ArrayLike, frame: HandFrame) -> Float64:
     return np.asarray(T_cloud_hand, dtype=np.float64) @ frame.T_hand_frame
 
 
-def from_frame(T_cloud_frame: ArrayLike, frame: HandFrame) -> Float64:
-    """Poses of our hand frame, from those of another frame on the hand.
-
-    Args:
-        T_cloud_frame: (..., 4, 4) poses of the other frame.
-        frame: The other frame.
-
-    Returns:
-        (..., 4, 4) T_cloud_hand.
-    """
-    T_frame_hand = np.linalg.inv(frame.T_hand_frame)
-    return np.asarray(T_cloud_frame, dtype=np.float64) @ T_frame_hand
-
-
 @dataclass(frozen=True)
 class FingerJoints:
     """The joints that open and close a gripper."""
