@@ -248,12 +248,6 @@ def tilted_up() -> Case:
     return case
 
 
-def nothing_from_below() -> Case:
-    upward = {"cones": [{"direction": (0.0, 0.0, 1.0), "max_angle": 0.2}]}
-    unknown = {"gripper": "robotiq-2f-85", "viewpoint": None}  # each brings a warning more
-    return seen("packed_7-000006_0", approach_direction=upward, seed=14, **unknown)
-
-
 def score_edges() -> Case:
     name = "packed_7-000012_0"
     case, arrays = seen(name, seed=15), view(name)
@@ -275,6 +269,6 @@ def score_hand_poses() -> Case:
 
 MAKERS = (packed_plane, pile_ransac, organised_mask, depth_image, two_views, given_normals)
 MAKERS += (segments_own_gripper, robotiq_side, obstacles_clearance, indices_highest_debug)
-MAKERS += (tilted_up, nothing_from_below, score_edges, score_hand_poses)
+MAKERS += (tilted_up, score_edges, score_hand_poses)
 CASES = {make.__name__: make for make in MAKERS}
 OVER_THE_WIRE = ("depth_image", "segments_own_gripper", "score_edges")

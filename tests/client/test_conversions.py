@@ -66,15 +66,6 @@ def test_quaternions_and_matrices_are_those_of_scipy(quaternion: tuple[float, ..
     assert np.linalg.norm(found) == pytest.approx(1.0)
 
 
-def test_a_quaternion_is_xyzw() -> None:
-    quarter_about_z = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    np.testing.assert_allclose(
-        quaternion_from_matrix(quarter_about_z), [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
-    )
-    with pytest.raises(ValueError, match="not all zero"):
-        matrix_from_quaternion([0, 0, 0, 0])
-
-
 @given(pose=poses(), frame=st.sampled_from(FRAMES))
 def test_frames_turn_and_move(pose: np.ndarray, frame: HandFrame) -> None:
     np.testing.assert_allclose(to_frame(pose, frame), pose @ frame.T_hand_frame, atol=1e-12)

@@ -89,31 +89,6 @@ def test_background_around_them_makes_no_other_objects(seed: int, around: set[st
         assert grasp.object in {each.number for each in crowded.objects}
 
 
-@given(seed=st.integers(0, SEED))
-@settings(max_examples=4)
-def test_a_scene_moved_with_its_camera_has_the_same_answer_moved(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    cloud = render(
-        [table(), *boxes_on_table(seed), *BACKGROUND["wall"], *BACKGROUND["floor"]], view(rng)
-    )
-    turn, shift = Rotation.random(rng=rng), rng.uniform(-0.5, 0.5, 3)
-    moved = (turn.apply(cloud.reshape(-1, 3).astype(np.float64)) + shift).reshape(cloud.shape)
-    here, there = detect(cloud), detect(moved, viewpoint=shift.tolist())
-    assert here.support is not None
-    assert there.support is not None
-    assert there.support.normal @ turn.apply(here.support.normal) > 1 - 1e-5
-    np.testing.assert_allclose(there.up, turn.apply(here.up), atol=1e-3)
-    assert len(there.objects) == len(here.objects)
-    for one, other in zip(here.objects, there.objects, strict=True):
-        np.testing.assert_allclose(turn.apply(one.center) + shift, other.center, atol=0.004)
-    assert here.grasps
-    assert there.grasps
-    best = here.grasps[0]
-    contact = turn.apply(best.contact_point) + shift
-    apart = [np.linalg.norm(grasp.contact_point - contact) for grasp in there.grasps]
-    assert min(apart) < 0.05  # voxels lie otherwise, and so do approach points
-
-
 @pytest.mark.parametrize("polar", [0.05, 0.4])
 @pytest.mark.parametrize("height", [0.045, 0.12])
 def test_a_bin_has_contents_and_no_rims(polar: float, height: float) -> None:
