@@ -22,7 +22,7 @@ from edgegrasp_camera.errors import InvalidRequest as InvalidRequest
 def invalid_fields(
     error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
 ) -> InvalidRequest:
-    """Say the first thing wrong in a validation error as field, value and fix.
+    """Give the first fault of a validation error as field, value and fix.
 
     Args:
         error: Of pydantic.

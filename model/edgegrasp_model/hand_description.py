@@ -66,7 +66,7 @@ def describe_hands(
         support: Plane that heights are measured from; None where it is unknown.
         viewpoints: (W, 3) the cameras; None where they are unknown. Of several, nothing but what
             none of them saw is described.
-        at_side: (N,) points where a side of the workspace cuts things off: what is between the
+        at_side: (N,) points where a side of the workspace cuts objects off: what is between the
             fingers there may be wider than it seems. None: nowhere.
         view: `hand_views` of the same candidates, where the caller has it already.
         object_of_point: (N,) the object that each point belongs to; None: all to one.
@@ -127,7 +127,7 @@ class _Seen(NamedTuple):
 
     hits: Float32  # (E, 7) as `_count_hits` orders them
     between: Float32  # (E, 29) as `_measure_between` orders them
-    cut_off: Float32  # (E,) between the fingers, where a side of the workspace cuts things off
+    cut_off: Float32  # (E,) between the fingers, where a side of the workspace cuts objects off
     first_met: Float32  # (E, 2) greatest and least y between the fingers; 0 where nothing is
     runs: Float32  # (E, 3) as `_runs_along` orders them
 

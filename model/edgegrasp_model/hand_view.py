@@ -119,7 +119,7 @@ SEEN_LENGTH = 0.0465  # metres of the fingers, from their tips: the Panda's are 
 def seen_part(gripper: Gripper) -> Gripper:
     """The same hand with its palm at most so far behind its fingertips.
 
-    What holds a thing is the ends of the fingers: there, hands of any length look alike.
+    The ends of the fingers hold an object: relative to them, hands of any length look alike.
     """
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 

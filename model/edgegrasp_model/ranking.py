@@ -114,7 +114,7 @@ def ranked(
         score: (E,) probabilities.
         collision_free: (E,) the others' scores are worth COLLIDING as much.
         order: By score; by height where the score is SURE_SCORE or more, then the others by
-            score; or those free of collision first, by clearance, then by score.
+            score; or collision-free ones first, by clearance, then by score.
         height: (E,) of the TCP along up, for `highest`.
         clearance: (E,) for `clearance`.
     """
@@ -179,7 +179,7 @@ def _far_side_hidden(
 
 
 def found_support(support: Support | None) -> FoundSupport | None:
-    """A support as it is told to the caller."""
+    """A support as it is returned to the caller."""
     if support is None:
         return None
     residual = None if math.isnan(support.residual) else support.residual

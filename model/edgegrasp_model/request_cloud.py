@@ -70,7 +70,7 @@ def decode_cloud(
         The cloud; and the options, in which the cameras of depth images are the viewpoints.
 
     Raises:
-        InvalidRequest: It cannot be decoded, or the same thing is sent twice.
+        InvalidRequest: It cannot be decoded, or an array is sent twice.
         PayloadTooLarge: More than `max_points` points.
         UnsupportedMediaType: There is no reader for the file's format.
     """

@@ -117,7 +117,7 @@ def drawn_image(scale: float = 1.0) -> dict[str, Any]:
 
 
 def seen(name: str, table_seed: int | None = None, **options: Any) -> Case:
-    """A labelled view, with its camera as viewpoint and, unless told otherwise, its table."""
+    """A labelled view, with its camera as viewpoint and, by default, its table."""
     points = view(name)["points"]
     options = {"viewpoint": camera(name), "support": TABLE} | options
     return Case(options, points if table_seed is None else with_table(points, table_seed))

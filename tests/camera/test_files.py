@@ -249,8 +249,8 @@ def test_an_archive_of_a_depth_image_and_what_is_not_read() -> None:
         assert np.shape(cloud.points) == np.shape(cloud.colors) == (4, 6, 3)
         np.testing.assert_allclose(cloud.points[1, 2], [-0.5 / 12, -0.5 / 12, 0.5], atol=1e-6)
         assert cloud.warnings == ("arrays of the file that are not read: labels.",)
-    (told,) = read_file("npz", npz(points=POINTS, colours=POINTS), MANY).warnings
-    assert "colours" in told
+    (warning,) = read_file("npz", npz(points=POINTS, colours=POINTS), MANY).warnings
+    assert "colours" in warning
     with pytest.raises(InvalidRequest, match=r"cloud\.intrinsics"):
         read_file("npz", npz(depth=depth, intrinsics=np.ones(3)), MANY)
 

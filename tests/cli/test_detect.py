@@ -129,13 +129,13 @@ def test_a_picture_shows_the_cloud_its_grasps_and_the_region(
 
 
 def test_a_picture_that_cannot_be_written_is_refused_before_any_work(refused, tmp_path) -> None:
-    for name, told in (
+    for name, message in (
         ("seen.gif", "Name a file .png or"),
         ("seen", "Name a file"),
         ("nowhere/seen.png", "there is no folder"),
     ):
         shown = refused("detect", tmp_path / "no.npy", "--picture", tmp_path / name)
-        assert told in " ".join(shown.split())
+        assert message in " ".join(shown.split())
 
 
 def test_several_depth_images_are_one_cloud(camera_files, dummy_server, run, refused) -> None:

@@ -73,9 +73,9 @@ class FailingServer(grasp_pb2_grpc.GraspServiceServicer):
             return httpx.Response(200, json=body | found)
         if not problem.kind:
             return httpx.Response(problem.status, text="<html>")
-        told = {"detail": "what happened", "field": "f", "value": "v", "fix": "x"}
-        told |= {"type": f"urn:edgegrasp:error:{problem.kind}"}
-        return httpx.Response(problem.status, json=told | {"retry_after": problem.retry_after})
+        document = {"detail": "what happened", "field": "f", "value": "v", "fix": "x"}
+        document |= {"type": f"urn:edgegrasp:error:{problem.kind}"}
+        return httpx.Response(problem.status, json=document | {"retry_after": problem.retry_after})
 
 
 @pytest.fixture

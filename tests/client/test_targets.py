@@ -21,11 +21,11 @@ def test_a_mask_narrows_the_regions_that_are_asked_for() -> None:
 def test_an_object_is_cut_out_of_the_scene_that_repeats_it() -> None:
     rng = np.random.default_rng(0)
     scene = rng.uniform(-0.3, 0.3, (4000, 3))
-    thing = np.linalg.norm(scene - 0.1, axis=1) < 0.08
+    wanted = np.linalg.norm(scene - 0.1, axis=1) < 0.08
     holed = np.concatenate([scene, [[np.nan] * 3]])
-    for around in (holed, scene[~thing]):
-        cloud, segment_ids = object_in_scene(scene[thing], around)
-        np.testing.assert_array_equal(cloud[segment_ids == 1], scene[thing].astype(np.float32))
+    for around in (holed, scene[~wanted]):
+        cloud, segment_ids = object_in_scene(scene[wanted], around)
+        np.testing.assert_array_equal(cloud[segment_ids == 1], scene[wanted].astype(np.float32))
         far = np.linalg.norm(cloud[segment_ids == 0] - 0.1, axis=1)
         assert far.min() > 0.07
-        assert 0.97 * (~thing).sum() < len(far) <= (~thing).sum()
+        assert 0.97 * (~wanted).sum() < len(far) <= (~wanted).sum()

@@ -52,12 +52,12 @@ def infer(body: bytes, header: str | None = None) -> None:
 @contextlib.contextmanager
 def refused() -> Iterator[None]:
     """What is inside may be refused as the caller's fault."""
-    told = None
+    refusal = None
     try:
         yield
     except open_inference.RefusedError as error:
-        told = error
-    assert told is None or (400 <= told.status < 500 and str(told).encode())
+        refusal = error
+    assert refusal is None or (400 <= refusal.status < 500 and str(refusal).encode())
 
 
 @given(changed(INFER) | VALUES)
@@ -130,10 +130,10 @@ def test_arguments_of_an_agent(tools: Any, data: st.DataObject) -> None:
     for field in ("point_cloud_file", "depth_file", "mask_file"):
         if field in arguments and data.draw(st.booleans()):
             arguments[field] = data.draw(st.sampled_from(NAMES))
-    told: ToolError | None = None
+    refusal: ToolError | None = None
     try:
         asyncio.run(tools.call_tool(name, arguments))
     except ToolError as error:
-        told = error
-    assert not isinstance(told, UnexpectedToolError), told.__cause__
-    assert "agent0" not in str(told)  # the folder's own path
+        refusal = error
+    assert not isinstance(refusal, UnexpectedToolError), refusal.__cause__
+    assert "agent0" not in str(refusal)  # the folder's own path

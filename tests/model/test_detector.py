@@ -45,9 +45,9 @@ def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:
     cloud = render([table(), *boxes_on_table(1)], camera(0.7, 0.0, 0.9)).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     network = ModelCatalogue.load().get("edgegrasp-plus")
-    told = network.detect(cloud, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
+    given = network.detect(cloud, DetectOptions(viewpoint=(0.0, 0.0, 0.0)))
     assumed = network.detect(cloud)
-    assert same(told, assumed)
+    assert same(given, assumed)
     assert len(assumed.grasps) > 0
     assert any("the camera is assumed at the origin" in each for each in assumed.warnings)
 

@@ -209,8 +209,8 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
         shallowest = gripper.contact_z - gripper.tip_z + TIP_MARGIN
         assert shallowest - 1e-3 < further_in < MAX_INSERTION + 2e-3
         assert grasp.width <= np.float32(gripper.max_opening)
-    told = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
-    assert told == (gripper.name != "panda")
+    warned = any("trained for the gripper 'panda'" in warning for warning in found.warnings)
+    assert warned == (gripper.name != "panda")
 
 
 def test_weights_that_learned_from_many_hands_promise_as_much_for_any_other() -> None:

@@ -84,14 +84,14 @@ LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
 )
 def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> None:
     floor = {"normal": (0, 0, 1), "offset": 0.0}
-    told = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
-    asked = parse_options(told | {"approach_direction": {"preset": "top-down"}} | options)
-    (thing,) = hopeless().detect(seen_box(*size), asked).objects
-    assert thing.reason == reason
+    known = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
+    asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
+    (single,) = hopeless().detect(seen_box(*size), asked).objects
+    assert single.reason == reason
 
 
 def test_an_object_with_a_good_grasp_needs_no_reason() -> None:
-    (thing,) = (
+    (single,) = (
         ModelCatalogue.load()
         .get("edgegrasp-plus")
         .detect(
@@ -100,6 +100,6 @@ def test_an_object_with_a_good_grasp_needs_no_reason() -> None:
         )
         .objects
     )
-    assert thing.best_score is not None
-    assert thing.best_score > 0.5
-    assert thing.reason is None
+    assert single.best_score is not None
+    assert single.best_score > 0.5
+    assert single.reason is None

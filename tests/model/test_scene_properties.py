@@ -97,17 +97,17 @@ def test_a_mask_of_the_caller_wins() -> None:
 
 
 def test_segments_stand_on_what_lies_below_them_not_on_the_top_of_a_carton() -> None:
-    carton, thing = (
+    carton, small = (
         box((-0.3, -0.3, 0.15), (0.4, 0.5, 0.15)),
         box((0.3, 0.2, 0.05), (0.02, 0.02, 0.05)),
     )
-    boxes, pose = [thing, carton, table(0.8, 0.7)], camera(0.9, -np.pi / 2, 0.9)
+    boxes, pose = [small, carton, table(0.8, 0.7)], camera(0.9, -np.pi / 2, 0.9)
     segments = (seen_box(boxes, pose) == 0).astype(np.int32)
     found = ask(CloudInput(render(boxes, pose), segment_ids=segments))
     assert found.support is not None
     assert found.grasps
-    height = (thing.center - pose[:3, 3]) @ pose[:3, :3] @ found.support.normal
-    assert height - found.support.offset == pytest.approx(thing.half[2], abs=0.005)
+    height = (small.center - pose[:3, 3]) @ pose[:3, :3] @ found.support.normal
+    assert height - found.support.offset == pytest.approx(small.half[2], abs=0.005)
 
 
 def test_every_row_is_labelled_with_an_object_the_support_or_neither() -> None:

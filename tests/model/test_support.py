@@ -112,8 +112,8 @@ def test_every_view_has_a_factor_of_its_own() -> None:
     corrected = correct_depth_scale(cloud, SupportPlane(**PLANE), cameras, warnings)
     np.testing.assert_allclose(corrected.points, np.concatenate(clean), atol=0.003)
     assert len(warnings) == 2
-    for warning, *told in zip(warnings, ("view 0", "view 2"), ("1.04", "0.95"), strict=True):
-        assert all(text in warning for text in told)
+    for warning, *said in zip(warnings, ("view 0", "view 2"), ("1.04", "0.95"), strict=True):
+        assert all(text in warning for text in said)
 
 
 def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]:
@@ -130,8 +130,8 @@ def built(points: np.ndarray, **support: object) -> tuple[np.ndarray, list[str]]
 
 def test_a_scene_is_the_same_after_wrong_depths_where_that_is_asked_for() -> None:
     points = scene(np.random.default_rng(4))
-    (right, quiet), (corrected, told) = built(points), built(seen(points, 1.06))
-    assert (len(quiet), len(told)) == (0, 1)
+    (right, quiet), (corrected, said) = built(points), built(seen(points, 1.06))
+    assert (len(quiet), len(said)) == (0, 1)
     assert abs(len(right) - len(corrected)) < 0.05 * len(right)
     np.testing.assert_allclose(right.max(axis=0), corrected.max(axis=0), atol=0.004)
     np.testing.assert_allclose(right.min(axis=0), corrected.min(axis=0), atol=0.004)

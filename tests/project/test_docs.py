@@ -56,8 +56,8 @@ def commands() -> Iterator[tuple[str, list[str]]]:
     """The name of the page and the words of each command that it shows."""
     for name, block in blocks("console"):
         for line in re.findall(r"^[$#] ((?:.*\\\n)*.*)$", block, re.MULTILINE):
-            told = re.sub(r"\s#.*", "", line.replace("\\\n", " "))
-            for command in re.split(r"&&|;", told):
+            shown = re.sub(r"\s#.*", "", line.replace("\\\n", " "))
+            for command in re.split(r"&&|;", shown):
                 words = shlex.split(command)
                 while words and re.match(r"[A-Z_]+=", words[0]):
                     words.pop(0)
@@ -133,23 +133,23 @@ def test_the_commands_of_the_pages_exist_and_have_their_flags(monkeypatch) -> No
     for page, words in commands():
         program = words[0]
         seen.add(program)
-        told = f"{page}: {' '.join(words)}"
+        shown = f"{page}: {' '.join(words)}"
         if program == "edgegrasp":
             command = load_command(words[1])
             if hasattr(command, "commands") and words[2] in command.commands:
                 command = command.commands[words[2]]
             flags = {flag for each in command.params for flag in (*each.opts, *each.secondary_opts)}
             used = {word.partition("=")[0] for word in words if word.startswith("--")}
-            assert used - {"--help"} <= flags, told
+            assert used - {"--help"} <= flags, shown
         elif program == "make":
             asked = [word for word in words[1:] if "=" not in word]
-            assert set(asked) <= set(targets), told
+            assert set(asked) <= set(targets), shown
         elif program in ("python", ".venv/bin/python"):
             module = words[1] == "-m"
             here = importlib.util.find_spec(words[2]) if module else (ROOT / words[1]).exists()
-            assert here, told
+            assert here, shown
         else:
-            assert program in OTHERS | {"curl"}, told
+            assert program in OTHERS | {"curl"}, shown
     assert {"edgegrasp", "make", "python", "curl"} <= seen
 
 
@@ -185,11 +185,11 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
     write_what_commands_read(tmp_path)
     detected = set()
     for page, words in commands():
-        told = " ".join(words)
-        if page not in ("README.md", "index.md") or told in detected:
+        shown = " ".join(words)
+        if page not in ("README.md", "index.md") or shown in detected:
             continue
-        assert not re.search(r"\b[A-Z_]{4,}\b|~/", told), f"{page}: {told} has a placeholder"
-        for file in re.findall(r"(?<!picture )(?<![\w/])[\w/]+\.(?:png|ply|npz|npy)", told):
+        assert not re.search(r"\b[A-Z_]{4,}\b|~/", shown), f"{page}: {shown} has a placeholder"
+        for file in re.findall(r"(?<!picture )(?<![\w/])[\w/]+\.(?:png|ply|npz|npy)", shown):
             assert (tmp_path / file).exists(), f"{page}: nobody has {file}"
         if words[:2] == ["edgegrasp", "detect"]:
             program = "from edgegrasp_cli.main import main; main()"
@@ -198,7 +198,7 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
             assert done.returncode == 0, done.stderr
             with Image.open(tmp_path / words[words.index("--picture") + 1]) as picture:
                 assert min(picture.size) > 300
-            detected.add(told)
+            detected.add(shown)
     assert detected
 
 

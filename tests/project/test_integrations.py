@@ -23,7 +23,7 @@ class Part(SimpleNamespace):
 
 
 def test_the_code_of_the_page_runs(start_dummy, tmp_path, monkeypatch) -> None:
-    """MoveIt is a stand-in that keeps what it is told; the server has the dummy detector."""
+    """MoveIt is a stand-in that records its calls; the server has the dummy detector."""
     pytest.importorskip("yaml", reason="the extra `yaml` is not installed")
     constructor = MagicMock()
     for name, module in (

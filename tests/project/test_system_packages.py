@@ -40,7 +40,7 @@ def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    ("lacks", "machine_is", "code", "told"),
+    ("lacks", "machine_is", "code", "message"),
     [
         ("none", {}, 0, ""),
         (f'*"{VENV_CHECK}"*|*libusb*', {}, 0, ""),
@@ -52,11 +52,11 @@ def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
     ],
 )
 def test_what_is_missing_is_installed_by_root_and_told_to_others(
-    tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, told: str
+    tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, message: str
 ) -> None:
     done = run(machine(tmp_path, lacks=lacks, **machine_is))
     assert done.returncode == code, done.stderr
-    assert told in done.stdout + done.stderr
+    assert message in done.stdout + done.stderr
     installed = tmp_path / "apt.log"
     assert installed.exists() == (VENV_CHECK in lacks)
     if installed.exists():

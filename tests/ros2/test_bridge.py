@@ -76,8 +76,8 @@ def make_image(sent) -> Callable[..., Any]:
         flat = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
         rows = np.pad(flat, ((0, 0), (0, padding)))
         size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": rows.shape[1]}
-        told = {"header": HEADER, "encoding": encoding, "data": rows.ravel()}
-        return sent("sensor_msgs/msg/Image", size | told)
+        fields = {"header": HEADER, "encoding": encoding, "data": rows.ravel()}
+        return sent("sensor_msgs/msg/Image", size | fields)
 
     return make_image
 
@@ -221,14 +221,14 @@ def test_a_mask_says_where(asked, make_image, camera, encoding) -> None:
 def test_an_object_and_its_scene_come_apart(asked, make_cloud, make_image, camera, bigendian):
     organised = np.full((4, 50, 3), np.nan, np.float32)
     organised[1:] = np.random.default_rng(0).uniform(0.3, 0.4, (3, 50, 3))
-    thing = organised[2, :20]
-    in_base = thing @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
+    wanted = organised[2, :20]
+    in_base = wanted @ T_base_camera[:3, :3].T + T_base_camera[:3, 3]
     cluster = make_cloud(in_base, "base", bigendian)
     scene = Scene(make_cloud(organised, bigendian=bigendian))
     bridge.detect(asked, scene, Settings(), {}, lookup, cluster)
     segment_ids = asked.given["segment_ids"]
-    np.testing.assert_allclose(asked.cloud[segment_ids == 1], thing, atol=1e-5)
-    assert len(thing) + 100 < len(asked.cloud) <= 150
+    np.testing.assert_allclose(asked.cloud[segment_ids == 1], wanted, atol=1e-5)
+    assert len(wanted) + 100 < len(asked.cloud) <= 150
 
     bridge.detect(
         asked,
@@ -325,7 +325,7 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
     empty = sent("sensor_msgs/msg/CameraInfo", {"header": HEADER})
     flat = make_cloud(cloud)
     flat.fields[0].name = "intensity"
-    for scene, cluster, told in (
+    for scene, cluster, message in (
         (Scene(), None, "No cloud and no depth image has come yet"),
         (Scene(depth=image), None, "no CameraInfo yet"),
         (Scene(depth=image, camera=empty), None, "p and k are 0"),
@@ -333,5 +333,5 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
         (Scene(depth=make_image(DEPTH.astype("i4"), "32SC1"), camera=camera), None, "'32SC1' for"),
         (Scene(make_cloud(cloud)), flat, "Send x too, as 7"),
     ):
-        with pytest.raises((ValueError, InvalidRequest), match=told):
+        with pytest.raises((ValueError, InvalidRequest), match=message):
             bridge.detect(client, scene, Settings(), {}, lookup, cluster)

@@ -114,7 +114,7 @@ class HandBatch:
 def hand_batch(
     scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
 ) -> HandBatch:
-    """What the hand network is told of some candidates of a scene."""
+    """The input of the hand network for some candidates of a scene."""
     return HandBatch.from_cloud(
         scene.cloud,
         candidates,
@@ -157,7 +157,7 @@ class HandNet(nn.Module):
 
         Args:
             batch: What E hands see.
-            left_out: In training, draws what the classifier is not told; None: it is told all.
+            left_out: In training, draws inputs that the classifier does not get; None: gets all.
         """
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
