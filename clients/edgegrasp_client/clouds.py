@@ -13,9 +13,9 @@ from typing_extensions import NotRequired, TypedDict
 
 from edgegrasp_camera.clouds import PointCloud2
 from edgegrasp_camera.depth import intrinsics_of
+from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.errors import invalid
 
-FILE_FORMATS = ("npy", "npz", "ply", "pcd", "xyz")
 DEPTH_ENCODINGS = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}
 
 
