@@ -22,6 +22,14 @@ class Part(SimpleNamespace):
         return self.__dict__[name]
 
 
+def set_fields(message: object, fields: dict) -> None:
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            set_fields(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+
+
 def test_the_code_of_the_page_runs(start_dummy, tmp_path, monkeypatch) -> None:
     """MoveIt is a stand-in that records its calls; the server has the dummy detector."""
     pytest.importorskip("yaml", reason="the extra `yaml` is not installed")
@@ -30,6 +38,7 @@ def test_the_code_of_the_page_runs(start_dummy, tmp_path, monkeypatch) -> None:
         ("geometry_msgs", MagicMock()),
         ("geometry_msgs.msg", SimpleNamespace(PoseStamped=Part)),
         ("moveit", MagicMock()),
+        ("rosidl_runtime_py", SimpleNamespace(set_message_fields=set_fields)),
         ("moveit.task_constructor", constructor),
     ):
         monkeypatch.setitem(sys.modules, name, module)
