@@ -74,7 +74,7 @@ def test_a_header_cannot_promise_more_than_there_is(count: int) -> None:
 
 
 @pytest.mark.parametrize("name", GOOD_FILES)
-def test_too_many_points(name: str) -> None:
+def test_too_many_points_are_refused(name: str) -> None:
     with pytest.raises(PayloadTooLarge) as caught:
         read_file(name[:3], GOOD_FILES[name], max_points=39)
     assert caught.value.value == "40 points"
@@ -112,7 +112,7 @@ def test_ply_headers_without_points(header: bytes) -> None:
     assert "vertices" in caught.value.fix
 
 
-def test_compressed_pcd_with_sizes_that_lie() -> None:
+def test_a_compressed_pcd_with_wrong_sizes_is_refused() -> None:
     head, mark, _ = pcd(POINTS, "binary_compressed").partition(b"DATA binary_compressed\n")
     for sizes in ((4, 10**9), (10**9, 840)):
         with pytest.raises(InvalidRequest):
@@ -174,7 +174,7 @@ def test_npz_members_are_stored_or_deflated(method: int) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_npy_headers_that_nest_deeply(version: int) -> None:
+def test_deeply_nested_npy_headers_are_refused(version: int) -> None:
     text = b"-" * 9900 + b"1"
     size = struct.pack("<H" if version == 1 else "<I", len(text))
     with pytest.raises(InvalidRequest, match="writes"):
@@ -190,7 +190,7 @@ def test_a_png_of_very_many_chunks() -> None:
     assert read_png(whole[:33] + empty * 20 + whole[33:], MANY, "depth").shape == (6, 10)
 
 
-def test_errors_of_images_tell_no_addresses() -> None:
+def test_errors_of_images_show_no_addresses() -> None:
     with pytest.raises(InvalidRequest) as caught:
         read_png(b"no image", MANY, "depth")
     assert " at 0x" not in str(caught.value)
@@ -216,7 +216,7 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_png_images(name: str) -> None:
+def test_png_images_are_read_whole_or_refused(name: str) -> None:
     whole = png(IMAGES[name])
     pixels = read_png(whole, MANY, name)
     np.testing.assert_array_equal(pixels, IMAGES[name])
@@ -255,7 +255,7 @@ def test_an_archive_of_a_depth_image_and_what_is_not_read() -> None:
         read_file("npz", npz(depth=depth, intrinsics=np.ones(3)), MANY)
 
 
-def test_what_stands_beside_points_in_an_npz_file() -> None:
+def test_arrays_beside_points_in_an_npz_file_are_read() -> None:
     arrays = {"normals": NORMALS, "colors": COLORS, "segment_ids": IDS, "view_ids": IDS}
     cloud = read_file("npz", npz(points=POINTS, **arrays), MANY)
     for name, array in arrays.items():
@@ -303,7 +303,7 @@ def test_files_written_by_open3d(suffix: str, compressed: bool, text: bool, tmp_
     np.testing.assert_allclose(found.colors * scale, COLORS, atol=1.0)
 
 
-def test_organised_clouds() -> None:
+def test_organised_clouds_keep_their_shape() -> None:
     organised = POINTS.reshape(5, 8, 3).copy()
     organised[2, 3] = np.nan
     rows = organised.astype(object)
@@ -330,7 +330,7 @@ def test_organised_clouds() -> None:
         (b"0 0 a\n", "'a'"),
     ],
 )
-def test_bad_xyz_files(data: bytes, value: str) -> None:
+def test_bad_xyz_files_are_refused(data: bytes, value: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
         read_file("xyz", data, MANY)
     assert value in caught.value.value
@@ -356,7 +356,7 @@ def npy_of(header: str, body: bytes = b"") -> bytes:
         ("'|V0'", "(1, 3)"),
     ],
 )
-def test_npy_headers_of_no_array(descr: str, shape: str) -> None:
+def test_npy_headers_of_no_array_are_refused(descr: str, shape: str) -> None:
     header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
     with pytest.raises(InvalidRequest) as caught:
         read_file("npy", npy_of(header, bytes(12)), MANY)
@@ -364,7 +364,7 @@ def test_npy_headers_of_no_array(descr: str, shape: str) -> None:
 
 
 @pytest.mark.parametrize("count", ["1" * 5000, "1" * 4000, "99999999", "-1"])
-def test_counts_that_no_point_has(count: str) -> None:
+def test_impossible_counts_of_a_pcd_are_refused(count: str) -> None:
     for points in (-1, 0):
         data = pcd(POINTS, "ascii", points).replace(b"COUNT 1 1 1 2 1", b"COUNT 1 1 1 2 %a" % count)
         with pytest.raises(InvalidRequest):

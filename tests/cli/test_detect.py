@@ -53,7 +53,7 @@ def test_every_option_is_a_flag() -> None:
 
 
 @pytest.mark.parametrize("transport", ["grpc", "rest"])
-def test_options_of_every_kind(transport: str, file: str, dummy_server, run) -> None:
+def test_options_of_every_kind_are_flags(transport: str, file: str, dummy_server, run) -> None:
     address = dummy_server.address(transport)
     document = json.loads(run("detect", file, "--server", address, "--json", *OPTIONS))
     assert len(document["grasps"]) == 2
@@ -73,7 +73,7 @@ def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_p
         assert sentence in refused(*asked)
 
 
-def test_table(file: str, dummy_server, run) -> None:
+def test_a_table_shows_counts_and_warnings(file: str, dummy_server, run) -> None:
     output = run("detect", file, "--server", dummy_server.http_url, "--top-k", "3")
     assert "500 points" in output
     assert "Warning: The dummy detector made these grasps up." in output
@@ -187,7 +187,7 @@ def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
         (["--collision", "dodge"], "options.collision: got 'dodge'."),
     ],
 )
-def test_bad_options(options: list[str], sentence: str, file: str, dummy_server, refused) -> None:
+def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -> None:
     assert sentence in refused("detect", file, "--server", dummy_server.grpc_address, *options)
 
 
@@ -200,7 +200,9 @@ def test_bad_options(options: list[str], sentence: str, file: str, dummy_server,
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],
 )
-def test_bad_input_without_a_server(name, content, flags, sentence, refused, tmp_path) -> None:
+def test_bad_input_is_named_without_a_server(
+    name, content, flags, sentence, refused, tmp_path
+) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     assert sentence in refused("detect", tmp_path / name, *flags)
@@ -212,7 +214,7 @@ def test_a_device_that_is_not_there_is_named(file, refused, monkeypatch) -> None
     assert "Use auto, cpu, cuda" in refused("detect", file, "--device", "gpu")
 
 
-def test_models(dummy_server, run, refused) -> None:
+def test_models_are_listed_from_a_server_or_from_here(dummy_server, run, refused) -> None:
     for address in (dummy_server.grpc_address, dummy_server.http_url):
         assert "dummy" in run("models", "--server", address)
     assert "panda" in run("models")

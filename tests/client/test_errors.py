@@ -124,7 +124,7 @@ DESCRIBED = [
 
 
 @pytest.mark.parametrize(("problem", "expected"), DESCRIBED, ids=lambda value: str(value)[:40])
-def test_errors_that_the_server_describes(problem, expected, failing, cloud) -> None:
+def test_described_errors_are_the_same_exception(problem, expected, failing, cloud) -> None:
     client, server = failing([problem], retry=False)
     with pytest.raises(expected, match="what happened") as caught:
         client.detect(cloud)
@@ -157,7 +157,7 @@ NOT_DESCRIBED = {
 
 
 @pytest.mark.parametrize("row", range(6))
-def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, cloud) -> None:
+def test_errors_of_proxies_and_other_servers_are_classified(row, transport, failing, cloud) -> None:
     code, expected = NOT_DESCRIBED[transport][row]
     client, _ = failing(itertools.repeat(Problem("", code, code)), retry=False)
     with pytest.raises(GraspClientError) as caught:
@@ -167,7 +167,7 @@ def test_errors_of_proxies_and_other_servers(row: int, transport: str, failing, 
 
 
 @pytest.mark.parametrize("body", [[], {"grasps": [{}]}, {"grasps": 3}, {"detail": "Not Found"}])
-def test_json_of_another_server(body: Any, make_client, cloud) -> None:
+def test_json_of_another_server_is_a_protocol_error(body: Any, make_client, cloud) -> None:
     transport = httpx.MockTransport(lambda request: httpx.Response(200, json=body))
     client = make_client("http://elsewhere", http_transport=transport)
     with pytest.raises(ProtocolError, match="not the answer of a grasp service"):
@@ -210,7 +210,7 @@ def test_a_server_that_is_away_or_busy_is_asked_again(problems: Any, failing, cl
         (Problem("detector-failed", Code.INTERNAL, 500), {}, 1),
     ],
 )
-def test_attempts_end(problem: Problem, arguments: Any, calls: int, failing, cloud) -> None:
+def test_a_call_is_tried_as_often_as_it_can_help(problem, arguments, calls, failing, cloud) -> None:
     client, server = failing(itertools.repeat(problem), **arguments)
     with pytest.raises(dict(DESCRIBED).get(problem, GraspClientError)):
         client.detect(cloud)
@@ -232,7 +232,9 @@ def closed_port() -> int:
 
 @pytest.mark.usefixtures("hasty_retries")
 @pytest.mark.parametrize("scheme", ["", "http://"])
-def test_no_server(scheme: str, closed_port: int, make_client, cloud) -> None:
+def test_without_a_server_calls_fail_and_waiting_ends(
+    scheme: str, closed_port: int, make_client, cloud
+) -> None:
     client = make_client(f"{scheme}127.0.0.1:{closed_port}")
     for call in (client.models, lambda: client.detect(cloud)):
         with pytest.raises(ServerUnavailableError):
@@ -248,7 +250,9 @@ def slow_server(start_dummy):
         yield server
 
 
-def test_deadline(transport: str, slow_server, make_client, cloud) -> None:
+def test_a_deadline_ends_a_call_or_one_request_of_a_stream(
+    transport: str, slow_server, make_client, cloud
+) -> None:
     client = make_client(slow_server.address(transport), timeout=0.1)
     with pytest.raises(DeadlineError):
         client.detect(cloud)
@@ -260,7 +264,7 @@ def test_deadline(transport: str, slow_server, make_client, cloud) -> None:
 
 
 @pytest.mark.parametrize("size", [4_200_000, 9_000_000])  # the latter is over what gRPC reads
-def test_too_large(size: int, client) -> None:
+def test_a_cloud_that_is_too_large_is_refused(size: int, client) -> None:
     with pytest.raises(PayloadTooLargeError):
         client.detect(np.zeros((size, 3), np.float32))
     assert client.ready()

@@ -40,7 +40,7 @@ def depth_image(**changes: Any) -> Any:
     return {"depth": depth, "intrinsics": camera, "T_cloud_camera": np.eye(4)} | changes
 
 
-def test_arrays_beside_the_cloud(client, cloud) -> None:
+def test_arrays_beside_the_cloud_have_its_rows(client, cloud) -> None:
     ids = np.arange(500)
     beside = {"normals": cloud, "colors": cloud.astype(np.float64), "segment_ids": ids}
     found = client.detect(cloud, view_ids=ids % 2, viewpoint=[[0, 0, 1], [1, 0, 1]], **beside)
@@ -51,7 +51,7 @@ def test_arrays_beside_the_cloud(client, cloud) -> None:
         assert caught.value.field == name
 
 
-def test_organised_clouds(client, cloud) -> None:
+def test_organised_clouds_may_have_holes(client, cloud) -> None:
     organised = cloud.reshape(20, 25, 3).copy()
     assert contacts(client.detect(organised)) == contacts(client.detect(cloud))
     organised[3, 4] = np.nan
@@ -59,7 +59,7 @@ def test_organised_clouds(client, cloud) -> None:
     assert found.counts["points"] == 499
 
 
-def test_point_cloud2(client, cloud) -> None:
+def test_point_cloud2_messages_are_sent_as_they_are(client, cloud) -> None:
     expected = contacts(client.detect(cloud))
     assert contacts(client.detect(ros_message(cloud))) == expected
     listed = ros_message(cloud, list(cloud.tobytes()))
@@ -71,7 +71,7 @@ def test_point_cloud2(client, cloud) -> None:
     assert caught.value.field == "point_cloud2.data"
 
 
-def test_depth_images(client) -> None:
+def test_depth_images_are_sent_in_every_form(client) -> None:
     one = client.detect(depth_images=[depth_image()])
     assert one.counts["points"] == 600
     millimetres = np.round(depth_image()["depth"] * 1000).astype(np.uint16)
@@ -86,7 +86,7 @@ def test_depth_images(client) -> None:
     assert client.detect(depth_images=views, segment_ids=ids).counts["points"] == 1200
 
 
-def test_files_of_depths(client, tmp_path) -> None:
+def test_depth_files_are_read_with_their_scale(client, tmp_path) -> None:
     tenths = np.round(depth_image()["depth"] * 10000).astype(np.uint16)
     Image.fromarray(tenths).save(tmp_path / "depth.png")
     np.save(tmp_path / "depth.npy", tenths[..., None])
@@ -129,7 +129,7 @@ def test_scoring_over_any_cloud(client, cloud) -> None:
     assert client.score(depth_images=[depth_image()], edges=edges).evaluations
 
 
-def test_debug(client, cloud) -> None:
+def test_debug_returns_every_candidate(client, cloud) -> None:
     assert client.detect(cloud).debug is None
     debug = client.detect(cloud, debug=True).debug
     assert debug is not None
@@ -143,7 +143,7 @@ def test_debug(client, cloud) -> None:
     assert debug.support_plane is None
 
 
-def test_options_too_long_for_an_address(client, cloud) -> None:
+def test_options_too_long_for_a_query_are_sent(client, cloud) -> None:
     mask = np.ones((20, 25), bool)
     indices = np.arange(499)
     options: dict[str, Any] = {

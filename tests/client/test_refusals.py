@@ -52,7 +52,7 @@ def image(**changes: Any) -> dict[str, Any]:
         ({"gripper": [7]}, "options.gripper"),
     ],
 )
-def test_options(options: dict[str, Any], field: str, client, cloud) -> None:
+def test_a_bad_option_is_refused_by_field_value_and_fix(options, field, client, cloud) -> None:
     with pytest.raises(InvalidRequestError) as caught:
         client.detect(cloud, **options)
     error = caught.value
@@ -99,7 +99,7 @@ def test_options(options: dict[str, Any], field: str, client, cloud) -> None:
         ({"cloud": SOME, "view_ids": np.full(40, 2**40)}, "view_ids", ""),
     ],
 )
-def test_clouds(sent: dict[str, Any], field: str, value: str, client) -> None:
+def test_a_bad_cloud_is_refused_by_field_value_and_fix(sent, field, value, client) -> None:
     with pytest.raises(InvalidRequestError) as caught:
         client.detect(**sent)
     assert caught.value.field == field
@@ -123,7 +123,7 @@ def test_clouds(sent: dict[str, Any], field: str, value: str, client) -> None:
         ({"edges": np.array([[0, 1]]), "seed": -1}, "options.seed"),
     ],
 )
-def test_edges_and_hand_poses(given: dict[str, Any], field: str, client, cloud) -> None:
+def test_bad_edges_and_hand_poses_are_refused_by_field(given, field, client, cloud) -> None:
     with pytest.raises(InvalidRequestError) as caught:
         client.score(cloud, **given)
     assert caught.value.field in (field, "hand_poses" if field == "edges" else field)

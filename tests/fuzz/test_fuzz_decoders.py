@@ -53,7 +53,7 @@ def decode(size: int, **fields: Any) -> None:
 
 @pytest.mark.parametrize("file_format", FILES)
 @given(st.data())
-def test_files(file_format: str, data: st.DataObject) -> None:
+def test_mutated_files_decode_or_are_refused(file_format: str, data: st.DataObject) -> None:
     content = data.draw(files(file_format))
     decode(len(content), cloud=File(file_format, content))
 
@@ -77,7 +77,7 @@ PNG_CHUNKS = [
 
 
 @given(mutated([PNG.getvalue()]))
-def test_images(content: bytes) -> None:
+def test_mutated_images_decode_or_are_refused(content: bytes) -> None:
     depth = File("png", content)
     decode(len(content), depth_images=[{"depth": depth, "intrinsics": [30.0, 30.0, 9.5, 9.5]}])
     decode(len(content), points=POINTS.tobytes(), colors=depth)
@@ -92,12 +92,12 @@ def packed(compression: int) -> bytes:
 
 
 @given(mutated([packed(zipfile.ZIP_LZMA), packed(zipfile.ZIP_BZIP2)]))
-def test_archives_of_other_compressions(content: bytes) -> None:
+def test_archives_of_other_compressions_decode_or_are_refused(content: bytes) -> None:
     decode(len(content), cloud=File("npz", content))
 
 
 @given(st.lists(st.tuples(st.sampled_from(PNG_CHUNKS), st.none() | st.binary(max_size=40))))
-def test_chunks_of_images(chunks: list[tuple[bytes, bytes | None]]) -> None:
+def test_images_of_arbitrary_chunks_decode_or_are_refused(chunks) -> None:
     """Chunks whose sums are right, and which say what they like."""
     content = PNG.getvalue()[:8]
     for original, data in chunks:
@@ -107,12 +107,12 @@ def test_chunks_of_images(chunks: list[tuple[bytes, bytes | None]]) -> None:
 
 
 @given(changed(POINT_CLOUD2))
-def test_layouts(layout: dict[str, Any]) -> None:
+def test_changed_point_clouds_decode_or_are_refused(layout: dict[str, Any]) -> None:
     decode(len(repr(layout)), point_cloud2=layout)
 
 
 @given(LISTS, st.sampled_from(sorted(PER_POINT)))
-def test_lists(values: object, name: str) -> None:
+def test_arbitrary_lists_decode_or_are_refused(values: object, name: str) -> None:
     size = len(repr(values))
     decode(size, points=values)
     decode(size, points=POINTS.tobytes(), **{name: values})
@@ -187,7 +187,7 @@ def ask(transport: Any, body: bytes, scores: bool, media_type: str = "", query: 
 
 
 @given(mutated([message.SerializeToString() for message in MESSAGES]), st.booleans())
-def test_messages(content: bytes, scores: bool) -> None:
+def test_mutated_messages_decode_or_are_refused(content: bytes, scores: bool) -> None:
     ask("grpc", content, scores)
 
 
@@ -200,7 +200,7 @@ def test_messages(content: bytes, scores: bool) -> None:
     | VALUES,
     st.booleans(),
 )
-def test_json(document: Any, scores: bool) -> None:
+def test_changed_json_decode_or_are_refused(document: Any, scores: bool) -> None:
     if isinstance(document, dict) and not scores:
         document = {name: document[name] for name in document if name not in GIVEN}
     content = json.dumps(document, default=lambda data: data.decode("latin-1"))
@@ -212,13 +212,13 @@ def test_json(document: Any, scores: bool) -> None:
     st.sampled_from(["b", '"b"', "b; x=y", "x", '"', "b'\ud800"]),
     st.booleans(),
 )
-def test_forms(content: bytes, boundary: str, scores: bool) -> None:
+def test_mutated_forms_decode_or_are_refused(content: bytes, boundary: str, scores: bool) -> None:
     ask("http", content, scores, f"multipart/form-data; boundary={boundary}")
 
 
 @pytest.mark.parametrize("file_format", FILES)
 @given(data=st.data())
-def test_arrays_to_score(file_format: str, data: st.DataObject) -> None:
+def test_mutated_arrays_to_score_decode_or_are_refused(file_format, data) -> None:
     part = b'--b\r\nContent-Disposition: form-data; name="%s"; filename="a.%s"\r\n\r\n%s\r\n'
     cloud = part % (b"cloud", file_format.encode(), FILES[file_format][0])
     arrays = [*FILES["npy"], npy(np.array(3)), npy(np.array([[0, 1]])), npy(np.eye(4)[None])]
@@ -237,7 +237,7 @@ WORDS = st.text(max_size=12) | st.sampled_from(["[" * 5000, "1,,2", "{", "1e999,
     st.lists(st.tuples(st.sampled_from([*DetectOptions.model_fields, "x"]), WORDS), max_size=3),
     st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=40),
 )
-def test_queries_and_media_types(items: list[tuple[str, str]], media_type: str) -> None:
+def test_arbitrary_queries_and_media_types_decode_or_are_refused(items, media_type) -> None:
     query = "&".join(f"{name}={text}" for name, text in items)
     for kind in ("application/x-npy", media_type):
         ask("http", FILES["npy"][0], False, kind, query)

@@ -61,14 +61,14 @@ def refused() -> Iterator[None]:
 
 
 @given(changed(INFER) | VALUES)
-def test_inference_over_http(document: Any) -> None:
+def test_changed_inference_requests_are_answered_or_refused(document: Any) -> None:
     infer(json.dumps(document, default=lambda data: data.decode("latin-1")).encode())
 
 
 @given(
     mutated([BINARY + POINTS.tobytes()]), st.sampled_from([str(len(BINARY)), "-1", "x", "9" * 9])
 )
-def test_inference_of_binary_tensors(content: bytes, header: str) -> None:
+def test_mutated_binary_tensors_are_answered_or_refused(content: bytes, header: str) -> None:
     infer(content, header)
 
 
@@ -81,7 +81,7 @@ MESSAGE = messages.ModelInferRequest(
 
 
 @given(mutated([MESSAGE]))
-def test_inference_over_grpc(content: bytes) -> None:
+def test_mutated_inference_messages_are_answered_or_refused(content: bytes) -> None:
     with refused(), contextlib.suppress(DecodeError):
         request = messages.ModelInferRequest.FromString(content)
         tensors = open_inference._grpc_inputs(request)
@@ -124,7 +124,7 @@ ARGUMENTS = {
 
 
 @given(st.data())
-def test_arguments_of_an_agent(tools: Any, data: st.DataObject) -> None:
+def test_changed_arguments_of_an_agent_are_answered_or_refused(tools, data) -> None:
     name = data.draw(st.sampled_from(sorted(ARGUMENTS)))
     arguments = data.draw(changed(ARGUMENTS[name]))
     for field in ("point_cloud_file", "depth_file", "mask_file"):

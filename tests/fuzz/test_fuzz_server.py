@@ -60,7 +60,7 @@ BODIES = [
     ),
     st.sampled_from(["/v1/grasps", "/v1/grasps:score", "/v1/grasps?seed=%FF&up=[", "/v1/models"]),
 )
-def test_bodies(http: httpx.Client, body: tuple[str, bytes], path: str) -> None:
+def test_mutated_bodies_get_an_answer_below_500(http, body, path) -> None:
     response = http.post(path, content=body[1], headers={"content-type": body[0]})
     status = response.status_code
     assert status < 500, response.text
@@ -74,7 +74,7 @@ def test_bodies(http: httpx.Client, body: tuple[str, bytes], path: str) -> None:
     mutated([message.SerializeToString() for message in MESSAGES]) | st.binary(max_size=100),
     st.sampled_from(["DetectGrasps", "ScoreGrasps", "ListModels"]),
 )
-def test_messages(channel: grpc.Channel, content: bytes, method: str) -> None:
+def test_mutated_messages_get_an_answer(channel: grpc.Channel, content: bytes, method: str) -> None:
     call: Any = channel.unary_unary(f"/edgegrasp.v1.GraspService/{method}").future(content)
     assert call.code() in ANSWERS
 
@@ -86,7 +86,7 @@ REQUESTS = [
 
 
 @given(st.lists(mutated(REQUESTS), max_size=3))
-def test_messages_of_a_stream(channel: grpc.Channel, contents: list[bytes]) -> None:
+def test_each_mutated_message_of_a_stream_is_answered(channel, contents) -> None:
     """Each is answered, or ends the stream where it is no message at all."""
     method = channel.stream_stream("/edgegrasp.v1.GraspService/DetectGraspsStream")
     call: Any = method(iter(contents), timeout=PATIENCE)

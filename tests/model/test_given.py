@@ -124,7 +124,7 @@ def test_hand_poses_of_detected_grasps_find_their_own_contacts() -> None:
         np.testing.assert_allclose(one.grasp.contact_point, other.grasp.contact_point, atol=1e-6)
 
 
-def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_said_to_collide() -> None:
+def test_poses_in_the_air_hold_nothing_and_colliding_ones_are_marked() -> None:
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (2, 1, 1))
     poses[0, :3, 3] = 1.0
     poses[1, 2, 3] = 0.1  # the tips below the table, the palm in the box
@@ -163,7 +163,7 @@ GOOD = np.eye(4)[None]
         ({"hand_poses": GOOD @ np.diag([1, 1, -1, 1])}, "hand_poses", "pose 0"),
     ],
 )
-def test_what_is_no_edge_and_no_pose_is_refused(given, field, value) -> None:
+def test_bad_edges_and_poses_are_refused_by_field(given, field, value) -> None:
     with pytest.raises(InvalidRequest) as caught:
         detector().score(box_on_table(500), ask(), **given)
     assert caught.value.field == field

@@ -119,7 +119,7 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> No
         (["swing"], {"radius": 0.01, "reach": 0.02}, "radius must exceed"),
     ],
 )
-def test_contradictory_fields_are_refused_by_name(path, value, message) -> None:
+def test_contradictory_fields_of_a_gripper_are_refused_by_name(path, value, message) -> None:
     fields = panda_fields()
     part = fields
     for name in path[:-1]:
@@ -151,7 +151,7 @@ def choose(own: dict[str, object] | None = None, **fields: object) -> object:
     return choose_gripper(DetectOptions.model_validate(fields), PANDA, own or {})
 
 
-def test_none_is_the_default_a_name_a_file_and_an_object_itself() -> None:
+def test_a_gripper_is_chosen_by_nothing_a_name_or_fields() -> None:
     assert choose() is PANDA
     mine = load_gripper("wsg-50")
     assert choose(gripper="wsg-50") == mine
@@ -176,7 +176,7 @@ def test_none_is_the_default_a_name_a_file_and_an_object_itself() -> None:
         ({"collision": {"opening": 0.081}}, "options.collision.opening", "at most 0.08"),
     ],
 )
-def test_what_there_is_not_is_refused(fields: dict[str, object], field: str, fix: str) -> None:
+def test_an_unknown_gripper_or_opening_is_refused_by_field(fields, field, fix) -> None:
     with pytest.raises(InvalidRequest) as caught:
         choose(**fields)
     assert caught.value.field == field
@@ -213,7 +213,7 @@ def test_grasps_fit_the_gripper_that_was_asked_for(gripper: Gripper) -> None:
     assert warned == (gripper.name != "panda")
 
 
-def test_weights_that_learned_from_many_hands_promise_as_much_for_any_other() -> None:
+def test_weights_trained_with_many_hands_warn_about_no_gripper() -> None:
     of_one = detector()
     metadata = replace(of_one.metadata, training={"training_hands": 400})
     of_many = GraspDetector(of_one.network, metadata, of_one.gripper)

@@ -204,7 +204,7 @@ def test_between_its_fingertips_a_hand_with_long_fingers_sees_what_the_panda_doe
     assert (others.description[:, 72] - panda.description[:, 72]).numpy() == pytest.approx(0.05)
 
 
-def test_the_finger_behind_a_plate_is_the_one_that_nobody_saw() -> None:
+def test_the_finger_behind_a_plate_is_unseen() -> None:
     # A hand from the side, its fingers above and below the plate: y, the closing direction, is up.
     hand = np.eye(4, dtype=np.float32)
     hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
@@ -233,7 +233,7 @@ def blocks(gap: float) -> np.ndarray:
     return np.concatenate([half, half * (1.0, -1.0, 1.0)]).astype(np.float32)
 
 
-def test_two_things_with_a_gap_between_them_are_not_one() -> None:
+def test_two_objects_with_a_gap_between_them_are_not_one() -> None:
     hand = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
     hand[2, 3] = PANDA.tip_z - 0.015  # the fingertips are 15 mm below the tops
     index = np.array([0])

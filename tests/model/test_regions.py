@@ -47,13 +47,13 @@ def inside(region: Region, cloud: CheckedCloud) -> tuple[np.ndarray, np.ndarray]
         (HalfSpace(normal=(0, 0, -1), offset=-2), (9, 9, 1.9), (0, 0, 2.1)),
     ],
 )
-def test_shapes_hold_what_they_should(shape: object, within: tuple, outside: tuple) -> None:
+def test_shapes_contain_points_inside_and_none_outside(shape, within, outside) -> None:
     points = np.array([within, outside], dtype=np.float32)
     assert inside_shape(shape, points).tolist() == [True, False]
 
 
 @given(seed=st.integers(0, SEED))
-def test_rows_hold_a_voxel_by_half_of_its_points_however_they_are_named(seed: int) -> None:
+def test_rows_contain_a_voxel_if_they_have_half_of_its_points(seed: int) -> None:
     chosen = np.random.default_rng(seed).random(40) < 0.5
     cloud = rows(seed=seed, segment_ids=np.where(chosen, 7, -2))
     regions = [
@@ -82,7 +82,7 @@ def test_a_region_is_what_is_included_and_not_excluded() -> None:
         np.testing.assert_array_equal(inside(region, cloud)[0], expected)
 
 
-def test_masks_in_every_form() -> None:
+def test_a_mask_may_be_an_array_lists_bytes_or_base64() -> None:
     chosen = np.random.default_rng(0).random((4, 6)) < 0.5
     packed = base64.b64encode(chosen * np.uint8(255)).decode()
     flat = tuple(chosen.ravel().tolist())

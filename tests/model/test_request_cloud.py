@@ -66,7 +66,7 @@ def test_points_project_back_onto_their_pixels() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "64FC1", "16UC1"])
-def test_encodings_say_the_same(encoding: str) -> None:
+def test_encodings_give_the_same_depths(encoding: str) -> None:
     millimetres = np.round(depth_of() * 1000)
     expected, _ = read_depth_images([image(millimetres / 1000, pose(2))], MANY)
     sent = image(millimetres if encoding == "16UC1" else millimetres / 1000, pose(2), encoding)
@@ -118,16 +118,14 @@ def test_intrinsics_in_every_form_and_a_camera_at_the_origin() -> None:
         ([[FX, 0, 0], [0, FY, 0], [CX, CY, 1]], "", "[[60.0, 0, 0]"),
     ],
 )
-def test_intrinsics_that_cannot_be_those_of_the_image(
-    intrinsics: list, field: str, value: str
-) -> None:
+def test_intrinsics_that_do_not_fit_the_image_are_refused(intrinsics, field, value) -> None:
     with pytest.raises(InvalidRequest) as caught:
         read_depth_images([image(depth_of(), pose(0)) | {"intrinsics": intrinsics}], MANY)
     assert caught.value.field == f"depth_images.0.intrinsics{field}"
     assert value in caught.value.value
 
 
-def test_doubtful_intrinsics_are_questioned() -> None:
+def test_doubtful_intrinsics_get_a_warning() -> None:
     good, doubtful = image(depth_of(), pose(0)), image(depth_of(), pose(1))
     assert read_depth_images([good], MANY)[0].warnings == ()
     doubtful["intrinsics"] |= {"cx": 8.0}
@@ -166,7 +164,7 @@ def test_views_are_fused() -> None:
         ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", ""),
     ],
 )  # fmt: skip
-def test_bad_images(images: object, field: str, value: str) -> None:
+def test_bad_images_are_refused_by_field(images: object, field: str, value: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
         read_depth_images(images, MANY)
     assert caught.value.field == field
@@ -232,9 +230,7 @@ def xyz(rows: np.ndarray, names: tuple[str, ...] = ("x", "y", "z")) -> np.ndarra
     kind=st.sampled_from(["f4", "f8"]),
     text=st.booleans(),
 )
-def test_every_layout_gives_the_points(
-    height: int, width: int, padding: int, big: bool, kind: str, text: bool
-) -> None:
+def test_every_layout_gives_the_points(height, width, padding, big, kind, text) -> None:
     rows = cloud_of((height, width), kind)
     fields = layout(rows, padding, big)
     if text:
@@ -281,7 +277,7 @@ FAR_FIELDS = [
         ({"fields": FAR_FIELDS}, "point_cloud2.fields"),
     ],
 )
-def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
+def test_bad_layouts_are_refused_by_field(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
         read(layout(cloud_of((1, 4))) | changes)
     assert caught.value.field == field
@@ -294,7 +290,7 @@ def test_bad_layouts(changes: dict[str, Any], field: str) -> None:
 @pytest.mark.parametrize(
     "decode", [decode_points, lambda rows, most: decode_array("normals", rows, most)]
 )
-def test_one_long_text_does_not_give_all_elements_its_room(decode: Any) -> None:
+def test_a_long_text_in_a_list_takes_its_memory_once(decode: Any) -> None:
     rows = [["x" * 100_000, "", ""]] + [["", "", ""]] * 2000
     tracemalloc.start()
     with pytest.raises(InvalidRequest) as caught:

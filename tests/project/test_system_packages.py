@@ -51,7 +51,7 @@ def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
         ("*version_info*3,*11*", {}, 1, "make PYTHON="),
     ],
 )
-def test_what_is_missing_is_installed_by_root_and_told_to_others(
+def test_root_installs_missing_packages_and_others_get_the_command(
     tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, message: str
 ) -> None:
     done = run(machine(tmp_path, lacks=lacks, **machine_is))

@@ -30,7 +30,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
 
 
-def test_what_they_hold(built: tuple[Path, Path]) -> None:
+def test_sdist_and_wheel_hold_the_packages_and_no_caches(built: tuple[Path, Path]) -> None:
     with tarfile.open(built[0]) as sdist, zipfile.ZipFile(built[1]) as wheel:
         names = [name.partition("/")[2] for name in sdist.getnames()]
         ours = [name for name in wheel.namelist() if ".dist-info/" not in name]
