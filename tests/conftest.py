@@ -89,6 +89,13 @@ def start_server() -> Callable[..., contextlib.AbstractContextManager[RunningSer
 
 
 @pytest.fixture(scope="session")
+def real_server() -> Iterator[RunningServer]:
+    """A server with the weights that ship."""
+    with running_server("--workers", "1", "--log-level", "warning") as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
 def start_dummy() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
     """As `start_server`, with the dummy detector, which takes `seconds`."""
     return partial(running_server, program=("-P", dummy.__file__))

@@ -1,7 +1,5 @@
 """Answers stay what they were: same grasps, in the same order, from either transport or none."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
@@ -51,12 +49,6 @@ def catalogue() -> ModelCatalogue:
     return ModelCatalogue.load()
 
 
-@pytest.fixture(scope="module")
-def addresses(start_server) -> Iterator[dict[str, str]]:
-    with start_server("--log-level", "warning") as server:
-        yield {"rest": server.http_url, "grpc": server.grpc_address}
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_detector_answers_as_recorded(name: str, catalogue: ModelCatalogue) -> None:
     assert_same(record(answer(CASES[name](), catalogue)), load(name))
@@ -64,9 +56,9 @@ def test_detector_answers_as_recorded(name: str, catalogue: ModelCatalogue) -> N
 
 @pytest.mark.parametrize("transport", ["rest", "grpc"])
 @pytest.mark.parametrize("name", OVER_THE_WIRE)
-def test_server_answers_as_recorded(name: str, transport: str, addresses: dict[str, str]) -> None:
+def test_server_answers_as_recorded(name: str, transport: str, real_server) -> None:
     case = CASES[name]()
-    with GraspClient(addresses[transport], timeout=120.0) as client:
+    with GraspClient(real_server.address(transport), timeout=120.0) as client:
         ask = client.score if case.given else client.detect
         sent = {"depth_images": case.depth_images, **case.beside, **case.given, **case.options}
         found = ask(case.points, **sent)

@@ -1,17 +1,14 @@
 """Grasp the handle: both regions restricted to it, with the weights that ship, in simulation."""
 
-import re
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector, ModelCatalogue
+from edgegrasp_client import GraspClient, object_in_scene, on_mask
+from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
@@ -69,8 +66,6 @@ def hammer() -> Tool:
 
 @pytest.fixture(scope="module")
 def shipped() -> GraspDetector:
-    if not any(WEIGHTS_FOLDER.glob("*.safetensors")):
-        pytest.skip("no weights ship with this checkout")
     return ModelCatalogue.load().get()
 
 
@@ -124,7 +119,7 @@ def test_restricted_to_the_handle_every_grasp_is_on_it_and_the_best_holds(
         assert simulation.try_grasp(found.grasps[0].T_cloud_hand).success
 
 
-def test_the_examples_grasp_what_was_marked(start_server, shipped, tmp_path: Path) -> None:
+def test_grasps_are_on_what_a_mask_or_the_cloud_of_an_object_marks(real_server, tmp_path) -> None:
     tool, middle = mug(), np.array([0.14, 0.14, TABLE + 0.04])
     with ClutterSimulation() as simulation:
         placed = ObjectPlacement(tool.write(tmp_path), 1.0, tuple(middle.tolist()), (0, 0, 0, 1))
@@ -132,31 +127,23 @@ def test_the_examples_grasp_what_was_marked(start_server, shipped, tmp_path: Pat
         camera = look_at(np.array([0.55, 0.35, 0.55]), np.array([0.15, 0.15, 0.06]))
         depth = simulation.world.render_depth(camera, CAMERA)
     seen = depth < 0.95 * CAMERA.far
-    np.save(tmp_path / "depth.npy", np.where(seen, depth, np.nan).astype(np.float32))
-    focal, centre = CAMERA.focal_length, (CAMERA.centre_x, CAMERA.centre_y - 1.0)
+    focal, x0, y0 = CAMERA.focal_length, CAMERA.centre_x, CAMERA.centre_y - 1.0
     rows, columns = np.indices(depth.shape)
-    x, y = (columns - centre[0]) / focal * depth, (rows - centre[1]) / focal * depth
-    points = np.stack([x, y, depth], axis=-1)
-    center, half = tool.region
-    own = points @ camera[:3, :3].T + camera[:3, 3] - middle - center
-    handle = seen & (np.abs(own) <= half).all(axis=-1)
-    assert handle.sum() > 100
-    Image.fromarray(handle.astype(np.uint8) * 255).save(tmp_path / "handle.png")
-    np.save(tmp_path / "handle.npy", points[handle])
-    np.save(tmp_path / "scene.npy", points[seen])
+    points = np.stack([(columns - x0) / focal * depth, (rows - y0) / focal * depth, depth], axis=-1)
+    center, half = np.array(tool.region)
 
-    examples = Path(__file__).parents[2] / "examples"
-    intrinsics = ",".join(str(number) for number in (focal, focal, *centre))
-    files = {
-        "12_handle_of_the_red_mug.py": ["depth.npy", "handle.png", intrinsics],
-        "13_object_and_scene.py": ["handle.npy", "scene.npy"],
-    }
-    with start_server("--log-level", "warning") as server:
-        for example, words in files.items():
-            command = [sys.executable, examples / example, *words, server.grpc_address]
-            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-            contacts = re.findall(r"contact at (\S+), (\S+), (\S+) m", done.stdout)
-            assert len(contacts) == 5, done.stdout + done.stderr
-            for contact in np.array(contacts, float):
-                in_region = camera[:3, :3] @ contact + camera[:3, 3] - middle - center
-                assert (np.abs(in_region) <= np.array(half) + 0.005).all()
+    def in_region(places: np.ndarray) -> np.ndarray:
+        return places @ camera[:3, :3].T + camera[:3, 3] - middle - center
+
+    handle = seen & (np.abs(in_region(points)) <= half).all(axis=-1)
+    assert handle.sum() > 100
+    depths = np.where(seen, depth, np.nan).astype(np.float32)
+    image = {"depth": depths, "intrinsics": (focal, focal, x0, y0)}
+    cloud, segment_ids = object_in_scene(points[handle], points[seen])
+    with GraspClient(real_server.grpc_address) as client:
+        by_mask = client.detect(depth_images=[image], **on_mask(handle, {"top_k": 5}))
+        by_object = client.detect(cloud, segment_ids=segment_ids, viewpoint=(0, 0, 0), top_k=5)
+    for found in (by_mask, by_object):
+        contacts = np.array([grasp.contact_point for grasp in found.grasps])
+        assert len(contacts) == 5
+        assert (np.abs(in_region(contacts)) <= half + 0.005).all()

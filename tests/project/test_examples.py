@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -42,13 +42,6 @@ def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_p
     assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply\n")
 
 
-@pytest.fixture(scope="module")
-def address(start_server) -> Iterator[str]:
-    """A server with the weights that ship."""
-    with start_server("--workers", "1") as server:
-        yield server.grpc_address
-
-
 def example(name: str, *words: object) -> str:
     """What an example prints."""
     done = run(sys.executable, EXAMPLES / name, *words)
@@ -76,16 +69,16 @@ def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Pat
     assert "error 3: depth_images.0" in wrong.stderr
 
 
-def test_region_on_a_handle(address: str) -> None:
-    shown = example("region_on_a_handle.py", address)
+def test_region_on_a_handle(real_server) -> None:
+    shown = example("region_on_a_handle.py", real_server.grpc_address)
     contacts = re.findall(r"contact point at (\S+), (\S+), (\S+) m", shown)
     assert len(contacts) == 5
     apart = np.array(contacts, dtype=float) - (0.122, 0.098, 0.497)
     assert np.linalg.norm(apart, axis=1).max() < 0.023
 
 
-def test_your_gripper(address: str) -> None:
-    small, panda = example("your_gripper.py", address).split("panda:")
+def test_your_gripper(real_server) -> None:
+    small, panda = example("your_gripper.py", real_server.grpc_address).split("panda:")
     openings = [int(text) for text in re.findall(r"opening (\d+) mm", small)]
     assert len(openings) == panda.count("score") == 5
     assert max(openings) <= 50
@@ -99,9 +92,9 @@ def test_depth_camera(tmp_path: Path) -> None:
         assert depth.size == color.size == (640, 480)
 
 
-def test_several_views(address: str) -> None:
+def test_several_views(real_server) -> None:
     pattern = r"each view: \[(.*)\] grasps, best holds \[.*\]; all three: (\d+), True"
-    printed = re.findall(pattern, example("several_views.py", address, "2"))
+    printed = re.findall(pattern, example("several_views.py", real_server.grpc_address, "2"))
     for alone, together in printed:
         assert int(together) >= max(map(int, alone.split(", ")))
     assert len(printed) == 2
