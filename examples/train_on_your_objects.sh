@@ -14,7 +14,7 @@ shipped=$(python3 -c 'from edgegrasp_model.detector import WEIGHTS_FOLDER as f; 
 
 edgegrasp generate-data "$output/data" --objects "$objects" --scene packed --scenes "$scenes"
 edgegrasp train "$output/data" --start-from "$shipped/edgegrasp-plus.safetensors" --keep 0.5 \
-    --learning-rate 3e-4 --schedule cosine --steps "$steps" --run "$output/run"
+    --learning-rate 3e-4 --steps "$steps" --run "$output/run"
 edgegrasp benchmark --planner in-process --model "$output/run/edgegrasp-plus.safetensors" \
     --objects "$objects" --scene packed --seed 0 --rounds "$((scenes / 10 + 1))" \
     --output "$output/benchmark"

@@ -4,13 +4,14 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from edgegrasp_cli.benchmark import Cluster, interruptible
 from edgegrasp_cli.flags import given_flags, model_flags, takes_flags
+from edgegrasp_training.options import GenerationOptions, TrainingOptions
 
 if TYPE_CHECKING:
     from edgegrasp_training.training import Trainer
@@ -18,28 +19,11 @@ if TYPE_CHECKING:
 Option = typer.Option
 
 
-class DataFlags(Cluster):
+class DataFlags(GenerationOptions, Cluster):
     """The flags of `edgegrasp generate-data`."""
 
     objects: Path | None = Field(
         None, description="Folder packed/train, pile/train; else the built-in objects"
-    )
-    scenes: int = Field(100, ge=1, description="Scenes")
-    scene: Literal["packed", "pile", "bin", "table"] | None = Field(
-        None, description="Kind of the scenes: packed, pile, bin or table; else all of them"
-    )
-    views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
-    grasps_per_view: int = Field(100, ge=1, description="Grasps tried in each view")
-    seed: int = Field(1, ge=0, description="Seed of everything random")
-    weights: Path | None = Field(
-        None, description="Network that chooses half of the grasps: its best and its least certain"
-    )
-    gripper: str = Field(
-        "panda",
-        description="Hand that tries them: a gripper's name or .toml file; random: one a scene",
-    )
-    household: float = Field(
-        0.0, ge=0.0, le=1.0, description="Share of the scenes made of random household objects"
     )
 
 
@@ -56,30 +40,15 @@ def generate_data(
     from rich.progress import track
 
     from edgegrasp_sim.engine import choose_engine
-    from edgegrasp_sim.objects import SceneKind
-    from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+    from edgegrasp_training.generation import generate, missing_scenes
     from edgegrasp_training.views import find_views, write_data_card
 
     asked = given_flags(DataFlags, flags)
-    chosen = choose_engine(asked.engine)
-    print(chosen)
-    # Paths as other machines have them.
-    objects = asked.objects and asked.objects.resolve()
-    options = GenerationOptions(
-        asked.scenes,
-        asked.views_per_scene,
-        asked.grasps_per_view,
-        asked.seed,
-        asked.weights and asked.weights.resolve(),
-        None if asked.scene is None else SceneKind(asked.scene),
-        chosen.name,
-        asked.gripper,
-        asked.household,
-    )
-    missing = len(missing_scenes(output, options))
+    print(choose_engine(asked.engine))
+    missing = len(missing_scenes(output, asked))
     tried = held = 0
     with interruptible("generate-data", resumes=True):
-        made = generate(output, objects, options, asked.workers, asked.ray)
+        made = generate(output, asked.objects, asked, asked.workers, asked.ray)
         for _, grasps, successes in track(made, "scenes", total=missing):
             tried, held = tried + grasps, held + successes
     write_data_card(output, find_views([output]), _command())
@@ -88,7 +57,7 @@ def generate_data(
     print(f"{missing} scenes made, {kept} kept; {tried} grasps tried{share}.")
 
 
-class TrainFlags(BaseModel):
+class TrainFlags(TrainingOptions):
     """The flags of `edgegrasp train`."""
 
     model: str = Field(
@@ -97,19 +66,7 @@ class TrainFlags(BaseModel):
     run: Path = Field(
         Path("runs/edgegrasp-plus"), description="Folder of this run: state, log, weights, card"
     )
-    steps: int = Field(20_000, ge=1, description="Steps at most")
     until: int | None = Field(None, description="Pause at this step; the same command continues")
-    views_per_step: int = Field(4, ge=1, description="Views in a step")
-    balls_per_view: int = Field(8, ge=1, description="Balls of each view in a step")
-    learning_rate: float = Field(1e-3, description="At the start")
-    schedule: Literal["plateau", "cosine"] = Field(
-        "plateau", description="Halve the rate on a plateau, or let it fall to 0 at the last step"
-    )
-    rotations: Literal["any", "upright", "none"] = Field(
-        "any",
-        description="Random rotations of training balls: any, about up only, none; edgegrasp "
-        "networks",
-    )
     teacher: Path | None = Field(
         None, description="Weights of a hand network that also teaches a network of balls"
     )
@@ -119,14 +76,8 @@ class TrainFlags(BaseModel):
     outcomes: Path | None = Field(
         None, description="File of a server's /v1/outcomes: only recalibrate --start-from on it"
     )
-    keep: float = Field(
-        0.0, ge=0.0, le=1.0, description="Share of the weights of --start-from in the result"
-    )
-    evaluate_every: int = Field(250, ge=1, description="Steps between evaluations")
     validation_share: float = Field(0.1, description="Share of the scenes kept apart")
-    seed: int = Field(0, ge=0, description="Seed of weights, split and batches")
     device: str = Field("cpu", description="cpu or cuda")
-    mixed_precision: bool = Field(False, description="Products in bfloat16: for a GPU")
 
 
 @takes_flags(flags=model_flags(TrainFlags))
@@ -173,22 +124,18 @@ def train(
 
 def _trainer(data: list[Path], asked: TrainFlags) -> "Trainer":
     """What trains on the views of these folders."""
-    from dataclasses import fields
-
     from edgegrasp_training.recipes import recipe
     from edgegrasp_training.teacher import Teacher
-    from edgegrasp_training.training import Trainer, TrainingOptions
+    from edgegrasp_training.training import Trainer
     from edgegrasp_training.views import find_views, split_by_scene
 
-    names = {field.name for field in fields(TrainingOptions)} & set(TrainFlags.model_fields)
-    options = TrainingOptions(**asked.model_dump(include=names))
     views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
     metadata, teacher = recipe(asked.model), None
     if asked.teacher is not None:
         taught = asked.run.parent / "taught"
         teacher = Teacher(asked.teacher, metadata.network.crop_radius, taught)
     trainer = Trainer(
-        metadata, views, validation, asked.run, options, asked.device, teacher, asked.start_from
+        metadata, views, validation, asked.run, asked, asked.device, teacher, asked.start_from
     )
     print(f"{len(views)} training and {len(validation)} validation views")
     return trainer

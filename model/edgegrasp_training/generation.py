@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,7 +37,8 @@ from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
-from edgegrasp_training.hands import PANDA, hand_of_scene
+from edgegrasp_training.hands import hand_of_scene
+from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
 from edgegrasp_training.views import LabelledView, engine_of, support_as_array
@@ -103,30 +104,6 @@ FREE_SHARE = 0.75  # of the grasps chosen at random, those free of collision wit
 GUIDED_SHARE = 0.5  # of the tried grasps, the network's best and unsure ones
 
 
-@dataclass(frozen=True)
-class GenerationOptions:
-    """What to generate."""
-
-    scenes: int = 100
-    views_per_scene: int = 2
-    grasps_per_view: int = 100
-    seed: int = 1
-    weights: Path | None = None  # of the network that guides the choice
-    kind: SceneKind | None = None  # of all scenes; None: those of MIXTURE in turn
-    engine: str | None = None  # see `choose_engine`
-    gripper: str = PANDA  # see `hand_of_scene`
-    household: float = 0.0  # share of the scenes made of household objects
-
-    def __post_init__(self) -> None:
-        if self.kind is not None and self.kind not in MIXTURE:
-            kinds = ", ".join(dict.fromkeys(MIXTURE))
-            raise ValueError(f"scene is {self.kind.value!r}; views are generated of {kinds}")
-
-    def kind_of(self, index: int) -> SceneKind:
-        """How a scene is made."""
-        return self.kind or MIXTURE[index % len(MIXTURE)]
-
-
 class Query(NamedTuple):
     """A view of a scene and a request for grasps in it."""
 
@@ -167,7 +144,11 @@ def generate(
         RuntimeError: Workers keep dying, or there is no such Ray cluster.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    options = replace(options, engine=choose_engine(options.engine).name)
+    found = {"engine": choose_engine(options.engine).name}
+    if options.weights is not None:  # other machines find it there too
+        found["weights"] = options.weights.resolve()
+    options = options.model_copy(update=found)
+    objects = objects and objects.resolve()
     known = {engine_of(path) for path in folder.glob("*.npz")}
     if other := known - {options.engine}:
         raise ValueError(
@@ -177,7 +158,7 @@ def generate(
     missing = missing_scenes(folder, options)
     sets = {}
     if objects is not None:
-        wanted = {options.kind_of(index).objects for index in missing}
+        wanted = {kind_of(options, index).objects for index in missing}
         there = [kind for kind in CLUTTER if kind in wanted or (objects / kind).is_dir()]
         sets = {kind: ObjectSet.from_folder(objects, kind, "train") for kind in there}
     digests = [drawn.digest for drawn in sets.values()]
@@ -201,10 +182,14 @@ def missing_scenes(folder: Path, options: GenerationOptions) -> list[int]:
     ]
 
 
+def kind_of(options: GenerationOptions, index: int) -> SceneKind:
+    """How a scene is made."""
+    return SceneKind(options.scene) if options.scene else MIXTURE[index % len(MIXTURE)]
+
+
 def view_path(folder: Path, index: int, view: int, options: GenerationOptions) -> Path:
     """File of a view."""
-    kind = options.kind_of(index).value
-    return folder / f"{kind}_{options.seed}-{index:06d}_{view}.npz"
+    return folder / f"{kind_of(options, index)}_{options.seed}-{index:06d}_{view}.npz"
 
 
 def _scene_maker(
@@ -220,7 +205,7 @@ def generate_scene(
 ) -> list[LabelledView]:
     """Generate all views of one scene, of the built-in objects where there are no sets."""
     streams = [np.random.default_rng([options.seed, index, stream]) for stream in range(7)]
-    kind = options.kind_of(index)
+    kind = kind_of(options, index)
     # Some scenes are made of the other kind's objects, where there are any.
     source = kind.objects
     if streams[SCENE_STREAM].random() < OTHER_OBJECTS:

@@ -1,14 +1,14 @@
-"""The training loop: resumes at the exact step, stops by itself, keeps the best network."""
+"""The training loop: resumes at the exact step and keeps the best network."""
 
 import csv
 import math
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,38 +32,20 @@ from edgegrasp_training.examples import (
     tried_grasps,
     turned,
 )
+from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train, start_from
 from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import hands_of, load_view
 
 VIEWS_IN_MEMORY = 8000
-Schedule = Literal["plateau", "cosine"]  # halve on a plateau, or fall to 0 at the last step
+WEIGHT_DECAY = 1e-4
+AVERAGING = 0.998  # share of the old weights in the running mean that is kept
+UNKNOWN = 0.1  # share of training views without their table, and without their camera
 DROPOUT_STREAM = 1  # random stream of a step
 STATE_FILE, LOG_FILE = "state.pt", "log.csv"
 # Attributes of a trainer that its state file keeps.
-COUNTERS = ("step", "best_loss", "since_best", "halved", "seconds")
+COUNTERS = ("step", "best_loss", "seconds")
 STATEFUL = ("network", "average", "optimizer")
-
-
-@dataclass(frozen=True)
-class TrainingOptions:
-    """How to train; the defaults are the recipe for two processor cores."""
-
-    steps: int = 20_000
-    views_per_step: int = 4
-    balls_per_view: int = 8
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-4
-    patience: int = 3  # evaluations without a better loss before the learning rate is halved
-    halvings: int = 4  # stop at the next one
-    evaluate_every: int = 250  # steps
-    averaging: float = 0.998  # share of the old weights in the running mean that is kept
-    unknown: float = 0.1  # share of training views without their table, and without their camera
-    rotations: Rotations = "any"  # of balls whose camera is known; Vector Neurons need none
-    schedule: Schedule = "plateau"  # of the learning rate
-    mixed_precision: bool = False  # matrix products in bfloat16, for a GPU
-    keep: float = 0.0  # share of the weights started from in the result
-    seed: int = 0
 
 
 class Trainer:
@@ -115,9 +97,9 @@ class Trainer:
             known = start_from(self.network, trained)
         self.average = deepcopy(self.network).requires_grad_(False).eval()
         self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), options.learning_rate, weight_decay=options.weight_decay
+            self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
         )
-        self.step, self.best_loss, self.since_best, self.halved = 0, float("inf"), 0, 0
+        self.step, self.best_loss = 0, float("inf")
         self.seconds = 0.0  # spent in training steps
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / STATE_FILE).is_file():
@@ -127,8 +109,8 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are done or the learning rate has been halved often enough."""
-        return self.step >= self.options.steps or self.halved > self.options.halvings
+        """Whether all steps are done."""
+        return self.step >= self.options.steps
 
     def run(self, progress: Callable[[int, float], None], until: int | None = None) -> None:
         """Train until finished, or up to a step.
@@ -221,16 +203,15 @@ class Trainer:
         label, weight = packed.label.to(self.device), packed.weight.to(self.device)
         loss = F.binary_cross_entropy_with_logits(logit, label, weight, reduction="sum")
         loss = loss / weight.sum()
-        if self.options.schedule == "cosine":
-            left = (1.0 + math.cos(math.pi * self.step / self.options.steps)) / 2
-            for group in self.optimizer.param_groups:
-                group["lr"] = left * self.options.learning_rate
+        left = (1.0 + math.cos(math.pi * self.step / self.options.steps)) / 2
+        for group in self.optimizer.param_groups:
+            group["lr"] = left * self.options.learning_rate
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimizer.step()
         # A mean over few steps only at first, so that it does not remember the random weights.
-        kept = min(self.options.averaging, (self.step + 1) / (self.step + 10))
+        kept = min(AVERAGING, (self.step + 1) / (self.step + 10))
         for mean, value in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(value.detach(), 1.0 - kept)
         return float(loss.detach())
@@ -240,7 +221,7 @@ class Trainer:
         count = min(self.options.views_per_step, len(self.train_paths))
         parts: list[Packed] = []
         for index in rng.choice(len(self.train_paths), count, replace=False):
-            camera_known, support_known = rng.random(2) >= self.options.unknown
+            camera_known, support_known = rng.random(2) >= UNKNOWN
             camera_matters = self.metadata.network.architecture == "hand"
             grasps = self._tried(self.train_paths[index], bool(camera_known) or not camera_matters)
             if not support_known:
@@ -256,7 +237,7 @@ class Trainer:
             if self.metadata.network.architecture == "edgegrasp":
                 # This network, unlike Vector Neurons, is not equivariant. Without a camera the
                 # detector's frame is upright, but may be turned any way about up.
-                rotations = self.options.rotations
+                rotations: Rotations = self.options.rotations
                 if not camera_known and rotations != "any":
                     rotations = "upright"
                 assert isinstance(packed.batch, BallBatch)
@@ -297,14 +278,9 @@ class Trainer:
         self.average.load_state_dict(self.network.state_dict())
 
     def _after_evaluation(self, evaluation: Evaluation, train_loss: float) -> None:
-        self.since_best += 1
         if evaluation.loss < self.best_loss:
-            self.best_loss, self.since_best = evaluation.loss, 0
+            self.best_loss = evaluation.loss
             self._save_average(self.metadata)
-        elif self.options.schedule == "plateau" and self.since_best >= self.options.patience:
-            self.since_best, self.halved = 0, self.halved + 1
-            for group in self.optimizer.param_groups:
-                group["lr"] /= 2
         self._log(evaluation, train_loss)
         self._save_state()
 

@@ -28,7 +28,8 @@ from edgegrasp_client import (
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import load_catalogue
-from edgegrasp_training.generation import GenerationOptions, generate
+from edgegrasp_training.generation import generate
+from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.views import find_views
 
 EDGEGRASP = "-c", "from edgegrasp_cli.main import main; main()"
@@ -153,7 +154,8 @@ def test_data_are_those_of_one_process_though_a_node_is_lost(
     cluster: Cluster, tmp_path: Path
 ) -> None:
     alone, there = tmp_path / "alone", tmp_path / "there"
-    list(generate(alone, None, GenerationOptions(6, 1, 8, seed=5)))
+    few = {"scenes": 6, "views_per_scene": 1, "grasps_per_view": 8, "seed": 5}
+    list(generate(alone, None, GenerationOptions(**few)))
     making = cluster.start(*EDGEGRASP, *DATA, str(there), f"--ray={cluster.address}")
     until(lambda: cluster.at_work("_run") and list(there.glob("*.npz")), making)
     cluster.kill(cluster.second)

@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +8,20 @@ from edgegrasp_model.candidates.edge_grasps import edge_grasps
 from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.teacher import Teacher
-from edgegrasp_training.training import Trainer, TrainingOptions
+from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import LabelledView, find_views, split_by_scene
 
 MakeView = Callable[[int], LabelledView]
 MakeTrainer = Callable[..., Trainer]
-FAST = TrainingOptions(
-    steps=40, views_per_step=2, balls_per_view=3, learning_rate=3e-3, evaluate_every=10
-)
+FAST = {
+    "steps": 40,
+    "views_per_step": 2,
+    "balls_per_view": 3,
+    "learning_rate": 3e-3,
+    "evaluate_every": 10,
+}
 NETWORKS = {
     "balls": NetworkConfig("edgegrasp", (8, 8, 8), (8, 8, 8), (8, 8), (16, 8), crop_radius=0.04),
     "vn": NetworkConfig("vn-edgegrasp", (6, 6, 6), (6, 9, 9), (9, 9), (16, 8, 4), crop_radius=0.04),
@@ -89,7 +93,7 @@ def make_trainer(views: list[Path]) -> MakeTrainer:
     ) -> Trainer:
         metadata = CheckpointMetadata(name, NETWORKS[network], voxel_size=0.0045, gripper="panda")
         own, validation = split_by_scene(views, 0.25, seed=0)
-        chosen = replace(FAST, **options)
+        chosen = TrainingOptions(**FAST | options)
         return Trainer(
             metadata, train or own, validation, folder, chosen, teacher=teacher, start=start
         )

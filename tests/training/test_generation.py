@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,14 +5,21 @@ import pytest
 
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed
-from edgegrasp_sim.objects import SceneKind, blob
+from edgegrasp_sim.objects import blob
 from edgegrasp_training.examples import tried_grasps
-from edgegrasp_training.generation import GenerationOptions, generate, missing_scenes
+from edgegrasp_training.generation import generate, missing_scenes
 from edgegrasp_training.household import FAMILIES
+from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.shapes import DRAWN_NAMES, made_object
 from edgegrasp_training.views import find_views, load_view
 
-SMALL = GenerationOptions(scenes=4, views_per_scene=1, grasps_per_view=8, seed=5)
+
+def small(**other: object) -> GenerationOptions:
+    few = {"scenes": 4, "views_per_scene": 1, "grasps_per_view": 8, "seed": 5}
+    return GenerationOptions(**few | other)
+
+
+SMALL = small()
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +62,11 @@ def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
     for other in set(ENGINES) - {engine}:
         if installed(other):
             with pytest.raises(ValueError, match=f"holds labels of {engine}, not of {other}"):
-                list(generate(data, None, replace(SMALL, scenes=5, engine=other)))
+                list(generate(data, None, small(scenes=5, engine=other)))
 
 
 def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp_path) -> None:
-    options = replace(SMALL, scenes=3, views_per_scene=2, kind=SceneKind.PACKED, gripper="random")
+    options = small(scenes=3, views_per_scene=2, scene="packed", gripper="random")
     list(generate(tmp_path, None, options))
     paths = find_views([tmp_path])
     views = [load_view(path) for path in paths]
@@ -83,7 +89,7 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
 
 
 def test_scenes_of_household_objects_name_them_and_are_reproducible(tmp_path: Path) -> None:
-    options = replace(SMALL, scenes=1, kind=SceneKind.TABLE, household=1.0)
+    options = small(scenes=1, scene="table", household=1.0)
     for folder in ("a", "b"):
         list(generate(tmp_path / folder, None, options))
     first, again = (load_view(find_views([tmp_path / folder])[0]) for folder in ("a", "b"))
@@ -94,7 +100,7 @@ def test_scenes_of_household_objects_name_them_and_are_reproducible(tmp_path: Pa
 
 
 def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
-    list(generate(tmp_path, None, replace(SMALL, scenes=2), workers=2))
+    list(generate(tmp_path, None, small(scenes=2), workers=2))
     assert len(find_views([tmp_path])) == 2
     for path in find_views([tmp_path]):
         again = load_view(data / path.name)
@@ -107,7 +113,7 @@ def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) ->
     plain = DRAWN_NAMES[:3]
     models = {name: made_object(name, train) for name in plain}
     (tmp_path / "objects" / "packed").symlink_to(tmp_path / "objects" / "pile")
-    options = GenerationOptions(2, 1, 4, seed=2, kind=SceneKind.PILE)
+    options = small(scenes=2, grasps_per_view=4, seed=2, scene="pile")
     list(generate(tmp_path / "views", tmp_path / "objects", options))
     paths = find_views([tmp_path / "views"])
     assert [path.name for path in paths] == [f"pile_2-00000{k}_0.npz" for k in range(2)]

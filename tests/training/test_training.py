@@ -9,6 +9,7 @@ import torch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
+from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import (
     LENGTH_UNIT,
     RECIPES,
@@ -17,7 +18,7 @@ from edgegrasp_training.recipes import (
     prepare_to_train,
     recipe,
 )
-from edgegrasp_training.training import Trainer, TrainingOptions
+from edgegrasp_training.training import Trainer
 from edgegrasp_training.views import find_views, load_view, split_by_scene
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "labelled_views"
@@ -137,7 +138,7 @@ def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None
 
 
 def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(make_trainer, tmp_path):
-    run = make_trainer(tmp_path, "balls", steps=8, evaluate_every=4, schedule="cosine")
+    run = make_trainer(tmp_path, "balls", steps=8, evaluate_every=4)
     run.run(ignore)
     rates = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)[:, 1]
     half, last = 3e-3 * (1 + np.cos(np.pi * np.array([3 / 8, 7 / 8]))) / 2

@@ -1,0 +1,49 @@
+"""What can be asked of data generation and of training; the command line makes flags of it."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+
+class GenerationOptions(BaseModel, frozen=True):
+    """What to generate."""
+
+    scenes: int = Field(100, ge=1, description="Scenes")
+    scene: Literal["packed", "pile", "bin", "table"] | None = Field(
+        None, description="Kind of the scenes: packed, pile, bin or table; else all of them"
+    )
+    views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
+    grasps_per_view: int = Field(100, ge=1, description="Grasps tried in each view")
+    seed: int = Field(1, ge=0, description="Seed of everything random")
+    weights: Path | None = Field(
+        None, description="Network that chooses half of the grasps: its best and its least certain"
+    )
+    gripper: str = Field(
+        "panda",
+        description="Hand that tries them: a gripper's name or .toml file; random: one a scene",
+    )
+    household: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the scenes made of random household objects"
+    )
+    engine: str | None = Field(
+        None, description="pybullet or mujoco; else the first one that is installed"
+    )
+
+
+class TrainingOptions(BaseModel, frozen=True):
+    """How to train; the defaults are the recipe for two processor cores."""
+
+    steps: int = Field(20_000, ge=1, description="Steps")
+    views_per_step: int = Field(4, ge=1, description="Views in a step")
+    balls_per_view: int = Field(8, ge=1, description="Balls of each view in a step")
+    learning_rate: float = Field(1e-3, description="At the start; falls to 0 at the last step")
+    rotations: Literal["any", "none"] = Field(
+        "any", description="Random rotations of training balls: any or none; edgegrasp networks"
+    )
+    keep: float = Field(
+        0.0, ge=0.0, le=1.0, description="Share of the weights of --start-from in the result"
+    )
+    evaluate_every: int = Field(250, ge=1, description="Steps between evaluations")
+    seed: int = Field(0, ge=0, description="Seed of weights, split and batches")
+    mixed_precision: bool = Field(False, description="Products in bfloat16: for a GPU")
