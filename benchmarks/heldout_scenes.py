@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
-from edgegrasp_sim.engine.with_pybullet import PybulletWorld, projection
+from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
 from edgegrasp_sim.sensor import random_sensor
@@ -192,7 +191,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Array]:
     T_world_camera = look_at(target + away * np.array([*level, np.cos(polar)]), target)
     roll = Rotation.from_euler("z", rng.normal(0, 12), degrees=True).as_matrix()
     T_world_camera[:3, :3] = T_world_camera[:3, :3] @ roll
-    true, body = seen(maker.world, T_world_camera, camera)
+    true, body = maker.world.render(T_world_camera, camera)
     depth = random_sensor(rng).apply(true, camera, rng)
     rows, columns = np.indices(true.shape)
     # The renderer samples a pixel at its lower left corner.
@@ -214,24 +213,6 @@ def picture(maker: Maker, made: Made) -> dict[str, Array]:
         "support_normal": up.astype(np.float32),
         "support_offset": np.float32(-T_world_camera[2, 3]),
     }
-
-
-def seen(
-    world: PybulletWorld, T_world_camera: Array, camera: Intrinsics
-) -> tuple[Array, NDArray[np.int64]]:
-    """Depth (H, W), metres, and the body (H, W) at each pixel; -1: none."""
-    view = np.linalg.inv(T_world_camera)
-    view[1:3] *= -1.0
-    mask = pybullet.getCameraImage(
-        camera.width,
-        camera.height,
-        view.flatten(order="F").tolist(),
-        projection(camera).flatten(order="F").tolist(),
-        renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=world.client,
-    )[4]
-    depth = world.render_depth(T_world_camera, camera)
-    return depth, np.asarray(mask, dtype=np.int64).reshape(camera.height, camera.width)
 
 
 def on_the_surface(label: NDArray[np.uint8], true: Array, depth: Array) -> NDArray[np.uint8]:

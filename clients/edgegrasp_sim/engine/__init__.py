@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from edgegrasp_sim.poses import Matrix
 
+Vector: TypeAlias = Sequence[float] | Matrix
+
 TIME_STEP = 1.0 / 80.0  # seconds
 GRAVITY = 9.81  # m/s²
 SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
@@ -219,8 +221,8 @@ class World(ABC):
     def load_urdf(
         self,
         path: Path,
-        position: Sequence[float],
-        quaternion_xyzw: Sequence[float],
+        position: Vector,
+        quaternion_xyzw: Vector,
         scale: float,
         *,
         mass: float,
@@ -236,14 +238,7 @@ class World(ABC):
         """
 
     @abstractmethod
-    def add_box(
-        self,
-        size: Sequence[float],
-        centre: Sequence[float],
-        *,
-        friction: float,
-        yaw: float = 0.0,
-    ) -> "Body":
+    def add_box(self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0) -> "Body":
         """Add a box that never moves, turned about z; `size` is its full extent in metres."""
 
     @abstractmethod
@@ -278,9 +273,7 @@ class Body(ABC):
         """Orientation in the world."""
 
     @abstractmethod
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Put the centre of mass there, at rest."""
 
     @property
@@ -307,13 +300,11 @@ class Hand(Body):
         """Metres between the fingers."""
 
     @abstractmethod
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Put the hand there at once, at rest and open, and hold it there."""
 
     @abstractmethod
-    def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
+    def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
         """Pull the centre of mass there in the next step."""
 
     @abstractmethod

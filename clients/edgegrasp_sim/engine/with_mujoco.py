@@ -23,6 +23,7 @@ from edgegrasp_sim.engine import (
     HandModel,
     Intrinsics,
     Shake,
+    Vector,
     World,
 )
 from edgegrasp_sim.engine.urdf import Surface, read_urdf
@@ -155,8 +156,8 @@ class MujocoWorld(World):
     def load_urdf(
         self,
         path: Path,
-        position: Sequence[float],
-        quaternion_xyzw: Sequence[float],
+        position: Vector,
+        quaternion_xyzw: Vector,
         scale: float,
         *,
         mass: float,
@@ -178,12 +179,7 @@ class MujocoWorld(World):
         return added
 
     def add_box(
-        self,
-        size: Sequence[float],
-        centre: Sequence[float],
-        *,
-        friction: float,
-        yaw: float = 0.0,
+        self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "MujocoBody":
         half = 0.5 * np.asarray(size)
         turn = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
@@ -371,9 +367,7 @@ class MujocoBody(Body):
         mujoco.mju_quat2Mat(matrix, self.world.places(self.uid)[0][3:7])
         return matrix.reshape(3, 3)
 
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         x, y, z, w = quaternion_xyzw
         qpos, qvel = self.world.places(self.uid)
         qpos[:7] = (*position, w, x, y, z)
@@ -405,9 +399,7 @@ class MujocoHand(MujocoBody, Hand):
         one, other = self.world.places(self.uid)[0][-2:].tolist()
         return float(one + other)
 
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         super().set_pose(position, quaternion_xyzw)
         data = self.world.data
         joints = self.world.places(self.uid)[0][7:]
@@ -417,7 +409,7 @@ class MujocoHand(MujocoBody, Hand):
         self.move(position, quaternion_xyzw)
         self.way = None
 
-    def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
+    def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
         x, y, z, w = quaternion_xyzw
         data = self.world.data
         here = data.mocap_pos[0]

@@ -1,7 +1,8 @@
 """PyBullet, which the published figures were measured in."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -19,6 +20,7 @@ from edgegrasp_sim.engine import (
     Intrinsics,
     Parts,
     Shake,
+    Vector,
     World,
 )
 from edgegrasp_sim.poses import Matrix
@@ -56,55 +58,54 @@ class PybulletWorld(World):
     shake = SHAKE
 
     def __init__(self) -> None:
-        self.client: int = pybullet.connect(pybullet.DIRECT)
-        if self.client < 0:
+        self.client = _Client()
+        if self.client.number < 0:
             raise RuntimeError("PyBullet did not start a physics server; close unused worlds")
         self.reset()
 
     def close(self) -> None:
-        if self.client >= 0:
-            pybullet.disconnect(physicsClientId=self.client)
-            self.client = -1
+        if self.client.number >= 0:
+            self.client.disconnect()
+            self.client.number = -1
 
     def reset(self) -> None:
-        pybullet.resetSimulation(physicsClientId=self.client)
-        pybullet.setPhysicsEngineParameter(
+        self.client.resetSimulation()
+        self.client.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP,
             numSolverIterations=SOLVER_ITERATIONS,
             # The order of contact pairs otherwise depends on what was loaded and moved before.
             deterministicOverlappingPairs=1,
-            physicsClientId=self.client,
         )
-        pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self.client)
+        self.client.setGravity(0.0, 0.0, -GRAVITY)
         self._hand: PybulletHand | None = None
 
     def step(self, steps: int = 1) -> None:
         for _ in range(steps):
             if self._hand is not None:
                 self._hand.swing()
-            pybullet.stepSimulation(physicsClientId=self.client)
+            self.client.stepSimulation()
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
-        hits = pybullet.rayTestBatch(starts.tolist(), ends.tolist(), physicsClientId=self.client)
+        hits = self.client.rayTestBatch(starts.tolist(), ends.tolist())
         return [hit[0] for hit in hits]
 
     def detect_collisions(self) -> None:
-        pybullet.performCollisionDetection(physicsClientId=self.client)
+        self.client.performCollisionDetection()
 
     def save_state(self) -> int:
-        return int(pybullet.saveState(physicsClientId=self.client))
+        return int(self.client.saveState())
 
     def restore_state(self, state: int) -> None:
-        pybullet.restoreState(stateId=state, physicsClientId=self.client)
+        self.client.restoreState(stateId=state)
 
     def remove_state(self, state: int) -> None:
-        pybullet.removeState(state, physicsClientId=self.client)
+        self.client.removeState(state)
 
     def load_urdf(
         self,
         path: Path,
-        position: Sequence[float],
-        quaternion_xyzw: Sequence[float],
+        position: Vector,
+        quaternion_xyzw: Vector,
         scale: float,
         *,
         mass: float,
@@ -113,13 +114,7 @@ class PybulletWorld(World):
         if not path.is_file():
             raise FileNotFoundError(f"no object file at {path}; check the object folder")
         try:
-            uid = pybullet.loadURDF(
-                str(path),
-                position,
-                quaternion_xyzw,
-                globalScaling=scale,
-                physicsClientId=self.client,
-            )
+            uid = self.client.loadURDF(str(path), position, quaternion_xyzw, globalScaling=scale)
         except pybullet.error as error:
             raise ValueError(f"PyBullet cannot read {path}: {error}") from error
         body = PybulletBody(self.client, uid)
@@ -128,22 +123,13 @@ class PybulletWorld(World):
         return body
 
     def add_box(
-        self,
-        size: Sequence[float],
-        centre: Sequence[float],
-        *,
-        friction: float,
-        yaw: float = 0.0,
+        self, size: Vector, centre: Vector, *, friction: float, yaw: float = 0.0
     ) -> "PybulletBody":
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_BOX,
-            halfExtents=[0.5 * extent for extent in size],
-            physicsClientId=self.client,
+        shape = self.client.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=[0.5 * extent for extent in size]
         )
         quaternion_xyzw = [0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2))]
-        uid = pybullet.createMultiBody(
-            0.0, shape, -1, centre, quaternion_xyzw, physicsClientId=self.client
-        )
+        uid = self.client.createMultiBody(0.0, shape, -1, centre, quaternion_xyzw)
         body = PybulletBody(self.client, uid)
         body.change(-1, lateralFriction=friction)
         return body
@@ -153,65 +139,78 @@ class PybulletWorld(World):
         return self._hand
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
+        return self.render(T_world_camera, camera, pybullet.ER_NO_SEGMENTATION_MASK)[0]
+
+    def render(
+        self, T_world_camera: Matrix, camera: Intrinsics, flags: int = 0
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Depth, and the body at each pixel, -1 for none, unless the flags leave it out."""
         view = np.linalg.inv(T_world_camera)
         view[1:3] *= -1.0  # OpenGL's camera looks along -z with y up
-        _, _, _, z_buffer, _ = pybullet.getCameraImage(
+        shape = camera.height, camera.width
+        _, _, _, z_buffer, bodies = self.client.getCameraImage(
             camera.width,
             camera.height,
             viewMatrix=view.flatten(order="F").tolist(),
-            projectionMatrix=projection(camera).flatten(order="F").tolist(),
+            projectionMatrix=_projection(camera).flatten(order="F").tolist(),
             renderer=pybullet.ER_TINY_RENDERER,
-            flags=pybullet.ER_NO_SEGMENTATION_MASK,
-            physicsClientId=self.client,
+            flags=flags,
         )
-        z = np.asarray(z_buffer, dtype=np.float64).reshape(camera.height, camera.width)
-        return camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
+        z = np.asarray(z_buffer, dtype=np.float64).reshape(shape)
+        depth = camera.far * camera.near / (camera.far - (camera.far - camera.near) * z)
+        return depth, np.resize(np.asarray(bodies, dtype=np.int64), shape)
+
+
+class _Client:
+    """PyBullet's functions, for one physics server."""
+
+    def __init__(self) -> None:
+        self.number: int = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, function: str) -> Any:
+        return partial(getattr(pybullet, function), physicsClientId=self.number)
 
 
 class PybulletBody(Body):
     """A body of a physics server."""
 
-    def __init__(self, client: int, uid: int) -> None:
+    def __init__(self, client: _Client, uid: int) -> None:
         self.client = client
         self.uid = uid
 
     def change(self, link: int, **dynamics: float) -> None:
         """Set properties of a link, -1 the base, by the engine's names for them."""
-        pybullet.changeDynamics(self.uid, link, physicsClientId=self.client, **dynamics)
+        self.client.changeDynamics(self.uid, link, **dynamics)
 
     def remove(self) -> None:
-        pybullet.removeBody(self.uid, physicsClientId=self.client)
+        self.client.removeBody(self.uid)
 
     @property
     def position(self) -> Matrix:
-        pose = pybullet.getBasePositionAndOrientation(self.uid, physicsClientId=self.client)
+        pose = self.client.getBasePositionAndOrientation(self.uid)
         return np.asarray(pose[0], dtype=np.float64)
 
     @property
     def quaternion_xyzw(self) -> tuple[float, float, float, float]:
-        pose = pybullet.getBasePositionAndOrientation(self.uid, physicsClientId=self.client)
+        pose = self.client.getBasePositionAndOrientation(self.uid)
         x, y, z, w = pose[1]
         return x, y, z, w
 
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
-        pybullet.resetBasePositionAndOrientation(
-            self.uid, position, quaternion_xyzw, physicsClientId=self.client
-        )
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
+        self.client.resetBasePositionAndOrientation(self.uid, position, quaternion_xyzw)
 
     @property
     def speed(self) -> float:
-        linear, angular = pybullet.getBaseVelocity(self.uid, physicsClientId=self.client)
+        linear, angular = self.client.getBaseVelocity(self.uid)
         return float(np.linalg.norm((linear, angular)))
 
     @property
     def bounds(self) -> Matrix:
-        lower, upper = pybullet.getAABB(self.uid, physicsClientId=self.client)
+        lower, upper = self.client.getAABB(self.uid)
         return np.asarray((lower, upper), dtype=np.float64)
 
     def contacts(self) -> list[Contact]:
-        points = pybullet.getContactPoints(self.uid, physicsClientId=self.client)
+        points = self.client.getContactPoints(self.uid)
         return [Contact(other_uid=point[2], distance=point[8]) for point in points]
 
 
@@ -221,8 +220,8 @@ class PybulletHand(PybulletBody, Hand):
     Fingers that swing slide along y on a link that slides along z.
     """
 
-    def __init__(self, client: int, model: HandModel, position: Matrix) -> None:
-        self.model = model
+    def __init__(self, client: _Client, model: HandModel, position: Matrix) -> None:
+        self.client, self.model = client, model
         if model.meshes is None:
             palm, *fingers = (_boxes(client, each) for each in (model.palm, *model.fingers))
         else:
@@ -231,7 +230,7 @@ class PybulletHand(PybulletBody, Hand):
         x, y, z = model.finger_centre
         ahead = 0 if model.advance is None else 1  # links before the fingers
         links = ahead + 2
-        uid = pybullet.createMultiBody(
+        uid = self.client.createMultiBody(
             baseMass=model.mass,
             baseCollisionShapeIndex=palm,
             basePosition=position,
@@ -246,7 +245,6 @@ class PybulletHand(PybulletBody, Hand):
             linkParentIndices=[0] * ahead + [ahead] * 2,
             linkJointTypes=[pybullet.JOINT_PRISMATIC] * links,
             linkJointAxis=[[0.0, 0.0, 1.0]] * ahead + [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]],
-            physicsClientId=client,
         )
         super().__init__(client, int(uid))
         self._fingers = ahead, ahead + 1
@@ -263,11 +261,11 @@ class PybulletHand(PybulletBody, Hand):
                 jointUpperLimit=0.5 * model.max_opening,
             )
         none = [0.0, 0.0, 0.0]
-        self._anchor = pybullet.createConstraint(
-            self.uid, -1, -1, -1, pybullet.JOINT_FIXED, none, none, position, physicsClientId=client
+        self._anchor = self.client.createConstraint(
+            self.uid, -1, -1, -1, pybullet.JOINT_FIXED, none, none, position
         )
         along = [1.0, 0.0, 0.0]
-        gear = pybullet.createConstraint(
+        gear = self.client.createConstraint(
             self.uid,
             self._fingers[0],
             self.uid,
@@ -276,36 +274,30 @@ class PybulletHand(PybulletBody, Hand):
             along,
             none,
             none,
-            physicsClientId=client,
         )
-        pybullet.changeConstraint(
-            gear, gearRatio=-1.0, erp=GEAR_ERP, maxForce=GEAR_FORCE, physicsClientId=client
-        )
+        self.client.changeConstraint(gear, gearRatio=-1.0, erp=GEAR_ERP, maxForce=GEAR_FORCE)
 
     @property
     def opening(self) -> float:
-        states = pybullet.getJointStates(self.uid, self._fingers, physicsClientId=self.client)
+        states = self.client.getJointStates(self.uid, self._fingers)
         return float(states[0][0]) + float(states[1][0])
 
-    def set_pose(
-        self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]
-    ) -> None:
+    def set_pose(self, position: Vector, quaternion_xyzw: Vector) -> None:
         super().set_pose(position, quaternion_xyzw)
         self.move(position, quaternion_xyzw)
         half = 0.5 * self.model.max_opening
         if self.model.advance is not None:
-            pybullet.resetJointState(self.uid, 0, 0.0, physicsClientId=self.client)
+            self.client.resetJointState(self.uid, 0, 0.0)
         for finger in self._fingers:
-            pybullet.resetJointState(self.uid, finger, half, physicsClientId=self.client)
+            self.client.resetJointState(self.uid, finger, half)
             self._drive(finger, half)
 
-    def move(self, position: Sequence[float] | Matrix, quaternion_xyzw: Sequence[float]) -> None:
-        pybullet.changeConstraint(
+    def move(self, position: Vector, quaternion_xyzw: Vector) -> None:
+        self.client.changeConstraint(
             self._anchor,
             jointChildPivot=position,
             jointChildFrameOrientation=quaternion_xyzw,
             maxForce=self.model.tool_force,
-            physicsClientId=self.client,
         )
 
     def close_fingers(self) -> None:
@@ -316,55 +308,49 @@ class PybulletHand(PybulletBody, Hand):
         """Have the fingers come forward in the next step as far as they will have closed."""
         if self.model.advance is None:
             return
-        finger = pybullet.getJointState(self.uid, self._fingers[0], physicsClientId=self.client)
+        finger = self.client.getJointState(self.uid, self._fingers[0])
         half = finger[0] + TIME_STEP * finger[1]
-        pybullet.setJointMotorControl2(
+        self.client.setJointMotorControl2(
             self.uid,
             0,
             pybullet.POSITION_CONTROL,
             targetPosition=float(np.polynomial.polynomial.polyval(half, self.model.advance)),
             force=self.model.tool_force,
             positionGain=1.0,
-            physicsClientId=self.client,
         )
 
     def _drive(self, finger: int, position: float) -> None:
         """Let a finger's motor pull toward a place, metres from the middle."""
-        pybullet.setJointMotorControl2(
+        self.client.setJointMotorControl2(
             self.uid,
             finger,
             pybullet.POSITION_CONTROL,
             targetPosition=position,
             force=self.model.finger_force,
-            physicsClientId=self.client,
         )
 
 
-def _hull(client: int, mesh: str, quaternion_xyzw: Sequence[float]) -> int:
+def _hull(client: _Client, mesh: str, quaternion_xyzw: Vector) -> int:
     """A collision shape: the convex hull of a mesh, turned."""
-    shape = pybullet.createCollisionShape(
-        pybullet.GEOM_MESH,
-        fileName=str(_MESHES / mesh),
-        collisionFrameOrientation=quaternion_xyzw,
-        physicsClientId=client,
+    shape = client.createCollisionShape(
+        pybullet.GEOM_MESH, fileName=str(_MESHES / mesh), collisionFrameOrientation=quaternion_xyzw
     )
     return int(shape)
 
 
-def _boxes(client: int, parts: Parts) -> int:
+def _boxes(client: _Client, parts: Parts) -> int:
     """A collision shape: the boxes around some parts."""
-    shape = pybullet.createCollisionShapeArray(
+    shape = client.createCollisionShapeArray(
         shapeTypes=[pybullet.GEOM_BOX] * len(parts),
         halfExtents=[(np.ptp(part, axis=0) / 2).tolist() for part in parts],
         collisionFramePositions=[
             ((part.min(axis=0) + part.max(axis=0)) / 2).tolist() for part in parts
         ],
-        physicsClientId=client,
     )
     return int(shape)
 
 
-def projection(camera: Intrinsics) -> Matrix:
+def _projection(camera: Intrinsics) -> Matrix:
     """OpenGL's projection matrix of a pinhole camera (row-major)."""
     matrix = np.zeros((4, 4))
     matrix[0, 0] = 2.0 * camera.focal_length / camera.width
