@@ -1,21 +1,35 @@
-"""How well scores separate grasps that hold from those that do not, and the model card."""
+"""How well scores separate grasps that hold from those that do not, and the model card.
 
+`python -m edgegrasp_training.evaluation data/held-out --weights A.safetensors B.safetensors`
+compares weights of hand networks on labelled views that none of them has learned from: by kind of
+scene, and by whether the camera saw the far side.
+"""
+
+import argparse
 import csv
-from collections.abc import Mapping
-from dataclasses import dataclass
+import sys
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import expit
 from scipy.stats import rankdata
 
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
-from edgegrasp_training.views import table
+from edgegrasp_model.hand_description import BEYOND
+from edgegrasp_model.networks.checkpoint import load_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
+from edgegrasp_model.networks.hand import HandBatch
+from edgegrasp_model.ranking import HIDDEN
+from edgegrasp_training.examples import pack_hands, tried_grasps
+from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene, table
 
 FloatArray = NDArray[np.floating]
+TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
+EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # of the ranges of scores in a comparison
 CURVE_ROWS = 20  # of the learning curve in the card, about
 
 
@@ -26,7 +40,6 @@ class Evaluation:
     loss: float  # cross entropy, nats
     accuracy: float
     auroc: float
-    average_precision: float
     temperature: float  # that calibrates the logits
     logit: NDArray[np.float32]  # (E,)
     label: NDArray[np.float32]  # (E,)
@@ -34,25 +47,14 @@ class Evaluation:
 
 def evaluate_scores(logit: NDArray[np.float32], label: NDArray[np.float32]) -> Evaluation:
     """All figures of some scores.  # (E,), (E,)."""
-    return Evaluation(
-        cross_entropy(logit, label),
-        accuracy(logit, label),
-        auroc(logit, label),
-        average_precision(logit, label),
-        fit_temperature(logit, label),
-        logit,
-        label,
-    )
+    accuracy = float(np.mean((logit > 0) == (label > 0.5)))
+    loss, rank = cross_entropy(logit, label), auroc(logit, label)
+    return Evaluation(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
 
 
 def cross_entropy(logit: FloatArray, label: FloatArray) -> float:
     """Mean binary cross entropy, nats.  # (E,), (E,)."""
     return float(np.mean(np.logaddexp(0.0, logit) - label * logit))
-
-
-def accuracy(logit: FloatArray, label: FloatArray) -> float:
-    """Share of labels that `logit > 0` predicts.  # (E,), (E,)."""
-    return float(np.mean((logit > 0) == (label > 0.5)))
 
 
 def auroc(logit: FloatArray, label: FloatArray) -> float:
@@ -66,16 +68,6 @@ def auroc(logit: FloatArray, label: FloatArray) -> float:
     return float(excess / (successes * failures))
 
 
-def average_precision(logit: FloatArray, label: FloatArray) -> float:
-    """Area under the precision-recall curve, ties counted together; nan without a success."""
-    threshold, place = np.unique(-logit, return_inverse=True)  # best first
-    taken = np.cumsum(np.bincount(place, minlength=len(threshold)))
-    held = np.bincount(place, weights=label, minlength=len(threshold))
-    if held.sum() == 0:
-        return float("nan")
-    return float((held * np.cumsum(held) / taken).sum() / held.sum())
-
-
 def fit_temperature(logit: FloatArray, label: FloatArray) -> float:
     """The t for which sigmoid(logit / t) has the least cross entropy."""
     logit, label = logit.astype(np.float64), label.astype(np.float64)
@@ -87,75 +79,147 @@ def fit_temperature(logit: FloatArray, label: FloatArray) -> float:
     return float(np.exp(best.x))
 
 
+class Range(NamedTuple):
+    """Grasps whose scores lie between two edges."""
+
+    score: float  # mean
+    held: float  # share of them
+    count: int
+
+
 def reliability(
-    logit: FloatArray, label: FloatArray, bins: int = 10
-) -> list[tuple[float, float, int]]:
-    """Mean predicted probability, observed success rate and count of each occupied bin."""
-    probability = expit(logit)
-    which = np.minimum((probability * bins).astype(int), bins - 1)
-    inside = [which == number for number in range(bins) if (which == number).any()]
-    return [(float(probability[b].mean()), float(label[b].mean()), int(b.sum())) for b in inside]
+    score: FloatArray, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
+) -> dict[float, Range]:
+    """What held in each range of scores that has any, by its lower edge.  # (E,), (E,)."""
+    number = np.digitize(score, edges[1:-1])
+    ranges = {low: number == k for k, low in enumerate(edges[:-1])}
+    return {
+        low: Range(float(score[mine].mean()), float(held[mine].mean()), int(mine.sum()))
+        for low, mine in ranges.items()
+        if mine.any()
+    }
+
+
+def calibration_error(score: FloatArray, held: NDArray[np.generic]) -> float:
+    """Mean distance of score and share that held, over ten ranges of equal width."""
+    ranges = reliability(score, held).values()
+    return sum(each.count * abs(each.score - each.held) for each in ranges) / len(score)
 
 
 def write_model_card(
-    path: Path,
-    metadata: CheckpointMetadata,
-    training: Mapping[str, Any],
-    evaluation: Evaluation,
-    log: Path,
-    command: str,
+    path: Path, metadata: CheckpointMetadata, evaluation: Evaluation, log: Path, command: str
 ) -> None:
     """Write a card in Markdown.
 
     The evaluation is that before calibration.
     """
-    network = metadata.network
+    network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
+    facts = network | {"voxel_size": metadata.voxel_size, "gripper": metadata.gripper}
+    facts |= metadata.training
+    facts |= {
+        "validation_loss": f"{evaluation.loss:.4f} nats",
+        "validation_accuracy": f"{100 * evaluation.accuracy:.1f} %",
+        "validation_AUROC": f"{evaluation.auroc:.4f}",
+        "temperature": f"{metadata.temperature:.3f}",
+    }
     rows = [
-        ("architecture", network.architecture),
-        ("crop radius", f"{network.crop_radius * 1000:g} mm"),
-        *_layers(network),
-        ("classifier", network.classifier_widths),
-        ("voxel size", f"{metadata.voxel_size * 1000:g} mm"),
-        ("gripper", metadata.gripper),
-        *((name.replace("_", " "), value) for name, value in training.items()),
-        ("validation loss", f"{evaluation.loss:.4f} nats"),
-        ("validation accuracy", f"{100 * evaluation.accuracy:.1f} %"),
-        ("validation AUROC", f"{evaluation.auroc:.4f}"),
-        ("validation average precision", f"{evaluation.average_precision:.4f}"),
-        ("temperature", f"{metadata.temperature:.3f}"),
+        (name.replace("_", " "), ", ".join(map(str, v)) if isinstance(v, tuple | list) else v)
+        for name, v in facts.items()
     ]
-    calibrated = evaluation.logit / metadata.temperature
-    bins = [
-        (f"{predicted:.3f}", f"{observed:.3f}", count)
-        for predicted, observed, count in reliability(calibrated, evaluation.label)
-    ]
-    plain = [(n, ", ".join(map(str, v)) if isinstance(v, tuple | list) else v) for n, v in rows]
-    lines = [f"# {metadata.name}", "", *table(("", ""), plain)]
+    ranges = reliability(expit(evaluation.logit / metadata.temperature), evaluation.label)
+    bins = [(f"{score:.3f}", f"{held:.3f}", count) for score, held, count in ranges.values()]
+    with log.open(newline="") as file:
+        head, *curve = csv.reader(file)
+    some = curve[:: -max(1, len(curve) // CURVE_ROWS)][::-1]
+    lines = [f"# {metadata.name}", "", *table(("", ""), rows)]
     lines += ["", "Trained by:", "", "```", command, "```", ""]
     lines += ["Reliability of the score on the validation views:", ""]
-    lines += [*table(("score", "held", "grasps"), bins), "", "During training:", "", *_curve(log)]
+    lines += [*table(("score", "held", "grasps"), bins), "", "During training:", ""]
+    lines += table([name.replace("_", " ") for name in head], some)
     path.write_text("\n".join(lines) + "\n")
 
 
-def _layers(network: NetworkConfig) -> list[tuple[str, object]]:
-    """What comes before the classifier."""
-    if network.architecture == "hand":
-        return [
-            ("hand description", f"{network.description_size} numbers per edge grasp"),
-            ("point encoder", f"{network.hand_widths}, {network.hand_points} points of each hand"),
-        ]
-    return [
-        ("neighbours", network.k),
-        ("convolutions", network.conv_widths),
-        ("global MLPs", f"{network.global_widths_1}, {network.global_widths_2}"),
+# Comparing weights
+
+
+class Scored(NamedTuple):
+    """Labelled grasps of some views, and the scores of several networks."""
+
+    kind: NDArray[np.str_]  # (E,) of scene
+    far_side_hidden: NDArray[np.bool_]  # (E,)
+    held: NDArray[np.bool_]  # (E,)
+    logit: NDArray[np.float64]  # (W, E) calibrated, of each network
+
+
+def score_views(paths: list[Path], weights: list[Path]) -> Scored:
+    """Score the labelled grasps of views.
+
+    Raises:
+        InvalidCheckpoint: Weights cannot be read.
+        ValueError: They are not of hand networks.
+    """
+    networks = [load_checkpoint(path) for path in weights]
+    if any(metadata.network.architecture != "hand" for _, metadata in networks):
+        raise ValueError("weights: hand networks are compared, such as edgegrasp-plus. Name those.")
+    parts = []
+    for path in paths:
+        view, logits = load_view(path), []
+        if len(view.tried()) == 0:
+            continue
+        for network, metadata in networks:
+            grasps = tried_grasps(view, metadata.network)
+            packed = pack_hands(grasps, grasps.balls(), metadata.network)
+            assert isinstance(packed.batch, HandBatch)
+            description = packed.batch.description
+            with torch.inference_mode():
+                logit = network(packed.batch).double().numpy()
+            logits.append(logit / metadata.temperature)
+        hidden = (description[:, BEYOND] > HIDDEN).any(dim=1).numpy()
+        kind = np.full(len(hidden), scene_of(path).split("_")[0])
+        parts.append(Scored(kind, hidden, packed.label.numpy() > 0.5, np.stack(logits)))
+    return Scored(*(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True)))
+
+
+def reliability_tables(scored: Scored, names: list[str]) -> str:
+    """Markdown: figures of each group of grasps, and how many of each range of scores held."""
+    groups = {"all": np.ones(len(scored.held), dtype=bool)}
+    groups |= {f"{kind} scenes": scored.kind == kind for kind in np.unique(scored.kind)}
+    groups |= {"far side hidden": scored.far_side_hidden, "far side seen": ~scored.far_side_hidden}
+    rows = []
+    for group, mine in groups.items():
+        held = scored.held[mine]
+        for name, logit in zip(names, scored.logit[:, mine], strict=True):
+            if not mine.any():
+                continue
+            score = expit(logit)
+            shares = (f"{100 * v.mean():.1f} %" for v in (score, held))
+            loss, brier = cross_entropy(logit, held.astype(float)), np.square(score - held).mean()
+            figures = (f"{v:.3f}" for v in (loss, brier, calibration_error(score, held)))
+            rows.append((group, name, len(held), *shares, *figures))
+    head = ("grasps", "weights", "number", "mean score", "held", "loss", "Brier", "ECE")
+    found = [reliability(expit(logit), scored.held, EDGES) for logit in scored.logit]
+    cells = [
+        {low: f"{100 * each.held:.1f} % of {each.count}" for low, each in one.items()}
+        for one in found
     ]
+    ranges = [(f"from {low:g}", *(one.get(low, "-") for one in cells)) for low in EDGES[:-1]]
+    by_range = table(("score", *(f"{name}: held" for name in names)), ranges)
+    return "\n".join([*table(head, rows), "", *by_range])
 
 
-def _curve(log: Path) -> list[str]:
-    """Some twenty rows of the log as a table, the last among them."""
-    with log.open(newline="") as file:
-        rows = list(csv.reader(file))
-    head, body = [name.replace("_", " ") for name in rows[0]], rows[1:]
-    every = max(1, len(body) // CURVE_ROWS)
-    some = body[(len(body) - 1) % every :: every]
-    return table(head, some)
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(prog="python -m edgegrasp_training.evaluation")
+    parser.add_argument("data", type=Path, nargs="+", help="folders of views")
+    parser.add_argument("--weights", type=Path, nargs="+", required=True)
+    parser.add_argument("--validation-share", type=float, help="only what `train` kept apart")
+    given = parser.parse_args()
+    paths = find_views(given.data)
+    if given.validation_share is not None:
+        paths = split_by_scene(paths, given.validation_share, seed=0)[1]
+    names = list(map(str, given.weights))
+    sys.stdout.write(reliability_tables(score_views(paths, given.weights), names) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -173,7 +173,7 @@ class Trainer:
         metadata = replace(self.metadata, temperature=evaluation.temperature, training=training)
         self._save_average(metadata)
         card = self.folder / f"{self.metadata.name}.md"
-        write_model_card(card, metadata, training, evaluation, self.folder / LOG_FILE, command)
+        write_model_card(card, metadata, evaluation, self.folder / LOG_FILE, command)
         return evaluation
 
     def _mix_in(self, start: Path) -> None:

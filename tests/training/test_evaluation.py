@@ -1,14 +1,21 @@
+"""Figures of scores, and weights compared on labelled views."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import expit
 
+from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.evaluation import (
-    accuracy,
+    Scored,
     auroc,
-    cross_entropy,
+    calibration_error,
     evaluate_scores,
-    fit_temperature,
     reliability,
+    reliability_tables,
+    score_views,
 )
 
 
@@ -28,16 +35,61 @@ def test_auroc_of_one_class_is_undefined() -> None:
 
 def test_loss_and_accuracy_of_known_scores() -> None:
     logit, label = np.array([0.0, np.log(3), -np.log(3)]), np.array([1.0, 1.0, 1.0])
-    assert cross_entropy(logit, label) == pytest.approx(-np.log([0.5, 0.75, 0.25]).mean())
-    assert accuracy(logit, label) == pytest.approx(1 / 3)
+    found = evaluate_scores(logit, label)
+    assert found.loss == pytest.approx(-np.log([0.5, 0.75, 0.25]).mean())
+    assert found.accuracy == pytest.approx(1 / 3)
 
 
 def test_the_temperature_undoes_overconfidence() -> None:
     rng = np.random.default_rng(0)
     honest = rng.normal(size=20_000)
     label = (rng.random(20_000) < expit(honest)).astype(float)
-    assert fit_temperature(honest * 3, label) == pytest.approx(3, rel=0.1)
     found = evaluate_scores((honest * 3).astype(np.float32), label.astype(np.float32))
-    for predicted, observed, _ in reliability(found.logit / found.temperature, found.label):
-        assert predicted == pytest.approx(observed, abs=0.05)
-    assert sum(count for _, _, count in reliability(found.logit, found.label)) == 20_000
+    assert found.temperature == pytest.approx(3, rel=0.1)
+    ranges = reliability(expit(found.logit / found.temperature), found.label)
+    assert all(each.score == pytest.approx(each.held, abs=0.05) for each in ranges.values())
+    assert sum(each.count for each in ranges.values()) == 20_000
+
+
+def test_scores_as_good_as_shares_have_no_calibration_error() -> None:
+    score = np.repeat([0.25, 0.75], 400)
+    held = np.concatenate([np.arange(400) % 4 == 0, np.arange(400) % 4 != 0])
+    assert calibration_error(score, held) == pytest.approx(0.0)
+    assert calibration_error(score, ~held) == pytest.approx(0.5)
+    assert calibration_error(np.ones(4), np.array([True, True, False, False])) == 0.5
+
+
+def test_tables_tell_the_better_weights_from_the_worse_ones_by_group() -> None:
+    rng = np.random.default_rng(0)
+    logit = rng.normal(0.0, 3.0, 4000)
+    held = rng.random(4000) < 1.0 / (1.0 + np.exp(-logit))
+    kind = np.where(np.arange(4000) % 2, "table", "pile")
+    hidden = np.arange(4000) < 1000
+    text = reliability_tables(Scored(kind, hidden, held, np.stack([logit, -logit])), ["a", "b"])
+    figures = {}
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        figures[tuple(cells[:2])] = cells[2:]
+    for group, number in (("all", 4000), ("pile scenes", 2000), ("far side hidden", 1000)):
+        good, bad = figures[group, "a"], figures[group, "b"]
+        assert int(good[0]) == int(bad[0]) == number
+        assert all(float(g) < float(b) for g, b in zip(good[3:], bad[3:], strict=True))
+        assert float(good[5]) < 0.05
+
+
+def test_views_are_scored_by_hand_networks_alone(made_up_view, networks, tmp_path: Path) -> None:
+    made_up_view(1).save(tmp_path / "pile_0-000000_0.npz")
+    made_up_view(2).save(tmp_path / "table_0-000001_0.npz")
+    paths = sorted(tmp_path.glob("*.npz"))
+    files = {}
+    for name in ("hands", "balls"):
+        files[name] = tmp_path / f"{name}.safetensors"
+        metadata = CheckpointMetadata(name, networks[name], 0.0045, "panda")
+        save_checkpoint(files[name], build_network(networks[name]), metadata)
+    scored = score_views(paths, [files["hands"], files["hands"]])
+    assert set(scored.kind.tolist()) == {"pile", "table"}
+    assert scored.logit.shape == (2, len(scored.held))
+    np.testing.assert_array_equal(*scored.logit)
+    assert 0 < scored.held.mean() < 1
+    with pytest.raises(ValueError, match="hand networks"):
+        score_views(paths, [files["balls"]])
