@@ -44,14 +44,6 @@ LIFT_STEP = 0.005  # metres in each time step of a retreat whose outcome is clea
 _TARGET_DEPTHS = (0.007, 0.002, 0.015, 0.025)
 
 
-class GraspOutcome(StrEnum):
-    """The outcome of a grasp."""
-
-    SUCCESS = "success"
-    PREGRASP = "pregrasp"
-    AFTER = "after"
-
-
 class FailureCause(StrEnum):
     """Why a grasp failed: the first of these that applies."""
 
@@ -67,8 +59,6 @@ class GraspResult:
     """The outcome of a grasp, and its details.
 
     Attributes:
-        outcome: `SUCCESS`; `PREGRASP`: contact at the start pose (only where that is a failure);
-            `AFTER`: nothing held at the end.
         opening: metres between the fingers at the end.
         start_contact: whether the open hand overlapped something at its start pose.
         held: the object held, None if nothing is.
@@ -77,7 +67,6 @@ class GraspResult:
         held_after_shaking: whether it was still held then; None if the hand was not shaken.
     """
 
-    outcome: GraspOutcome
     opening: float
     start_contact: bool
     held: SceneObject | None
@@ -88,7 +77,7 @@ class GraspResult:
     @property
     def success(self) -> bool:
         """Whether the hand came away holding something."""
-        return self.outcome is GraspOutcome.SUCCESS
+        return self.cause is None
 
 
 def run_grasp(
@@ -97,7 +86,6 @@ def run_grasp(
     objects: Mapping[int, SceneObject],
     obstacles: Set[int] = frozenset(),
     *,
-    start_contact_fails: bool,
     to_the_end: bool,
     shake: bool = False,
 ) -> GraspResult:
@@ -108,21 +96,18 @@ def run_grasp(
         T_world_hand: pose of the `panda_hand` link at the grasp, (4, 4).
         objects: what may be held, by the id of its body.
         obstacles: ids of the bodies that a hand must not cut into: that fails the grasp at once.
-        start_contact_fails: stop with `PREGRASP` if the open hand overlaps anything at the start.
         to_the_end: simulate every step, so that whatever the hand pushes aside ends up right;
             otherwise stop once the outcome is clear.
-        shake: shake a held object at the end of the retreat; this does not change `outcome`.
+        shake: shake a held object at the end of the retreat; this does not change `success`.
     """
     gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
 
-    def failed(cause: FailureCause, outcome: GraspOutcome = GraspOutcome.AFTER) -> GraspResult:
-        return GraspResult(outcome, gripper.opening, start_contact, None, target, cause)
+    def failed(cause: FailureCause) -> GraspResult:
+        return GraspResult(gripper.opening, start_contact, None, target, cause)
 
-    if start_contact and start_contact_fails:
-        return failed(FailureCause.START_COLLISION, GraspOutcome.PREGRASP)
     if _cut_into(gripper) & obstacles:
         return failed(FailureCause.START_COLLISION)
     collided = False
@@ -137,7 +122,7 @@ def run_grasp(
     if not missed or to_the_end:
         held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
         if held is not None and gripper.opening > MIN_OPENING:
-            result = GraspResult(GraspOutcome.SUCCESS, gripper.opening, start_contact, held, target)
+            result = GraspResult(gripper.opening, start_contact, held, target)
             if not shake:
                 return result
             still = _holds_when_shaken(gripper, T_world_hand, held, objects)

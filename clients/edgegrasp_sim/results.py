@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import TypeAdapter
+from scipy.stats import binomtest
 
-from edgegrasp_sim.hand import FailureCause, GraspOutcome
-from edgegrasp_sim.trial import Attempt, Round, RoundEnd
+from edgegrasp_sim.hand import FailureCause
+from edgegrasp_sim.trial import Attempt, Round
 
 CSV_COLUMNS = (
     "seed",
@@ -24,19 +26,12 @@ CSV_COLUMNS = (
     *(name for name in Attempt.__dataclass_fields__ if name != "T_world_hand"),
     "T_world_hand",
 )
-PAIRED = (
-    "scene",
-    "engine",
-    "protocol",
-    "objects",
-    "constants",
-)  # of the manifest, equal in paired runs
+PAIRED = ("scene", "engine", "protocol", "objects", "constants")  # equal in paired runs
 COUNTS = ("successes", "attempts", "objects")
 RATE_LABELS = {"grasp_success_rate": "GSR", "declutter_rate": "DR"}
 GATED = ("scene", "engine", "protocol", "protocol_version")
-FIRST_ENGINE = {"engine": "pybullet"}  # of results that name none
-Z_95 = 1.959964  # standard normal deviate of a two-sided 95 % interval
 RESAMPLES = 10_000
+ROUND = TypeAdapter(Round)
 
 
 class ResultFolder:
@@ -87,7 +82,7 @@ class ResultFolder:
         """
         self.manifest()
         files = (self.path / "rounds").glob("*.json")
-        rounds = [round_from_json(json.loads(file.read_text())) for file in files]
+        rounds = [ROUND.validate_json(file.read_bytes()) for file in files]
         return sorted(rounds, key=lambda item: (item.seed, item.index))
 
     def manifest(self) -> dict[str, Any]:
@@ -100,7 +95,7 @@ class ResultFolder:
         if not file.is_file():
             raise FileNotFoundError(f"{self.path} contains no benchmark: manifest.json is missing")
         table: dict[str, Any] = json.loads(file.read_text())
-        return table | {"run": FIRST_ENGINE | table["run"]}
+        return table
 
     def finish(self, rounds: Sequence[Round]) -> dict[str, Any]:
         """Write `attempts.csv` and `summary.json`; returns the summary."""
@@ -206,19 +201,6 @@ def attempts_digest(rounds: Sequence[Round]) -> str:
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
 
 
-def round_from_json(table: dict[str, Any]) -> Round:
-    """Rebuild a round from the JSON of its dataclass."""
-    attempts = []
-    for item in table["attempts"]:
-        cause = None if item["cause"] is None else FailureCause(item["cause"])
-        attempts.append(
-            Attempt(**item | {"outcome": GraspOutcome(item["outcome"]), "cause": cause})
-        )
-    names = {key: tuple(table.get(key, ())) for key in ("objects", "too_wide")}
-    end = RoundEnd(table["end"])
-    return Round(**table | names | {"attempts": tuple(attempts), "end": end})
-
-
 def planner_title(planner: dict[str, Any]) -> str:
     """The weights of a manifest's planner, or its name if it has none."""
     return str(planner.get("model") or planner["name"])
@@ -278,9 +260,8 @@ def below_gate(summary: dict[str, Any], gate: Path) -> list[str]:
         FileNotFoundError: there is no such file.
         ValueError: it is no summary, or one of another scene or protocol.
     """
-    summary = FIRST_ENGINE | summary
     try:
-        committed = FIRST_ENGINE | json.loads(gate.read_text())
+        committed = json.loads(gate.read_text())
         limits = {name: committed[name]["wilson_95"] for name in RATE_LABELS}
         differing = [name for name in GATED if committed[name] != summary[name]]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
@@ -306,11 +287,8 @@ def wilson(successes: int, trials: int) -> tuple[float, float] | None:
     """Wilson's 95 % interval of a share; None without trials."""
     if trials == 0:
         return None
-    share = successes / trials
-    spread = Z_95**2 / trials
-    centre = (share + spread / 2) / (1 + spread)
-    half = Z_95 / (1 + spread) * ((share * (1 - share) + spread / 4) / trials) ** 0.5
-    return max(0.0, centre - half), min(1.0, centre + half)
+    low, high = binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def paired_difference(

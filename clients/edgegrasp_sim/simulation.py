@@ -125,10 +125,6 @@ class ClutterSimulation:
 
     Args:
         objects: what to make scenes from, for each kind; the built-in sets by default.
-        start_contact_fails: call a grasp failed (`PREGRASP`) if the open hand overlaps anything
-            at its start pose. The reference simulator asks for contacts there before the engine
-            has looked for any, so that it never fails a grasp for this and lets the engine push
-            hand and objects apart; off by default, to agree with it.
         engine: see `choose_engine`.
         gripper: the fields of a gripper file; by default the Panda's hand with the vendor's shapes.
     """
@@ -137,7 +133,6 @@ class ClutterSimulation:
         self,
         objects: Mapping[SceneKind, ObjectSet] | None = None,
         *,
-        start_contact_fails: bool = False,
         engine: str | None = None,
         gripper: Mapping[str, Any] | None = None,
     ) -> None:
@@ -148,7 +143,6 @@ class ClutterSimulation:
             if objects is not None
             else {kind: ObjectSet.builtin(kind) for kind in SceneKind}
         )
-        self.start_contact_fails = start_contact_fails
         self.surroundings = OPEN_TABLE
         self.world = make_world(engine)
         self._objects: list[SceneObject] = []
@@ -414,7 +408,6 @@ class ClutterSimulation:
             T,
             {item.body.uid: item for item in self._objects},
             self._obstacles,
-            start_contact_fails=self.start_contact_fails,
             to_the_end=to_the_end,
             shake=shake,
         )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_sim.camera import Observation, crop
-from edgegrasp_sim.hand import FailureCause, GraspOutcome
+from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import Protocol as BenchmarkProtocol
 from edgegrasp_sim.simulation import ClutterSimulation
@@ -55,7 +55,6 @@ class Attempt:
     """One executed grasp.
 
     Attributes:
-        outcome: its outcome.
         cause: why it failed, None if it did not.
         object: name of the object removed, None after a failure.
         target: name of the object that was between the fingers, None if there was none.
@@ -70,7 +69,6 @@ class Attempt:
         T_world_hand: (4, 4) row-major pose of the hand.
     """
 
-    outcome: GraspOutcome
     cause: FailureCause | None
     object: str | None
     target: str | None
@@ -87,7 +85,7 @@ class Attempt:
     @property
     def success(self) -> bool:
         """Whether an object was removed."""
-        return self.outcome is GraspOutcome.SUCCESS
+        return self.cause is None
 
     @property
     def T_cloud_hand(self) -> NDArray[np.float32]:  # noqa: N802
@@ -179,7 +177,6 @@ class RoundDriver:
         self._camera = random_stream(seed, index, Stream.CAMERA)
         self._noise = random_stream(seed, index, Stream.NOISE)
         self._policy = random_stream(seed, index, Stream.POLICY)
-        simulation.start_contact_fails = protocol.round.start_contact_fails
         simulation.reset(
             scene,
             random_stream(seed, index, Stream.SCENE),
@@ -236,7 +233,6 @@ class RoundDriver:
         """
         result = self.simulation.execute_grasp(grasp.T_world_hand)
         attempt = Attempt(
-            outcome=result.outcome,
             cause=result.cause,
             object=result.held.model.name if result.held is not None else None,
             target=result.target.model.name if result.target is not None else None,

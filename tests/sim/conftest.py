@@ -18,16 +18,10 @@ def engine(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="session")
-def _simulation(engine: str) -> Iterator[ClutterSimulation]:
+def simulation(engine: str) -> Iterator[ClutterSimulation]:
+    """A simulation that all tests share."""
     with ClutterSimulation(engine=engine) as simulation:
         yield simulation
-
-
-@pytest.fixture
-def simulation(_simulation: ClutterSimulation) -> ClutterSimulation:
-    """A simulation that all tests share, with its settings as they are at first."""
-    _simulation.start_contact_fails = False
-    return _simulation
 
 
 @pytest.fixture

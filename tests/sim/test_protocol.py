@@ -32,13 +32,9 @@ def test_the_side_view_is_where_giga_has_it() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("views = 1", "", "camera lacks views"),
-        ("views = 1", "views = 1\nzoom = 2", "camera has unknown zoom"),
-        (
-            'table = "known"',
-            'table = "guess"',
-            "table is 'guess'; choose one of known, seen, around",
-        ),
+        ("views = 1", "", "camera.views: Field required"),
+        ("views = 1", "views = 1\nzoom = 2", "camera.zoom: Unexpected"),
+        ('table = "known"', 'table = "guess"', "planning.table: .* 'known', 'seen', 'around'"),
         ("version = 2", "version = ", "protocol .*toml"),
     ],
 )

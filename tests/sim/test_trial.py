@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from edgegrasp_sim.camera import Observation
-from edgegrasp_sim.hand import FailureCause, GraspOutcome
+from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
 from edgegrasp_sim.results import attempts_digest
@@ -58,14 +58,14 @@ def test_top_down_grasps_clear_a_scene_of_cubes(cubes, paper_with) -> None:
     assert done.end is RoundEnd.CLEARED
     assert done.successes == len(done.objects) == 3
     for attempt in done.attempts:
-        assert attempt.object == ("cube" if attempt.outcome is GraspOutcome.SUCCESS else None)
+        assert attempt.object == ("cube" if attempt.success else None)
 
 
 def test_two_failures_in_a_row_end_a_round(run: Callable[..., Round]) -> None:
     done = run(lambda seen, seed: PlannedGrasp(IN_THE_AIR, 1.0, 0.04), PACKED, 2)
     assert done.end is RoundEnd.FAILURES
-    found = [(attempt.outcome, attempt.cause, attempt.target) for attempt in done.attempts]
-    assert found == [(GraspOutcome.AFTER, FailureCause.MISSED, None)] * 2
+    found = [(attempt.cause, attempt.target) for attempt in done.attempts]
+    assert found == [(FailureCause.MISSED, None)] * 2
 
 
 def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Round]) -> None:
