@@ -16,7 +16,7 @@ from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientE
 from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.engine import ENGINES, choose_engine
-from edgegrasp_sim.picture import Picture, View
+from edgegrasp_camera.picture import Picture, View
 from edgegrasp_sim.simulation import ClutterSimulation
 
 OUTPUT = Path(__file__).resolve().parents[1] / "demo_output"

@@ -22,9 +22,9 @@ from edgegrasp_cli.flags import (
 from edgegrasp_model.results import SUPPORT, UNLABELLED
 
 if TYPE_CHECKING:
+    from edgegrasp_camera.picture import Picture
     from edgegrasp_cli.real_scenes import Int64, RealScene, SceneFigures
     from edgegrasp_model.gripper import Gripper
-    from edgegrasp_sim.picture import Picture
 
 Option = typer.Option
 DECIDED = ("viewpoint", "debug", "robot")  # options that the scene decides, or this command
@@ -263,7 +263,7 @@ def draw(
     Grasps are best first and the plane that was found is its normal (3,) and offset, both in the
     camera's frame.
     """
-    from edgegrasp_sim.picture import Picture
+    from edgegrasp_camera.picture import Picture
 
     picture = Picture(scene.camera, scene.points, image=scene.rgb, title=title + CAPTION)
     row = picture.row_of_pixel

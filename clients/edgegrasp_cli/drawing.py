@@ -63,7 +63,7 @@ def draw(
         colors: As `CloudInput.colors`; None: those of the cloud, if any.
         from_above: Whether to look from above, whatever the cloud.
     """
-    from edgegrasp_sim.picture import Picture, View
+    from edgegrasp_camera.picture import Picture, View
 
     points = np.asarray(sent.points)
     flat, shown, image = points.reshape(-1, 3), detection.grasps[:DRAWN], None

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from edgegrasp_sim.picture import View
+from edgegrasp_camera.picture import View
 from edgegrasp_sim.segmentation import Segmentation, compare
 
 if TYPE_CHECKING:  # Numba is loaded where grasps are judged

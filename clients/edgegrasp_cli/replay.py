@@ -39,7 +39,7 @@ def attempt(
     """Make one recorded attempt again, in the scene and view it was made in."""
     from rich.console import Console
 
-    from edgegrasp_sim.picture import draw_grasps
+    from edgegrasp_camera.picture import draw_grasps
     from edgegrasp_sim.replay import Replay
     from edgegrasp_sim.report import attempt_title
     from edgegrasp_sim.results import ResultFolder

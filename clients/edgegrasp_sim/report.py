@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from edgegrasp_camera.picture import draw_grasps
 from edgegrasp_sim.page import Row, image, page, table
-from edgegrasp_sim.picture import draw_grasps
 from edgegrasp_sim.replay import Replay
 from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
 from edgegrasp_sim.trial import Round

@@ -9,6 +9,7 @@ from typing import Any, Self, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgegrasp_camera.picture import lit
 from edgegrasp_sim.camera import (
     CAMERA,
     EVALUATION_VIEWS,
@@ -24,7 +25,6 @@ from edgegrasp_sim.engine import make_world
 from edgegrasp_sim.engine.urdf import least_width, read_urdf
 from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
-from edgegrasp_sim.picture import lit
 from edgegrasp_sim.poses import Matrix, require_pose
 from edgegrasp_sim.scene import (
     PACKED_SCALE,

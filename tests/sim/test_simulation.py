@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from edgegrasp_model.gripper import gripper_fields, gripper_names, load_gripper
-from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import FINGERTIP, T_HANDCOM_HAND, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, Prism, SceneKind, write_object
 from edgegrasp_sim.poses import require_pose, translation
 from edgegrasp_sim.scene import load_object
-from edgegrasp_sim.simulation import ClutterSimulation, ObjectPlacement
+from edgegrasp_sim.simulation import PAINTS, ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, WORKSPACE
 
 CUBE = Path(__file__).parent / "cube.urdf"  # 0.05 m
@@ -243,6 +243,19 @@ def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:
     assert top(0.0, 0).std() < 1e-4
     assert np.array_equal(top(0.001, 5), top(0.001, 5))
     assert not np.array_equal(top(0.001, 5), top(0.001, 6))
+
+
+def test_a_colour_image_shows_every_object_in_a_paint_of_its_own(
+    simulation: ClutterSimulation,
+) -> None:
+    placed = simulation.reset("packed", np.random.default_rng(0), num_objects=4)
+    pose = look_at(np.array([0.15, -0.3, 0.5]), np.array([0.15, 0.15, 0.08]))
+    image = simulation.color_image(pose)
+    assert image.shape == (CAMERA.height, CAMERA.width, 3)
+    hues = image / np.maximum(image.sum(axis=2, keepdims=True), 1)
+    for paint in PAINTS[:placed]:
+        like = np.abs(hues - paint / paint.sum()).max(axis=2) < 0.02
+        assert like.sum() > 150
 
 
 def test_retreat_is_straight_up_after_a_side_grasp() -> None:

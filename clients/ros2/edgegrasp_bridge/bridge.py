@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
+from edgegrasp_camera.picture import fork
 from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_in_scene, on_mask
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
@@ -26,7 +27,6 @@ from edgegrasp_client.conversions import (
     quaternion_from_matrix,
 )
 from edgegrasp_client.options import DetectOptions
-from edgegrasp_sim.picture import fork
 
 Message = dict[str, Any]
 Lookup = Callable[[str, str, Any], Float64]

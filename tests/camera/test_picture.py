@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edgegrasp_sim.camera import CAMERA, look_at
-from edgegrasp_sim.picture import Picture, View, draw_grasps
-from edgegrasp_sim.simulation import PAINTS, ClutterSimulation
+from edgegrasp_camera.picture import Picture, View, draw_grasps
 
 
 @dataclass
@@ -20,19 +18,6 @@ class Planned:
 def pixels(written: io.BytesIO) -> np.ndarray:
     with Image.open(written) as picture:
         return np.asarray(picture.convert("RGB")).astype(int)
-
-
-def test_a_colour_image_shows_every_object_in_a_paint_of_its_own(
-    simulation: ClutterSimulation,
-) -> None:
-    placed = simulation.reset("packed", np.random.default_rng(0), num_objects=4)
-    pose = look_at(np.array([0.15, -0.3, 0.5]), np.array([0.15, 0.15, 0.08]))
-    image = simulation.color_image(pose)
-    assert image.shape == (CAMERA.height, CAMERA.width, 3)
-    hues = image / np.maximum(image.sum(axis=2, keepdims=True), 1)
-    for paint in PAINTS[:placed]:
-        like = np.abs(hues - paint / paint.sum()).max(axis=2) < 0.02
-        assert like.sum() > 150
 
 
 def test_the_nearest_point_is_seen_at_a_pixel() -> None:
