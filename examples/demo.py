@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_camera.picture import Picture, View
 from edgegrasp_client import Detection, DetectOptions, GraspClient, GraspClientError
 from edgegrasp_client.connection import local_server
 from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, crop
 from edgegrasp_sim.engine import ENGINES, choose_engine
-from edgegrasp_camera.picture import Picture, View
 from edgegrasp_sim.simulation import ClutterSimulation
 
 OUTPUT = Path(__file__).resolve().parents[1] / "demo_output"

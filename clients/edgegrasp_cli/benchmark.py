@@ -20,7 +20,7 @@ from edgegrasp_cli.flags import (
 )
 
 if TYPE_CHECKING:
-    from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_cli.planners import PlannerChoice
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.results import ResultFolder
     from edgegrasp_sim.trial import Round
@@ -130,7 +130,7 @@ def _plan(
     asked: BenchmarkFlags, connection: dict[str, Any], options: dict[str, Any]
 ) -> "tuple[BenchmarkConfig, PlannerChoice]":
     """What to run, and with which planner."""
-    from edgegrasp_cli.planners.choice import PlannerChoice
+    from edgegrasp_cli.planners import PlannerChoice
     from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
     from edgegrasp_sim.engine import choose_engine
@@ -225,8 +225,9 @@ def run_rounds(
     """
     from rich.console import Console
 
-    from edgegrasp_cli.planners.choice import open_planner
+    from edgegrasp_cli.planners import open_planner
     from edgegrasp_sim.benchmark import manifest, run_benchmark
+    from edgegrasp_sim.results import planner_title
 
     # A wrong folder fails before a server is started; meshes are split once for all workers.
     with Console(stderr=True).status("reading objects"):
@@ -243,7 +244,7 @@ def run_rounds(
                 folder=folder,
                 on_round=on_round,
             )
-    return done, planner.title
+    return done, planner_title(planner.facts)
 
 
 @contextmanager

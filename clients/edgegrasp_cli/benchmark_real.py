@@ -57,7 +57,7 @@ def benchmark_real(
     from rich.console import Console
     from rich.progress import track
 
-    from edgegrasp_cli.planners.detection import model_used
+    from edgegrasp_cli.planners import model_used
     from edgegrasp_cli.real_scenes import BEST, judge, load_scenes
 
     fields, loaded = parse_option_flags(options), load_scenes(scenes)

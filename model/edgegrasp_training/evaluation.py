@@ -84,15 +84,15 @@ class Range(NamedTuple):
 
     score: float  # mean
     held: float  # share of them
-    count: int
+    number: int
 
 
 def reliability(
     score: FloatArray, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
 ) -> dict[float, Range]:
     """What held in each range of scores that has any, by its lower edge.  # (E,), (E,)."""
-    number = np.digitize(score, edges[1:-1])
-    ranges = {low: number == k for k, low in enumerate(edges[:-1])}
+    place = np.digitize(score, edges[1:-1])
+    ranges = {low: place == k for k, low in enumerate(edges[:-1])}
     return {
         low: Range(float(score[mine].mean()), float(held[mine].mean()), int(mine.sum()))
         for low, mine in ranges.items()
@@ -103,7 +103,7 @@ def reliability(
 def calibration_error(score: FloatArray, held: NDArray[np.generic]) -> float:
     """Mean distance of score and share that held, over ten ranges of equal width."""
     ranges = reliability(score, held).values()
-    return sum(each.count * abs(each.score - each.held) for each in ranges) / len(score)
+    return sum(each.number * abs(each.score - each.held) for each in ranges) / len(score)
 
 
 def write_model_card(
@@ -199,7 +199,7 @@ def reliability_tables(scored: Scored, names: list[str]) -> str:
     head = ("grasps", "weights", "number", "mean score", "held", "loss", "Brier", "ECE")
     found = [reliability(expit(logit), scored.held, EDGES) for logit in scored.logit]
     cells = [
-        {low: f"{100 * each.held:.1f} % of {each.count}" for low, each in one.items()}
+        {low: f"{100 * each.held:.1f} % of {each.number}" for low, each in one.items()}
         for one in found
     ]
     ranges = [(f"from {low:g}", *(one.get(low, "-") for one in cells)) for low in EDGES[:-1]]

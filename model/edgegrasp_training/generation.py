@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +144,7 @@ def generate(
         RuntimeError: Workers keep dying, or there is no such Ray cluster.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found = {"engine": choose_engine(options.engine).name}
+    found: dict[str, Any] = {"engine": choose_engine(options.engine).name}
     if options.weights is not None:  # other machines find it there too
         found["weights"] = options.weights.resolve()
     options = options.model_copy(update=found)

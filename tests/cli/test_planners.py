@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_cli.planners.choice import PlannerChoice, named_planner, open_planner
-from edgegrasp_cli.planners.detection import request_options
+from edgegrasp_cli.planners import PlannerChoice, named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind

@@ -48,7 +48,7 @@ def test_the_temperature_undoes_overconfidence() -> None:
     assert found.temperature == pytest.approx(3, rel=0.1)
     ranges = reliability(expit(found.logit / found.temperature), found.label)
     assert all(each.score == pytest.approx(each.held, abs=0.05) for each in ranges.values())
-    assert sum(each.count for each in ranges.values()) == 20_000
+    assert sum(each.number for each in ranges.values()) == 20_000
 
 
 def test_scores_as_good_as_shares_have_no_calibration_error() -> None:

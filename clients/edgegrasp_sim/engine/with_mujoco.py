@@ -256,7 +256,7 @@ class MujocoWorld(World):
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         return self._images.depth(self.model, self.data, T_world_camera, camera)
 
-    def _add(self, position: Matrix, quaternion_xyzw: Sequence[float]) -> Any:
+    def _add(self, position: Matrix, quaternion_xyzw: Vector) -> Any:
         x, y, z, w = quaternion_xyzw
         name = str(self._bodies)
         self._bodies += 1

@@ -1,1 +1,0 @@
-"""Planners for clutter-removal trials, and how the command line finds them."""
