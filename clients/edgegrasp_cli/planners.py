@@ -75,7 +75,7 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
     if choice.server and choice.model.endswith(SUFFIX):
         raise ValueError(f"model is {choice.model}; name one of the server's own weights")
     weights, model = choice.weights_and_model()
-    facts = {"name": choice.name, "options": choice.options}
+    facts: dict[str, Any] = {"name": choice.name, "options": choice.options}
     if choice.name == "in-process":
         from edgegrasp_model.detector import ModelCatalogue
 

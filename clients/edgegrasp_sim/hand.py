@@ -19,7 +19,6 @@ MAX_OPENING = 0.08  # metres between the Panda's fingers
 FINGERTIP = 0.1122  # metres ahead of the panda_hand link
 FINGER_BASE = 0.0584
 CENTRE = 0.04  # of mass
-T_HANDCOM_HAND = translation(0.0, 0.0, -CENTRE)
 
 CLOSE_SECONDS = 0.5
 

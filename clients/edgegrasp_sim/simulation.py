@@ -231,7 +231,7 @@ class ClutterSimulation:
         around = self._clear(open_table(table_thickness) if surround is None else surround(rng))
         layout = Layout(self.world, around, objects, rng, num_objects, scales or usual)
         self._objects = make(layout)
-        self._gripper = self._add_gripper()
+        self._gripper = Gripper(self.world, self.hand)
         return self.num_objects
 
     def reset_from_poses(
@@ -253,7 +253,7 @@ class ClutterSimulation:
             )
             item.body.set_pose(placement.position, placement.quaternion_xyzw)
             self._objects.append(item)
-        self._gripper = self._add_gripper()
+        self._gripper = Gripper(self.world, self.hand)
 
     def observe(
         self,
@@ -342,15 +342,6 @@ class ClutterSimulation:
         image[seen] = painted * (0.45 + 0.55 * light[seen][:, None])
         return image.astype(np.uint8)
 
-    def save_state(self) -> int:
-        """Keep the scene's present state; valid until an object is removed or the scene changes."""
-        return self.world.save_state()
-
-    def restore_state(self, state: int) -> None:
-        """Return to a state of this scene exactly; nothing simulated since leaves a trace."""
-        self._forget_rest_state()
-        self._restore(state)
-
     def try_grasp(
         self, T_world_hand: ArrayLike, *, shake: bool = False, to_the_end: bool = False
     ) -> GraspResult:
@@ -389,9 +380,6 @@ class ClutterSimulation:
         self._objects = settle(self.world, self._objects, self.surroundings)
         return result
 
-    def _add_gripper(self) -> Gripper:
-        return Gripper(self.world, self.hand)
-
     @property
     def _hand(self) -> Gripper:
         if self._gripper is None:
@@ -415,16 +403,13 @@ class ClutterSimulation:
     def _restore_rest(self) -> None:
         # Every grasp starts from one saved state, so that earlier tries leave no trace.
         if self._rest_state is None:
-            self._rest_state = self.save_state()
-        self._restore(self._rest_state)
-
-    def _restore(self, state: int) -> None:
+            self._rest_state = self.world.save_state()
         # The engine keeps contact caches over a restore; moving all bodies apart empties them.
         for index, item in enumerate(self._objects):
             item.body.set_pose((5.0 + 5.0 * index, 0.0, 9.0), (0.0, 0.0, 0.0, 1.0))
         self._hand.park()
         self.world.detect_collisions()
-        self.world.restore_state(state)
+        self.world.restore_state(self._rest_state)
 
     def _clear(self, surroundings: Surroundings) -> Surroundings:
         self.world.reset()

@@ -297,7 +297,6 @@ FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
     "clamp": _clamp, "pen": _pen, "fruit": _fruit, "bag": _bag, "ring": _ring, "frame": _frame,
 }  # fmt: skip
 NAMES = tuple(FAMILIES)
-HOLLOW = frozenset({"bowl", "cup", "plate", "glass", "tray", "ring", "frame"})
 
 
 def _oval(sharp: float = 1.0, corners: int = FINE) -> Array:

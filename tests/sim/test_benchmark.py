@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from unittest.mock import MagicMock
 
 import pytest
 
@@ -111,31 +110,6 @@ def test_a_killed_run_goes_on_and_changes_nothing(alone, tmp_path) -> None:
     assert attempts_digest(rounds) == attempts_digest(folder.rounds()) == digest
     with pytest.raises(ValueError, match="different planner"):
         folder.open(manifest(config, {"name": "other"}))
-
-
-# Starting a Ray cluster leaves sockets and processes to the garbage collector.
-@pytest.mark.parametrize(
-    ("error", "expected", "message"),
-    [("RayTaskError", ConnectionError, "gone"), ("NodeDiedError", RuntimeError, "again")],
-)
-def test_errors_on_a_cluster_are_those_of_a_process_here(
-    alone: tuple[BenchmarkConfig, str],
-    monkeypatch: pytest.MonkeyPatch,
-    error: str,
-    expected: type[Exception],
-    message: str,
-) -> None:
-    ray = pytest.importorskip("ray", reason="the extra `ray` is not installed")
-    kind = getattr(ray.exceptions, error)
-    cause = ConnectionError("gone for good")
-    fake = MagicMock(exceptions=ray.exceptions)
-    fake.cluster_resources.return_value = {"CPU": 1.0}
-    failed = kind("run", "traceback", cause) if error == "RayTaskError" else kind("its machine")
-    fake.wait.side_effect = lambda running: (running, [])
-    fake.get.side_effect = failed
-    monkeypatch.setitem(sys.modules, "ray", fake)
-    with pytest.raises(expected, match=message):
-        run_benchmark(alone[0], make_planner, ray="local")
 
 
 def test_a_missing_ray_or_cluster_is_named(alone, monkeypatch) -> None:

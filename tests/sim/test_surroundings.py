@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edgegrasp_sim.camera import ViewRange, look_at
+from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.hand import FINGERTIP, FailureCause
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
@@ -14,7 +14,6 @@ from edgegrasp_sim.surroundings import (
     TABLE_HEIGHT,
     Box,
     Surroundings,
-    random_bin,
     random_shelf,
     random_table,
 )
@@ -38,33 +37,6 @@ def test_objects_rest_where_objects_are(simulation: ClutterSimulation, kind: Sce
     after = np.array([item.position for item in simulation.placements])
     resting = np.linalg.norm(after - middles, axis=1) < 0.005
     assert resting.mean() >= 0.5  # round ones roll on a while
-
-
-@pytest.mark.parametrize("thickness", [0.012, 0.2])
-def test_a_table_is_as_thick_as_the_protocol_has_it(
-    simulation: ClutterSimulation, thickness: float
-) -> None:
-    simulation.reset(SceneKind.PILE, np.random.default_rng(0), 1, table_thickness=thickness)
-    (table,) = simulation.surroundings.boxes
-    assert table.size[2] == thickness
-    assert table.centre[2] + thickness / 2 == pytest.approx(TABLE_HEIGHT)
-
-
-def test_a_bin_has_a_floor_and_walls_around_it() -> None:
-    heights = set()
-    for seed in range(8):
-        around = random_bin(np.random.default_rng(seed))
-        low, high = np.asarray(around.workspace)
-        walls = [box for box in around.boxes if box.obstacle]
-        assert len(walls) == 4
-        for wall in walls:
-            x, y, z = np.abs(np.asarray(wall.centre) - (MIDDLE, MIDDLE, TABLE_HEIGHT))
-            inner = x - wall.size[0] / 2, y - wall.size[1] / 2
-            half = (high - low)[:2] / 2
-            assert inner[0] == pytest.approx(half[0]) or inner[1] == pytest.approx(half[1])
-            assert z == pytest.approx(wall.size[2] / 2)
-        heights.add(walls[0].size[2])
-    assert len(heights) == 8
 
 
 def test_a_hand_that_hits_a_large_thing_fails_and_does_not_move_it(engine: str) -> None:
@@ -121,17 +93,3 @@ def test_a_shelf_is_open_to_the_front_alone(simulation: ClutterSimulation) -> No
         (eye,) = load_protocol("shelf").camera.view_range().sample(np.random.default_rng(seed))
         assert eye[1, 3] < low[1]  # before it
         assert eye[2, 3] > TABLE_HEIGHT
-
-
-def test_a_planner_is_told_the_inside_of_a_bin_and_sees_more(simulation) -> None:
-    simulation.reset(SceneKind.BIN, np.random.default_rng(0), 2)
-    views = ViewRange((0.8, 0.9), (0.0, 0.5), (0.0, 2 * np.pi), (MIDDLE, MIDDLE, 0.1))
-    rngs = np.random.default_rng(1), np.random.default_rng(2)
-    seen = simulation.observe(*rngs, views=views, table="around")
-    low, high = seen.workspace
-    assert low[2] == pytest.approx(TABLE_HEIGHT + 0.005)
-    walls = [box for box in simulation.surroundings.boxes if box.obstacle]
-    inside = min(abs(MIDDLE - box.centre[1]) - box.size[1] / 2 for box in walls[1::2])
-    assert [low[1], high[1]] == pytest.approx([MIDDLE - inside, MIDDLE + inside])
-    assert (seen.cloud.min(axis=0)[:2] < low[:2]).all()
-    assert (seen.cloud.max(axis=0)[:2] > high[:2]).all()

@@ -89,18 +89,6 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
     assert (varied.points[~there] == 0).all()
 
 
-def test_a_hand_whose_camera_is_not_known_is_told_of_none(made_up_view, hands) -> None:
-    view = made_up_view(1)
-    known = grasps_of(view, hands).seen
-    unknown = grasps_of(view, hands, camera=False).seen
-    assert known is not None
-    assert unknown is not None
-    changed = (known.description != unknown.description).any(axis=0)
-    camera = slice(37, 40)  # its direction
-    assert changed[camera].all()
-    assert (unknown.description[:, camera] == 0).all()
-
-
 def test_augmentation_turns_points_normals_and_approach_alike(made_up_view, balls) -> None:
     grasps = grasps_of(made_up_view(2), balls)
     batch = pack_balls(grasps, grasps.balls(), balls).batch
@@ -113,21 +101,6 @@ def test_augmentation_turns_points_normals_and_approach_alike(made_up_view, ball
     along = (batch.points[batch.contact] * batch.approach).sum(dim=1)
     along_other = (other.points[other.contact] * other.approach).sum(dim=1)
     torch.testing.assert_close(along, along_other, atol=1e-4, rtol=1e-4)
-
-
-def test_random_turns_are_any_or_upright_or_none() -> None:
-    rng = np.random.default_rng(0)
-    turns = {kind: [random_turn(kind, rng) for _ in range(50)] for kind in ("any", "upright")}
-    for turn in turns["any"] + turns["upright"]:
-        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-    raised = {kind: [(turn @ UP)[2] for turn in some] for kind, some in turns.items()}
-    assert min(raised["any"]) < -0.5
-    assert max(raised["any"]) > 0.5
-    np.testing.assert_allclose(raised["upright"], 1.0, atol=1e-6)
-    headings = [turn[0, 0] for turn in turns["upright"]]
-    assert min(headings) < -0.5
-    assert max(headings) > 0.5
-    np.testing.assert_array_equal(random_turn("none", rng), np.eye(3))
 
 
 def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, balls) -> None:

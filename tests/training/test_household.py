@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 
-from edgegrasp_training.household import FAMILIES, HOLLOW, HouseholdMesh, household_mesh
+from edgegrasp_training.household import FAMILIES, HouseholdMesh, household_mesh
 
 SEEDS = range(12)
-# Millimetres: the least and the greatest of the longest extent, and the least of the shortest.
-SIZES = {
-    "can": (50, 180, 30), "bottle": (120, 320, 20), "jar": (50, 160, 50), "bowl": (80, 420, 25),
-    "cup": (50, 170, 50), "plate": (120, 310, 9), "glass": (70, 170, 45), "carton": (20, 280, 20),
-    "tray": (60, 280, 25), "book": (100, 280, 8), "torch": (80, 220, 18), "hammer": (180, 360, 17),
-    "screwdriver": (110, 290, 10), "spanner": (100, 320, 4), "scissors": (100, 260, 6),
-    "clamp": (50, 230, 8), "pen": (110, 180, 6), "fruit": (35, 260, 20), "bag": (40, 290, 20),
-    "ring": (50, 140, 8), "frame": (60, 280, 6),
-}  # fmt: skip
 
 
 def _drawn(family: str) -> list[HouseholdMesh]:
@@ -32,19 +23,6 @@ def _planes(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_objects_have_the_size_of_their_family_and_stand_on_zero(family: str) -> None:
-    least, greatest, thinnest = SIZES[family]
-    for mesh in _drawn(family):
-        assert mesh.family == family
-        points = np.concatenate([vertices for vertices, _ in mesh.parts])
-        low, high = points.min(axis=0), points.max(axis=0)
-        extents = 1000 * (high - low)
-        assert least - 1 <= extents.max() <= greatest + 1
-        assert extents.min() >= thinnest - 1
-        np.testing.assert_allclose([low[2], *(low + high)[:2]], 0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize("family", FAMILIES)
 def test_parts_are_closed_convex_and_face_outwards(family: str) -> None:
     for mesh in _drawn(family):
         for vertices, faces in mesh.parts:
@@ -57,7 +35,7 @@ def test_parts_are_closed_convex_and_face_outwards(family: str) -> None:
             assert (vertices.mean(axis=0) @ normal.T < offset).all(), "faces inwards"
 
 
-@pytest.mark.parametrize("family", sorted(HOLLOW))
+@pytest.mark.parametrize("family", ["bowl", "cup", "plate", "glass", "tray", "ring", "frame"])
 def test_hollow_objects_surround_space_that_no_part_fills(family: str) -> None:
     for mesh in _drawn(family)[:4]:
         points = np.concatenate([vertices for vertices, _ in mesh.parts])
@@ -74,12 +52,6 @@ def test_hollow_objects_surround_space_that_no_part_fills(family: str) -> None:
         ]
         surrounded = ~full & (np.sum(between, axis=0) >= 2)
         assert surrounded.sum() > 0.03 * full.size
-
-
-def test_half_of_the_cartons_fit_an_80_mm_hand_on_no_side() -> None:
-    rng = np.random.default_rng(0)
-    least = [np.ptp(household_mesh(rng, "carton").parts[0][0], axis=0).min() for _ in range(200)]
-    assert 0.4 < np.mean(np.array(least) > 0.08) < 0.65
 
 
 def test_a_seed_draws_the_same_object_and_every_family_comes() -> None:

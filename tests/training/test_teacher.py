@@ -1,5 +1,4 @@
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,21 +84,6 @@ def test_soft_labels_are_kept_and_made_anew_for_a_changed_view(
     assert not np.array_equal(teacher.soft_labels(same).contact_index, first.contact_index)
     fresh = Teacher(weights, 0.04, tmp_path / "fresh").soft_labels(views[0])
     np.testing.assert_array_equal(fresh.chance, first.chance)
-
-
-def test_a_view_without_points_teaches_nothing(made_up_view, teacher, tmp_path) -> None:
-    view = made_up_view(0)
-    none = np.empty(0, np.int64)
-    empty = replace(
-        view,
-        points=view.points[:0],
-        normals=view.normals[:0],
-        approach_index=none,
-        contact_index=none,
-        success=none.astype(np.int8),
-    )
-    empty.save(tmp_path / "packed_0_0.npz")
-    assert len(teacher.soft_labels(tmp_path / "packed_0_0.npz").chance) == 0
 
 
 def test_soft_labels_are_packed_beside_the_labels_which_weigh_more(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
-from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import (
@@ -182,17 +182,3 @@ def test_a_network_trained_in_other_units_scores_the_same_in_metres(made_up_view
         assert not torch.allclose(network(metres), scores, rtol=0, atol=1e-6)
     for key, weight in in_units(in_metres(network)).state_dict().items():
         torch.testing.assert_close(weight, network.state_dict()[key], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("architecture", ["edgegrasp", "vn-edgegrasp"])
-def test_scores_of_an_untrained_network_of_full_depth_differ(made_up_view, architecture) -> None:
-    config = NetworkConfig(
-        architecture, (32, 32, 32), (32, 32, 32), (64, 64), (64, 32, 16), crop_radius=0.04
-    )
-    grasps = tried_grasps(made_up_view(1), config)
-    batch = pack_balls(grasps, grasps.balls(), config).batch
-    network = build_network(config)
-    with torch.no_grad():
-        before = network(batch).std()
-        prepare_to_train(network)
-        assert network(batch).std() > 5 * before
