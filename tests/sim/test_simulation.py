@@ -9,6 +9,7 @@ from edgegrasp_sim.camera import CAMERA, look_at
 from edgegrasp_sim.engine import World
 from edgegrasp_sim.hand import CENTRE, FINGERTIP, retreat_pose
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, Prism, SceneKind, write_object
+from edgegrasp_sim.poses import translation
 from edgegrasp_sim.scene import load_object
 from edgegrasp_sim.simulation import PAINTS, ClutterSimulation, ObjectPlacement
 from edgegrasp_sim.surroundings import OPEN_TABLE, TABLE_HEIGHT, WORKSPACE
