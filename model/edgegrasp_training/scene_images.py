@@ -493,31 +493,41 @@ def _lay_objects(
         room = np.array(heights.half) - half
         if (room <= 0).any():
             continue
-        best: tuple[float, Float64, float] | None = None
-        for _ in range(1 if how == "heap" else 10):
-            place = rng.uniform(-room, room)
-            if how != "spread":
-                place = np.clip(rng.normal(0.0, around, 2), -room, room)
-            moved = samples + np.array([*place, 0.0])
-            margin = (
-                moved if how != "spread" else np.concatenate([moved, moved + APART, moved - APART])
-            )
-            rise = heights.rest(margin)
-            top = rise + samples[:, 2].max()
-            lowest = rise + samples[:, 2].min()
-            if how != "heap" and lowest > 0.004:
-                continue
-            if top < ceiling and (best is None or lowest < best[0]):
-                best = (lowest, place, rise)
-            if best is not None and how == "spread":
-                break
-        if best is None:
+        offset = _lowest_place(rng, samples, heights, how, room, around, ceiling)
+        if offset is None:
             continue
-        offset = np.array([*best[1], best[2]])
         heights.put(samples + offset)
         scene.add_object((points + offset + origin, triangles))
         put += 1
     return put
+
+
+def _lowest_place(
+    rng: np.random.Generator,
+    samples: Float64,
+    heights: HeightMap,
+    how: str,
+    room: Float64,
+    around: float,
+    ceiling: float,
+) -> Float64 | None:
+    """The shift (3,) that puts an object's points lowest, of some tried; None: it fits nowhere."""
+    best: tuple[float, Float64] | None = None
+    for _ in range(1 if how == "heap" else 10):
+        place = rng.uniform(-room, room)
+        if how != "spread":
+            place = np.clip(rng.normal(0.0, around, 2), -room, room)
+        moved = samples + np.array([*place, 0.0])
+        apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
+        rise = heights.rest(np.concatenate(apart))
+        lowest = rise + samples[:, 2].min()
+        if how != "heap" and lowest > 0.004:
+            continue
+        if rise + samples[:, 2].max() < ceiling and (best is None or lowest < best[0]):
+            best = (lowest, np.array([*place, rise]))
+        if best is not None and how == "spread":
+            break
+    return None if best is None else best[1]
 
 
 # --- kinds of scenes ---
