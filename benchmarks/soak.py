@@ -1,28 +1,43 @@
-"""Send a server many requests of every kind: `python -m benchmarks.soak --requests 10000`.
+"""Ask a server for minutes while it is attacked: `python -m benchmarks.soak --minutes 10`.
 
-Clouds of 32 to 20,000 points go through a dummy network, over unary gRPC, streams and REST, a few
-of them malformed and a few abandoned by their client. Each answer carries the CRC-32 of the cloud
-that the server saw, so an answer that belongs to another request is noticed. At the end every
-request must have an outcome, the server's memory must not have grown, and it must stop.
+Clients send clouds of 32 to 20,000 points to a dummy network, over unary gRPC, streams and REST,
+a few of them malformed and a few abandoned; each answer carries the CRC-32 of the cloud that the
+server saw. First they are alone, then two attackers with another address go on beside them: one
+sends requests made to kill workers, one holds connections and streams open without taking or
+sending anything. A process of its own asks for the server's health, each time on a new connection.
+Fails unless every request has an outcome of its own, health is never refused, each attack is
+answered with an error, memory does not grow and the server stops.
 """
 
 import argparse
 import asyncio
+import base64
+import contextlib
+import io
+import itertools
 import json
+import multiprocessing
 import os
+import socket
+import struct
 import sys
 import time
+import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import grpc
+import httpx
 import numpy as np
 from benchmarks import dummy
 from benchmarks.measuring import RESULTS, Served, served, write_results
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 from numpy.typing import NDArray
 
 from edgegrasp_client import (
@@ -38,13 +53,69 @@ REFUSED = "refused"
 CANCELLED = "cancelled"
 CROSSED = "another cloud's answer"
 EXPECTED = {"good": {ANSWERED}, "malformed": {REFUSED}, "cancelled": {CANCELLED, ANSWERED}}
-SECONDS = 30.0  # until a request counts as stuck
-TOGETHER = 8  # requests of one stream
-EACH = 2  # clients of each kind
-SAMPLES = 100  # of memory
-WARM_UP = 0.2  # of the requests: memory grows while pools and caches fill
-MAX_SLOPE = 1.0  # MB per 1,000 requests
 FAULTS: tuple[dict[str, Any], ...] = ({"seed": -1}, {"model": "none"}, {"viewpoint": [1e300, 0, 0]})
+SECONDS = 30.0  # until a request counts as lost
+TOGETHER = 8  # requests of one stream
+ALONE = 0.1  # of the time, before the attacks begin
+PROBE_SECONDS = 0.1  # between two questions for health
+HEALTH_TIMEOUT = 5.0  # of a question, as in docker/kubernetes
+MEMORY_SAMPLES = 60
+MAX_GROWTH = 0.1  # of memory, from the middle of the attacks to their end
+ATTACKER = "127.0.0.2"  # fairness is between addresses
+HELD_SECONDS = 8.0  # for which the second attacker holds what it opened
+PAGES, CHECKS, STREAMS = 540, 200, 16  # that it opens
+ROOM = ("--max-queue-length", "512", "--max-streams", "64")  # for all of the clients
+
+
+def main() -> None:
+    """Send, write soak.json, and fail where anything is wrong."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--clients", type=int, default=32)
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    os.environ["DUMMY_SECONDS"] = "0.002"
+    results: dict[str, Any] = {"clients": given.clients, "minutes": given.minutes}
+    with served(*ROOM, program=["-P", dummy.__file__]) as server:
+        seconds, random = given.minutes * 60, itertools.count(given.seed)
+        results["alone"] = run(server, given.clients, seconds * ALONE, next(random), ())
+        attacks = (poison, lock_out)
+        results["attacked"] = run(
+            server, given.clients, seconds * (1 - ALONE), next(random), attacks
+        )
+        begun = time.monotonic()
+        results["exit_code"] = server.stop()
+        results["stop_seconds"] = round(time.monotonic() - begun, 2)
+    results["faults"] = faults(results)
+    write_results(given.output, "soak", results)
+    print(json.dumps(results, indent=1))
+    sys.exit(1 if results["faults"] else 0)
+
+
+def run(
+    server: Served, clients: int, seconds: float, seed: int, attacks: tuple[Any, ...]
+) -> dict[str, Any]:
+    """Clients beside attacks, which with the probe are processes of their own; the figures."""
+    context = multiprocessing.get_context("spawn")
+    stop, processes, tellers = context.Event(), [], []
+    for work in (probe, *attacks):
+        teller, told = context.Pipe(duplex=False)
+        given = (server.http_url, server.grpc_address, stop, told)
+        processes.append(context.Process(target=work, args=given))
+        processes[-1].start()
+        told.close()  # here: the end of a process is the end of its pipe
+        tellers.append(teller)
+    soak = Soak(server, seed)
+    asyncio.run(soak.run(clients, seconds))
+    stop.set()
+    health, *attacked = (teller.recv() for teller in tellers)
+    for process in processes:
+        process.join()
+    return soak.figures() | {"health": health, "attacks": attacked}
+
+
+# The clients
 
 
 @dataclass(frozen=True)
@@ -67,82 +138,72 @@ class Plan:
         return FAULTS[self.number % len(FAULTS)] if self.kind == "malformed" else {}
 
 
-def main() -> None:
-    """Send, write soak.json, and fail where anything is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak")
-    parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument("--requests", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    os.environ["DUMMY_SECONDS"] = "0.002"
-    with served(program=["-P", dummy.__file__]) as server:
-        soak = Soak(server, given.requests, given.seed)
-        results = asyncio.run(soak.run())
-        begun = time.monotonic()
-        results["exit_code"] = server.stop()
-        results["stop_seconds"] = round(time.monotonic() - begun, 2)
-    results["faults"] = faults(results)
-    write_results(given.output, "soak", results)
-    print(json.dumps({name: results[name] for name in results if name != "memory"}, indent=1))
-    sys.exit(1 if results["faults"] else 0)
-
-
-def plans(requests: int, seed: int) -> Iterator[Plan]:
-    """Requests in random order: 90 % good ones, 5 % malformed, 5 % abandoned."""
-    random_of = np.random.default_rng(seed)
-    for number in range(requests):
-        kind = random_of.choice(["good", "malformed", "cancelled"], p=[0.9, 0.05, 0.05])
-        size = int(np.exp(random_of.uniform(np.log(32), np.log(20_000))))
-        wait = float(random_of.uniform(0.0, 0.01))
-        yield Plan(number, str(kind), size, wait, seed)
+def plans(seed: int, end: float) -> Iterator[Plan]:
+    """Requests in random order until a time: 90 % good ones, 5 % malformed, 5 % abandoned."""
+    random = np.random.default_rng(seed)
+    for number in itertools.count():
+        if time.monotonic() > end:
+            return
+        kind = random.choice(["good", "malformed", "cancelled"], p=[0.9, 0.05, 0.05])
+        size = int(np.exp(random.uniform(np.log(32), np.log(20_000))))
+        yield Plan(number, str(kind), size, float(random.uniform(0.0, 0.01)), seed)
 
 
 class Soak:
     """Sends plans from several clients at a time, and notes what becomes of each."""
 
-    def __init__(self, server: Served, requests: int, seed: int) -> None:
-        self._server, self._requests = server, requests
-        self._todo = plans(requests, seed)
+    def __init__(self, server: Served, seed: int) -> None:
+        self._server, self._seed = server, seed
         self._came: Counter[str] = Counter()
         self._wrong: list[dict[str, Any]] = []
-        self._memory: list[tuple[int, float]] = []
-        self._slowest = 0.0
+        self._memory: list[float] = []
+        self._seconds: list[float] = []  # of good requests that are not in a stream
+        self._given = 0
 
-    async def run(self) -> dict[str, Any]:
-        """Send all; the figures."""
-        start = time.monotonic()
-        ways = ((self._server.grpc_address, 1), (self._server.grpc_address, TOGETHER))
-        ways += ((self._server.http_url, 1),)
-        await asyncio.gather(*(self._send(*way) for way in ways for _ in range(EACH)))
+    async def run(self, clients: int, seconds: float) -> None:
+        """Send for so long."""
+        self._todo = plans(self._seed, time.monotonic() + seconds)
+        ways = itertools.cycle(("grpc", "stream", "rest"))
+        sampling = asyncio.create_task(self._sample(seconds / MEMORY_SAMPLES))
+        await asyncio.gather(*(self._send(way) for way in islice(ways, clients)))
+        sampling.cancel()
+
+    def figures(self) -> dict[str, Any]:
+        """What came of it."""
         return {
-            "requests": self._requests,
-            "seconds": round(time.monotonic() - start, 1),
+            "requests": self._given,
+            "lost": self._given - self._came.total(),
+            "wrong": len(self._wrong),
+            "wrong_first": self._wrong[:20],
             "outcomes": dict(sorted(self._came.items())),
-            "wrong": self._wrong[:20],
-            "slowest_seconds": round(self._slowest, 3),
-            "memory": self._memory,
-            "memory_slope_mb_per_1000": slope(self._memory, self._requests),
-            "memory_most_mb": round(max(used for _, used in self._memory), 1),
-            "server_threads": self._server.threads(),
-            "server_files": self._server.files(),
+            "good_ms": milliseconds(self._seconds),
+            "memory_mb": self._memory,
         }
 
-    async def _send(self, address: str, together: int) -> None:
-        """Plans one after the other, or so many of them `together` in a stream."""
-        way = "stream" if together > 1 else "rest" if address.startswith("http") else "grpc"
+    async def _sample(self, seconds: float) -> None:
+        while True:
+            self._memory.append(round(await asyncio.to_thread(self._server.memory), 1))
+            await asyncio.sleep(seconds)
+
+    async def _send(self, way: str) -> None:
+        """Plans one after the other, or several together in a stream."""
+        address = self._server.http_url if way == "rest" else self._server.grpc_address
         async with AsyncGraspClient(address, timeout=SECONDS, retry=False) as client:
-            while some := list(islice(self._todo, together)):
-                if together > 1:
+            while some := list(islice(self._todo, TOGETHER if way == "stream" else 1)):
+                self._given += len(some)
+                if way == "stream":
                     await self._stream(client, some)
                     continue
                 start = time.monotonic()
-                self._note(way, some[0], await self._one(client, some[0]), start)
+                came = await self._one(client, some[0])
+                if came == ANSWERED and some[0].kind == "good":
+                    self._seconds.append(time.monotonic() - start)
+                self._note(way, some[0], came)
 
     async def _one(self, client: AsyncGraspClient, plan: Plan) -> str:
-        work = client.detect(plan.points(), **plan.options())
         try:
             async with asyncio.timeout(plan.wait if plan.kind == "cancelled" else None):
-                return outcome(plan, await work)
+                return outcome(plan, await client.detect(plan.points(), **plan.options()))
         except TimeoutError:
             return CANCELLED
         except GraspClientError as error:
@@ -155,24 +216,23 @@ class Soak:
             StreamRequest(plan.points(), request_id=str(plan.number), **plan.options())
             for plan in some
         ]
-        answers, start = client.detect_stream(requests), time.monotonic()
+        answers, failed = client.detect_stream(requests), ""
         for plan in some:
-            if plan.kind == "cancelled":
-                came = CANCELLED
-            else:
-                answer = await anext(answers)
-                came = outcome(plan, answer.error or answer.result())
-                came = came if answer.request_id == str(plan.number) else CROSSED
-            self._note("stream", plan, came, start)
+            came = failed or CANCELLED
+            if not failed and plan.kind != "cancelled":
+                try:
+                    answer = await anext(answers)
+                    came = outcome(plan, answer.error or answer.result())
+                    came = came if answer.request_id == str(plan.number) else CROSSED
+                except GraspClientError as error:  # of the stream: what follows has no answer
+                    came = failed = type(error).__name__
+            self._note("stream", plan, came)
         await answers.aclose()
 
-    def _note(self, way: str, plan: Plan, came: str, start: float) -> None:
+    def _note(self, way: str, plan: Plan, came: str) -> None:
         self._came[f"{way} {plan.kind}: {came}"] += 1
-        self._slowest = max(self._slowest, time.monotonic() - start)
         if came not in EXPECTED[plan.kind]:
             self._wrong.append({**asdict(plan), "transport": way, "outcome": came})
-        if (done := self._came.total()) % max(1, self._requests // SAMPLES) == 0:
-            self._memory.append((done, self._server.memory()))
 
 
 def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
@@ -183,23 +243,155 @@ def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
     return REFUSED if isinstance(came, InvalidRequestError) else type(came).__name__
 
 
-def slope(memory: list[tuple[int, float]], requests: int) -> float:
-    """Least squares through the samples after the warm-up, MB per 1,000 requests."""
-    after = np.array([sample for sample in memory if sample[0] > WARM_UP * requests])
-    if len(after) < 2:
-        return 0.0
-    return round(float(np.polyfit(after[:, 0] / 1000, after[:, 1], 1)[0]), 4)
+# The attackers and the probe
+
+
+def poison(url: str, address: str, stop: Any, told: Any) -> None:
+    """Small requests that ended workers once; tells the statuses of the answers."""
+    came: Counter[str] = Counter()
+    transport = httpx.HTTPTransport(local_address=ATTACKER)
+    with httpx.Client(base_url=url, transport=transport, timeout=SECONDS) as http:
+        for number in itertools.takewhile(lambda _: not stop.is_set(), itertools.count()):
+            for media, body in poisons(number).items():
+                headers = {"content-type": f"application/{media}"}
+                try:
+                    answer = http.post("/v1/grasps", content=body, headers=headers)
+                    came[f"{media}: {answer.status_code}"] += 1
+                except httpx.HTTPError as error:
+                    came[f"{media}: {type(error).__name__}"] += 1
+    told.send(dict(came))
+
+
+def poisons(number: int) -> dict[str, bytes]:
+    """By media type: an offset beyond the data, an LZMA dictionary of 4 GiB, a header of text."""
+    fields = [
+        {"name": name, "offset": offset, "datatype": 7, "count": 1}
+        for name, offset in (("x", 2**31 - 4), ("y", 4), ("z", 8))
+    ]
+    cloud = {"height": 1, "width": 1, "fields": fields, "point_step": 12, "row_step": 12}
+    cloud["data"] = base64.b64encode(bytes(12)).decode()
+    header = b"-" * 9900 + b"1"
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("points.npy", b"x" * 100 + str(number).encode())
+    lzma = file.getvalue().replace(struct.pack("<I", 2**23), b"\xff" * 4, 1)
+    return {
+        "json": json.dumps({"point_cloud2": cloud, "options": {"seed": number}}).encode(),
+        "x-npy": b"\x93NUMPY\x02\x00" + struct.pack("<I", len(header)) + header,
+        "x-npz": lzma,
+    }
+
+
+def lock_out(url: str, address: str, stop: Any, told: Any) -> None:
+    """Open pages that nobody reads and silent gRPC calls, hold them, and open them anew."""
+    came: Counter[str] = Counter()
+    page = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
+    while not stop.is_set():
+        with contextlib.ExitStack() as stack:
+            for _ in range(PAGES):
+                with contextlib.suppress(OSError):
+                    came["pages"] += bool(stack.enter_context(connect(url)).send(page))
+            with contextlib.suppress(OSError):
+                calls = stack.enter_context(connect(address))
+                calls.sendall(http2_opening())
+                for number in range(CHECKS + STREAMS):
+                    check = number < CHECKS
+                    path = "/grpc.health.v1.Health/Check"
+                    path = path if check else "/edgegrasp.v1.GraspService/DetectGraspsStream"
+                    calls.sendall(http2_headers(path, 2 * number + 1))
+                    came["silent calls"] += 1
+            stop.wait(HELD_SECONDS)
+    told.send(dict(came))
+
+
+def connect(address: str, source: str = ATTACKER) -> socket.socket:
+    """A connection with a small buffer."""
+    host, _, port = address.removeprefix("http://").rpartition(":")
+    made = socket.create_connection((host, int(port)), HEALTH_TIMEOUT, (source, 0))
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    return made
+
+
+def http2_frame(kind: int, flags: int, stream: int, payload: bytes) -> bytes:
+    """One frame of HTTP/2."""
+    return struct.pack(">IBBI", len(payload), kind, flags, stream)[1:] + payload
+
+
+def http2_opening() -> bytes:
+    """What a client says first."""
+    return b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + http2_frame(4, 0, 0, b"")
+
+
+def http2_headers(path: str, stream: int) -> bytes:
+    """Begins a gRPC call, and does not end it."""
+    headers = b"\x83\x86"  # :method POST, :scheme http
+    fields = {":path": path, ":authority": "x", "content-type": "application/grpc"}
+    for text in itertools.chain.from_iterable((fields | {"te": "trailers"}).items()):
+        mark = b"\x00" if text in (*fields, "te") else b""
+        headers += mark + bytes([len(text)]) + text.encode()
+    return http2_frame(1, 4, stream, headers)
+
+
+def probe(url: str, address: str, stop: Any, told: Any) -> None:
+    """Ask for health over both transports, each time on a new connection; tells how it went."""
+    questions = {"http": partial(ask_http, url), "grpc": partial(ask_grpc, address)}
+    refused: Counter[str] = Counter()
+    seconds: dict[str, list[float]] = {name: [] for name in questions}
+    while not stop.wait(PROBE_SECONDS):
+        for name, ask in questions.items():
+            start = time.monotonic()
+            try:
+                ask()
+            except (OSError, ValueError, grpc.RpcError) as error:
+                refused[f"{name}: {error}"[:200]] += 1
+            seconds[name].append(time.monotonic() - start)
+    figures = {name: {"asked": len(one), "ms": milliseconds(one)} for name, one in seconds.items()}
+    told.send({"refused": dict(refused), **figures})
+
+
+def ask_http(url: str) -> None:
+    """As Kubernetes asks for liveness; raises OSError or ValueError unless the answer is 200."""
+    with connect(url, "127.0.0.1") as connection:
+        connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+        said = connection.recv(4096)
+    if not said.startswith(b"HTTP/1.1 200"):
+        raise ValueError(said[:100])
+
+
+def ask_grpc(address: str) -> None:
+    """One Check; raises grpc.RpcError or ValueError unless the server serves."""
+    alone = (("grpc.use_local_subchannel_pool", 1),)
+    with grpc.insecure_channel(address, alone) as channel:
+        request = health_pb2.HealthCheckRequest()
+        answer = health_pb2_grpc.HealthStub(channel).Check(request, timeout=HEALTH_TIMEOUT)
+    if answer.status != health_pb2.HealthCheckResponse.SERVING:
+        raise ValueError(answer.status)
+
+
+def milliseconds(seconds: list[float]) -> dict[str, float]:
+    """The median, the 99th percentile and the longest."""
+    found = np.quantile(seconds or [0.0], (0.5, 0.99, 1.0)) * 1e3
+    return dict(zip(("p50", "p99", "max"), found.round(1).tolist(), strict=True))
 
 
 def faults(results: dict[str, Any]) -> list[str]:
     """What is wrong; empty: nothing."""
-    found = []
-    if results["wrong"]:
-        found.append("requests with a wrong outcome")
-    if sum(results["outcomes"].values()) != results["requests"]:
-        found.append("requests without an outcome")
-    # The slope of a few requests says nothing.
-    if results["requests"] >= 5000 and results["memory_slope_mb_per_1000"] >= MAX_SLOPE:
+    found, attacked = [], results["attacked"]
+    for name in ("alone", "attacked"):
+        if results[name]["wrong"]:
+            found.append(f"{name}: requests with a wrong outcome")
+        if results[name]["lost"]:
+            found.append(f"{name}: requests without an outcome")
+        if results[name]["health"]["refused"]:
+            found.append(f"{name}: health was refused")
+    poisoned, held = attacked["attacks"]
+    if not all(name.endswith((": 400", ": 413", ": 429")) for name in poisoned):
+        found.append("a poison was not refused")
+    if not all(held.values()):
+        found.append("nothing was held open")
+    memory = attacked["memory_mb"]
+    half = memory[len(memory) // 2 :]
+    if half and max(half[-len(half) // 4 :]) > half[0] * (1 + MAX_GROWTH):
         found.append("memory grows")
     if results["exit_code"] != 0:
         found.append(f"the server ended with {results['exit_code']}")
