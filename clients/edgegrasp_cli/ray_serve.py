@@ -17,10 +17,9 @@ from starlette.responses import JSONResponse, Response
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError
-from edgegrasp_service.errors import report
+from edgegrasp_service.errors import problem_document, report
 from edgegrasp_service.front.grpc import ERROR_METADATA, error_detail
 from edgegrasp_service.front.http import METHODS, requested_timeout
-from edgegrasp_service.front.http_protocol import problem_document
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer, load_catalogue
 from edgegrasp_service.worker.job import Answer, Facts, Job, Method

@@ -3,6 +3,8 @@
 import re
 from dataclasses import dataclass
 
+import orjson
+
 from edgegrasp_camera.errors import PayloadTooLarge as PayloadTooLarge
 from edgegrasp_camera.errors import UnsupportedMediaType as UnsupportedMediaType
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
@@ -138,6 +140,14 @@ def report(error: Exception) -> Problem:
     retry_after = error.retry_after if isinstance(error, Overloaded) else None
     kind = kind_of(type(error))
     return Problem(kind, detail, field, value, fix, code, status, retry_after)
+
+
+def problem_document(problem: Problem) -> bytes:
+    """An error as a problem document (RFC 9457)."""
+    title = problem.kind.replace("-", " ").capitalize()
+    document = {"type": f"urn:edgegrasp:error:{problem.kind}", "title": title} | vars(problem)
+    del document["kind"], document["code"]
+    return orjson.dumps(document)
 
 
 def _sendable(text: str) -> str:

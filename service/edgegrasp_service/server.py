@@ -16,10 +16,16 @@ from typing import Any
 import uvicorn
 
 from edgegrasp_service.errors import AddressInUse
-from edgegrasp_service.front.admission import Places
+from edgegrasp_service.front.connections import (
+    ACCEPTED,
+    BACKLOG,
+    HEALTH_PLACES,
+    KEEP_ALIVE_SECONDS,
+    HttpProtocol,
+    Places,
+)
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_app
-from edgegrasp_service.front.http_protocol import HttpProtocol
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder, check_outcomes
@@ -30,10 +36,7 @@ from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 logger = logging.getLogger(__name__)
 
 NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
-KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
-HEALTH_PLACES = 16  # connections beside max_connections, which no request but for health holds
-BACKLOG = 128  # connections that wait to be accepted
 REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble with sockets
 
 
@@ -114,8 +117,9 @@ class Server:
         asyncio.get_running_loop().set_exception_handler(_LoopErrors())
         with _listen(settings.host, settings.http_port) as http_socket:
             credentials = None if self._tls is None else self._tls.grpc
-            grpc_server = GrpcServer(self.service, self.reloader, credentials)
-            http_server = self._http_server()
+            http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
+            grpc_server = GrpcServer(self.service, self.reloader, credentials, http_connections)
+            http_server = self._http_server(http_connections)
             scheme = "http" if self._tls is None else "https"
             self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
@@ -153,10 +157,9 @@ class Server:
         await asyncio.sleep(notice)
         await self.service.drain(self._settings.grace_seconds - notice)
 
-    def _http_server(self) -> "_HttpServer":
+    def _http_server(self, places: Places) -> "_HttpServer":
         tls = self._tls
         app = create_app(self.service, self.metrics, self.reloader)
-        places = Places(self._settings.max_connections, spare=HEALTH_PLACES)
         config = uvicorn.Config(
             HttpMiddleware(app, self.service),
             log_config=None,
@@ -164,7 +167,7 @@ class Server:
             lifespan="off",
             http=partial(HttpProtocol, self._settings, places),  # type: ignore[arg-type]
             ws="none",
-            backlog=BACKLOG,
+            backlog=ACCEPTED,
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
@@ -176,6 +179,12 @@ class Server:
 
 class _HttpServer(uvicorn.Server):
     """Leaves signals to the process: both transports stop together."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen; more connections may wait than are accepted at once."""
+        await super().startup(sockets)
+        for one in sockets or ():
+            one.listen(BACKLOG)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -12,7 +12,8 @@ from grpc import aio
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
-from edgegrasp_service.front.admission import Admission, Places, Ticket
+from edgegrasp_service.front.admission import Admission, Ticket
+from edgegrasp_service.front.connections import Places
 from edgegrasp_service.observability import Call
 
 PATIENCE = 60

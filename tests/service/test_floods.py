@@ -24,7 +24,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
-from edgegrasp_service.server import HEALTH_PLACES
+from edgegrasp_service.front.connections import HEALTH_PLACES
 
 PATIENCE = 30
 MIB = 2**20
@@ -358,7 +358,8 @@ async def test_silent_health_checks_and_watchers_hold_up_nobody(serve, monkeypat
             for _ in range(200)
         ]
         await asyncio.sleep(0)
-        async with aio.insecure_channel(address) as other:
+        own = [("grpc.use_local_subchannel_pool", 1)]  # a connection of its own
+        async with aio.insecure_channel(address, own) as other:
             stub = health_pb2_grpc.HealthStub(other)
             for _ in range(5):
                 answer = await stub.Check(health_pb2.HealthCheckRequest(), timeout=PATIENCE)

@@ -3,9 +3,8 @@
 import asyncio
 import math
 import statistics
-import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
@@ -195,77 +194,6 @@ class Admission:
             del self._client_bytes[ticket.client]
         if not self._tickets:
             self._empty.set()
-
-
-class Place:
-    """One of the places below."""
-
-    def __init__(self, owner: str, lose: Callable[[], None]) -> None:
-        self.owner, self.lose = owner, lose
-        self.idle = True  # nothing is lost with it
-        self.used = time.monotonic()
-
-
-class Places:
-    """So many connections, streams or reads at a time.
-
-    Where all are taken, a newcomer ends one that was idle for `grace` seconds: of whoever has most
-    of those, the one that was idle for longest. `spare` places are never busy, so that there is
-    always one for a newcomer.
-    """
-
-    def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
-        self._most, self._grace, self._spare = most + spare, grace, spare
-        self._taken: dict[Place, None] = {}  # the latest used at the end
-
-    def take(self, owner: str, lose: Callable[[], None]) -> Place:
-        """A place, until `leave`; `lose` is called if it is lost. Raises Overloaded."""
-        if len(self._taken) >= self._most:
-            since = time.monotonic() - self._grace
-            idle = [place for place in self._taken if place.idle and place.used <= since]
-            if not idle:
-                raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
-            greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
-            lost = next(place for place in idle if place.owner == greedy)
-            self.leave(lost)
-            lost.lose()
-        place = Place(owner, lose)
-        self._taken[place] = None
-        return place
-
-    def use(self, place: Place, idle: bool = True) -> None:
-        """Something happens at a place, which is idle then or not; raises Overloaded."""
-        if place.idle and not idle and self._spare:
-            busy = sum(not other.idle for other in self._taken)
-            if busy >= self._most - self._spare:
-                raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
-        place.idle, place.used = idle, time.monotonic()
-        if place in self._taken:
-            self._taken[place] = self._taken.pop(place)
-
-    def leave(self, place: Place) -> None:
-        """Give a place back."""
-        self._taken.pop(place, None)
-
-    @asynccontextmanager
-    async def hold(self, owner: str) -> AsyncIterator[Place]:
-        """Have a place for a while; what happens inside is cancelled if it is lost.
-
-        Raises:
-            Overloaded: There is no place, or it was lost.
-        """
-        loop = asyncio.get_running_loop()
-        try:
-            async with asyncio.timeout(None) as ends:
-                place = self.take(owner, lambda: ends.reschedule(loop.time()))
-                try:
-                    yield place
-                finally:
-                    self.leave(place)
-        except TimeoutError:
-            if not ends.expired():
-                raise
-            raise Overloaded("The server is full, and others wait. Try again in 1 s.") from None
 
 
 def _whole_seconds(wait: float) -> int:

@@ -5,17 +5,13 @@ method then reads its message once there is room for it, and knows when its answ
 """
 
 import asyncio
-import contextlib
 import logging
 import math
-import os
-import socket
 import struct
 import urllib.parse
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
@@ -46,11 +42,22 @@ from edgegrasp_service.errors import (
     RequestTimeout,
     report,
 )
-from edgegrasp_service.front.admission import Places
+from edgegrasp_service.front.connections import (
+    SMALL_READ_SECONDS,
+    SMALL_READS,
+    STREAM_GRACE_SECONDS,
+    STREAM_IDLE_SECONDS,
+    WATCHERS,
+    Places,
+    grpc_bounds,
+    receive,
+    send,
+    trim_grpc,
+)
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
-from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call, network_of
+from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
 from edgegrasp_service.settings import UNIX
-from edgegrasp_service.worker.job import Answer, Job, Method
+from edgegrasp_service.worker.job import Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -58,18 +65,6 @@ SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
 HEALTH = health.SERVICE_NAME
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
-
-LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
-SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
-SMALL_READS = 8  # messages of health checks and reflection read at a time
-SMALL_READ_SECONDS = 2.0
-WATCHERS = 64  # of health
-STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
-STREAM_GRACE_SECONDS = 10.0  # the same, while others wait for its place
-DESCRIPTORS = Path("/proc/self/fd")
-SPARE_CONNECTIONS = 2  # times as many as may stay are accepted
-TRIM_SECONDS = 0.5  # until those that are too many are closed
-LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
 
 MOST_STREAM_FIELDS = 16  # in a message of a stream, which has three
 
@@ -96,34 +91,12 @@ class GrpcServer:
         self,
         service: GraspService,
         reloader: Reloader,
-        credentials: grpc.ServerCredentials | None = None,
+        credentials: grpc.ServerCredentials | None,
+        http_connections: Places,
     ) -> None:
         settings = service.settings
-        options = [
-            ("grpc.max_receive_message_length", settings.max_body_bytes + SPARE_BYTES),
-            ("grpc.max_metadata_size", settings.max_header_bytes),
-            ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
-            # What is compressed is unpacked before its length is known: none of it.
-            ("grpc.compression_enabled_algorithms_bitset", 1),
-            ("grpc.so_reuseport", 0),
-            (
-                "grpc.max_allowed_incoming_connections",
-                SPARE_CONNECTIONS * settings.max_connections,
-            ),
-            ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
-            ("grpc.max_connection_idle_ms", 300_000),
-            # A cloud comes in one go, without waiting for leave to send the rest of it.
-            ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
-            ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
-            # A client that vanished without a word is found out, and its streams end.
-            ("grpc.keepalive_time_ms", 30_000),
-            ("grpc.keepalive_timeout_ms", 10_000),
-            # Clients look up the servers anew now and then, and so find those that were added.
-            ("grpc.max_connection_age_ms", 300_000),
-            ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
-        ]
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
-        self._server = aio.server(options=options)
+        self._server = aio.server(options=grpc_bounds(settings))
         self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
         sockets = settings.host.startswith(UNIX)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
@@ -136,15 +109,15 @@ class GrpcServer:
         except RuntimeError as error:
             raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
-        self._port = 0 if sockets else port
-        self._most_connections = settings.max_connections
+        self._has_port = not sockets
+        self._trim = partial(trim_grpc, port, settings.max_connections, http_connections.__len__)
         self._trimming: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
         await self.set_serving(False)
         await self._server.start()
-        if self._port:
+        if self._has_port:
             self._trimming = asyncio.create_task(self._trim())
 
     async def set_serving(self, serving: bool) -> None:
@@ -158,43 +131,6 @@ class GrpcServer:
         if self._trimming is not None:
             self._trimming.cancel()
         await self._server.stop(grace_seconds)
-
-    async def _trim(self) -> None:
-        """Close connections that are too many: gRPC cannot tell whose they are."""
-        while True:
-            await asyncio.sleep(TRIM_SECONDS)
-            if len([*DESCRIPTORS.iterdir()]) > self._most_connections:
-                with contextlib.ExitStack() as stack:
-                    trim(_connections(self._port, stack), self._most_connections)
-
-
-def trim(connections: list[socket.socket], most: int) -> None:
-    """Shut down, of whoever has most of them, those that have been silent for longest."""
-    found: dict[str, list[tuple[int, socket.socket]]] = {}
-    for connection in connections:
-        with contextlib.suppress(OSError):
-            owner = network_of(connection.getpeername()[0])
-            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
-            found.setdefault(owner, []).append((*LAST_RECEIVED.unpack(info), connection))
-    for rows in found.values():
-        rows.sort(key=lambda row: row[0])
-    for _ in range(sum(map(len, found.values())) - most):
-        _, connection = max(found.values(), key=len).pop()
-        with contextlib.suppress(OSError):
-            connection.shutdown(socket.SHUT_RDWR)
-
-
-def _connections(port: int, stack: contextlib.ExitStack) -> list[socket.socket]:
-    """Those that this process has accepted at a port, until the stack closes."""
-    found = []
-    for link in DESCRIPTORS.iterdir():
-        with contextlib.suppress(OSError):
-            if not link.is_socket():
-                continue
-            one = stack.enter_context(socket.socket(fileno=os.dup(int(link.name))))
-            if one.family != socket.AF_UNIX and one.getsockname()[1] == port and one.getpeername():
-                found.append(one)
-    return found
 
 
 class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in its stubs only
@@ -266,22 +202,18 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 await _abort(context, report(error))
 
     async def _answer(self, method: Method, context: Any) -> None:
-        service = self._service
-
-        async def read() -> bytes:
-            message = await service.receive(context.read())
-            if message is EOF:
-                raise InvalidRequest("request", "nothing", "Send one message.")
-            body: bytes = message
-            return body
-
-        async def write(answer: Answer) -> None:
+        service, call = self._service, current_call()
+        async with service.admit(call, service.settings.max_body_bytes) as ticket:
+            answer = await service.answer(call, ticket, await self._read_job(method, context))
             if answer.error is not None:
                 await _abort(context, answer.error)
-            await context.write(answer.body)
+            await send(service.settings, context.write(answer.body), call.bytes_out)
 
-        job, most = Job(method, "grpc", b"", 0.0), service.settings.max_body_bytes
-        await service.answer(current_call(), job, most, read, write)
+    async def _read_job(self, method: Method, context: Any) -> Job:
+        body = await receive(self._service.settings, context.read())
+        if body is EOF:
+            raise InvalidRequest("request", "nothing", "Send one message.")
+        return Job(method, "grpc", body)
 
     async def _stream(self, context: Any) -> None:
         call = current_call()
@@ -291,7 +223,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                 self._streams.use(place, idle)
 
             async for response in answer_stream(self._service, call, context, use):
-                await self._service.send(context.write(response), len(response))
+                await send(self._service.settings, context.write(response), len(response))
 
     async def _list_models(self, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in self._service.models()]
@@ -491,19 +423,12 @@ async def _answer(service: GraspService, stream: Call, request: dict[str, Any]) 
     request_id, body = request["request_id"], request["request"]
     call = Call("grpc", stream.method, request_id, stream.peer, stream.token, in_stream=True)
     detection = b""
-
-    async def read() -> bytes:
-        return body  # type: ignore[no-any-return]  # bytes
-
-    async def write(answer: Answer) -> None:
-        nonlocal detection
-        detection = answer.body
-
     try:
         with service.observe(call):
             call.limit(_timeout(request))
-            job = Job("DetectGrasps", "grpc", b"", 0.0)
-            await service.answer(call, job, len(body), read, write)
+            async with service.admit(call, len(body)) as ticket:
+                answer = await service.answer(call, ticket, Job("DetectGrasps", "grpc", body))
+                detection = answer.body
     except Exception as error:
         if not isinstance(error, EdgeGraspError):
             logger.exception("a request of a stream failed")

@@ -21,8 +21,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, brief
 from edgegrasp_model.gripper import gripper_names, load_gripper
-from edgegrasp_service.errors import Cancelled, Problem, UnsupportedMediaType, report
-from edgegrasp_service.front.http_protocol import problem_document
+from edgegrasp_service.errors import (
+    Cancelled,
+    Problem,
+    UnsupportedMediaType,
+    problem_document,
+    report,
+)
+from edgegrasp_service.front import connections
+from edgegrasp_service.front.connections import PAGE_GRACE_SECONDS, PAGES, Places
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
 from edgegrasp_service.worker.job import Answer, Job, Method
@@ -72,6 +79,7 @@ class HttpMiddleware:
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
         self._service = service
+        self._pages = Places(PAGES, PAGE_GRACE_SECONDS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
@@ -106,14 +114,20 @@ class HttpMiddleware:
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 await send(message)
 
-            try:
-                self._check(scope, call, headers)
-            except EdgeGraspError as error:
-                await _problem_response(call, report(error))(scope, receive, send_named)
-                return
             if scope["method"] == "HEAD":  # the protocol leaves the body out
                 scope = {**scope, "method": "GET"}
-            await self._app(scope, receive_noting, send_named)
+            try:
+                self._check(scope, call, headers)
+                if method != "Docs":
+                    await self._app(scope, receive_noting, send_named)
+                    return
+                async with self._pages.hold(call.client):
+                    await self._app(scope, receive_noting, send_named)
+            except EdgeGraspError as error:
+                if call.code:
+                    await _break_off(call, error, scope, receive)
+                else:
+                    await _problem_response(call, report(error))(scope, receive, send_named)
 
     def _check(self, scope: Scope, call: Call, headers: dict[str, str]) -> None:
         size = sum(len(name) + len(value) for name, value in scope["headers"])
@@ -218,48 +232,52 @@ class _Work:
         service, call, headers = self._service, current_call(), Headers(scope=scope)
         call.limit(requested_timeout(headers))
         size = int(headers.get("content-length", service.settings.max_body_bytes))
-        content_type, query = headers.get("content-type", ""), scope["query_string"]
-        job = Job(self._method, "http", b"", 0.0, content_type, query.decode("latin-1"))
-
-        async def write(answer: Answer) -> None:
-            if answer.error is not None:
-                response = _problem_response(call, answer.error)
-            else:
-                response = Response(answer.body, media_type="application/json")
-            start = {"type": "http.response.start", "status": response.status_code}
-            await send({**start, "headers": response.raw_headers})
-            await send({"type": "http.response.body", "body": response.body, "more_body": True})
-            await send({"type": "http.response.body"})  # once the client has taken most of it
-
         try:
-            await service.answer(
-                call,
-                job,
-                size,
-                lambda: self._receive_body(receive),
-                write,
-                lambda work: _unless_gone(receive, work),
-            )
+            async with service.admit(call, size) as ticket:
+                job = self._read_job(scope, headers, receive)
+                answer = await _unless_gone(receive, service.answer(call, ticket, await job))
+                await connections.send(
+                    service.settings, _send_answer(call, answer, send), call.bytes_out
+                )
         except EdgeGraspError as error:
             if not call.code:
                 raise
-            call.problem, call.code = report(error), ""
-            scope["state"]["abort"]()  # half an answer is none
-            await _gone(receive)
+            await _break_off(call, error, scope, receive)
 
-    async def _receive_body(self, receive: Receive) -> bytes:
+    async def _read_job(self, scope: Scope, headers: Headers, receive: Receive) -> Job:
         pieces: list[bytes] = []
         received, more = 0, True
         start = asyncio.get_running_loop().time()
         while more:
-            message = await self._service.receive(receive(), received, start)
+            message = await connections.receive(self._service.settings, receive(), received, start)
             if message["type"] == "http.disconnect":
                 raise Cancelled("The client left before its request was whole.")
             pieces.append(message.get("body", b""))
             received += len(pieces[-1])
             self._service.check_size(received)
             more = message.get("more_body", False)
-        return b"".join(pieces)
+        query = scope["query_string"].decode("latin-1")
+        content_type = headers.get("content-type", "")
+        return Job(self._method, "http", b"".join(pieces), 0.0, content_type, query)
+
+
+async def _send_answer(call: Call, answer: Answer, send: Send) -> None:
+    """Send an answer; returns once the client has taken most of it."""
+    if answer.error is not None:
+        response = _problem_response(call, answer.error)
+    else:
+        response = Response(answer.body, media_type="application/json")
+    start = {"type": "http.response.start", "status": response.status_code}
+    await send({**start, "headers": response.raw_headers})
+    await send({"type": "http.response.body", "body": response.body, "more_body": True})
+    await send({"type": "http.response.body"})
+
+
+async def _break_off(call: Call, error: EdgeGraspError, scope: Scope, receive: Receive) -> None:
+    """Close a connection whose client has half an answer, which is none."""
+    call.problem, call.code = report(error), ""
+    scope["state"]["abort"]()
+    await _gone(receive)
 
 
 async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> Answer:

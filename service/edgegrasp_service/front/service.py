@@ -5,10 +5,9 @@ import contextlib
 import hashlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
-from typing import Any, TypeVar
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import (
@@ -20,11 +19,10 @@ from edgegrasp_service.errors import (
     PayloadTooLarge,
     PermissionDenied,
     ReloadFailed,
-    RequestTimeout,
     WorkerLost,
     report,
 )
-from edgegrasp_service.front.admission import Admission
+from edgegrasp_service.front.admission import Admission, Ticket
 from edgegrasp_service.observability import CALL, Call
 from edgegrasp_service.security import ADMIN_FIX, HEADER, ServerTls, Tokens, load_tokens
 from edgegrasp_service.settings import Settings
@@ -37,8 +35,6 @@ MAX_HEADERS = 64
 MOST_DEATHS = 3  # of workers for one request; a crash counts as so many
 HARMFUL_SECONDS = 600.0  # for which such a request is refused
 MOST_HARMFUL = 1000  # of which this is known
-
-T = TypeVar("T")
 
 Observer = Callable[[Call], None]
 Recorder = Callable[[Job, Answer], None]
@@ -119,77 +115,64 @@ class GraspService:
         if known is not None:
             call.token, call.is_admin = known.name, known.is_admin
 
-    async def answer(
-        self,
-        call: Call,
-        job: Job,
-        size: int,
-        read: Callable[[], Awaitable[bytes]],
-        write: Callable[[Answer], Awaitable[None]],
-        wait: Callable[[Coroutine[Any, Any, Answer]], Awaitable[Answer]] | None = None,
-    ) -> None:
-        """Admit a request, read its body, have a worker answer it, and send the answer.
+    @asynccontextmanager
+    async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
+        """Let a request in until its answer is sent; all of it ends with its deadline.
 
         Args:
-            call: The request; all of it ends with its deadline.
-            job: What a worker is to do, without the body.
-            size: Bytes that the body may have.
-            read: Gives the body, once there is room for it.
-            write: Sends the answer, which may be an error.
-            wait: Waits for the answer, and ends the work where it raises; None: just wait.
+            call: The request.
+            size: Bytes that the body may have; there is room for them inside.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
             Overloaded: There is no place, or its turn would come too late.
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
-            HarmfulRequest: Workers died of this request.
-            WorkerLost: The worker died of something else.
-            Cancelled: The client does not take its answer.
         """
         self.check_ready()
         self.check_size(size)
         call.limit(self.settings.max_request_seconds)
         async with self.admission.admit(call.client, call.deadline, size) as ticket:
             call.end_stage("admission")
-            job = replace(job, body=await read(), request_id=call.request_id)
-            self.check_size(len(job.body))
-            call.end_stage("read")
-            call.bytes_in = len(job.body)
-            self.admission.resize(ticket, call.bytes_in)
-            ticket.whole = True
-            await self._harmful.check(job)
-            began = 0.0
-
-            def begun() -> None:
-                nonlocal began
-                call.end_stage("wait")
-                began = time.monotonic()
-                ticket.at_work = True
-
-            try:
-                work = self.pool.run(job, call.deadline, begun)
-                answer = await (wait(work) if wait else work)
-                if answer.error is None:
-                    await self._harmful.forget(job)
-                elif answer.error.kind == WORKER_LOST:
-                    await self._harmful.note(job, 1)
-            except (HarmfulRequest, WorkerLost) as error:
-                await self._harmful.note(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
-                raise
-            finally:
-                if began:
-                    self.admission.worked(time.monotonic() - began)
-                ticket.at_work = False
-            call.facts, call.problem = answer.facts, answer.error
-            call.stages |= answer.facts.seconds
-            call.bytes_out = len(answer.body)
-            self.admission.resize(ticket, call.bytes_out)
-            if self.record is not None:
-                self.record(job, answer)
-            del job
-            await self.send(write(answer), call.bytes_out)
+            yield ticket
             call.end_stage("write")
+
+    async def answer(self, call: Call, ticket: Ticket, job: Job) -> Answer:
+        """Have a worker answer a request that was let in and whose body is here.
+
+        Raises:
+            PayloadTooLarge: The body is over the limit.
+            HarmfulRequest: Workers died of this request.
+            WorkerLost: The worker died of something else.
+        """
+        call.end_stage("read")
+        call.bytes_in = len(job.body)
+        self.check_size(call.bytes_in)
+        self.admission.resize(ticket, call.bytes_in)
+        ticket.whole = True
+        await self._harmful.check(job)
+        worker = await self.pool.take()
+        call.end_stage("wait")
+        ticket.at_work, began = True, time.monotonic()
+        try:
+            answer = await worker.run(job, call.deadline)
+        except (HarmfulRequest, WorkerLost) as error:
+            await self._harmful.note(job, 1 if isinstance(error, WorkerLost) else MOST_DEATHS)
+            raise
+        finally:
+            self.admission.worked(time.monotonic() - began)
+            ticket.at_work = False
+        if answer.error is None:
+            await self._harmful.forget(job)
+        elif answer.error.kind == WORKER_LOST:
+            await self._harmful.note(job, 1)
+        call.facts, call.problem = answer.facts, answer.error
+        call.stages |= answer.facts.seconds
+        call.bytes_out = len(answer.body)
+        self.admission.resize(ticket, call.bytes_out)
+        if self.record is not None:
+            self.record(job, answer)
+        return answer
 
     async def drain(self, grace: float) -> None:
         """Refuse new requests, and wait for those accepted; after `grace` seconds give them up."""
@@ -204,33 +187,6 @@ class GraspService:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(1.0):  # to be told
                     await self.admission.empty()
-
-    async def receive(self, part: Awaitable[T], received: int = 0, start: float = 0.0) -> T:
-        """The next part of a body; raises RequestTimeout where it arrives too slowly.
-
-        Args:
-            part: Reads it.
-            received: Bytes that came before.
-            start: When the body began, by the clock of the event loop; 0: now.
-        """
-        slowest = self.settings.min_bytes_per_second
-        seconds = self.settings.read_seconds + received / slowest
-        try:
-            async with asyncio.timeout_at((start or time.monotonic()) + seconds):
-                return await part
-        except TimeoutError:
-            fix = f"Send at least {slowest} bytes a second."
-            value = f"{received} bytes in {seconds:.0f} s"
-            raise RequestTimeout("body", value, fix) from None
-
-    async def send(self, sending: Awaitable[None], size: int) -> None:
-        """Wait until so many bytes are taken; raises Cancelled where that takes too long."""
-        seconds = self.settings.write_seconds + size / self.settings.min_bytes_per_second
-        try:
-            async with asyncio.timeout(seconds):
-                await sending
-        except TimeoutError:
-            raise Cancelled(f"The client did not take {size} bytes.") from None
 
     def check_size(self, size: int) -> None:
         """Raise PayloadTooLarge for a body over the limit."""

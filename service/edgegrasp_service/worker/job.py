@@ -20,7 +20,7 @@ class Job:
     method: Method
     transport: Transport
     body: bytes  # of HTTP, or the serialized request message
-    remaining: float  # seconds until its deadline at the time it was handed over
+    remaining: float = 0.0  # seconds until its deadline at the time it was handed over
     content_type: str = ""  # HTTP: the header as sent
     query: str = ""  # HTTP: the query string, without the question mark
     request_id: str = ""  # for the worker's log

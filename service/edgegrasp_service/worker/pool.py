@@ -112,31 +112,12 @@ class WorkerPool:
             if worker.answer is None:  # the others finish what they have begun
                 worker.close()
 
-    async def run(
-        self, job: Job, deadline: float, begun: Callable[[], None] = lambda: None
-    ) -> Answer:
-        """Have a worker do a job, as soon as one is free; first come, first served.
-
-        Where this is cancelled the job is dropped, or its worker soon killed if it has begun.
-
-        Args:
-            job: What to do.
-            deadline: By the clock of the event loop; the worker gives up after it.
-            begun: Called when a worker has the job.
-
-        Raises:
-            HarmfulRequest: The worker died of the job.
-            WorkerLost: It died of something else.
-        """
-        worker = await self._take()
-        begun()
-        remaining = deadline - asyncio.get_running_loop().time()
-        answer = worker.begin(replace(job, remaining=remaining))
-        try:
-            return await asyncio.shield(answer)
-        except asyncio.CancelledError:
-            worker.abandon()
-            raise
+    async def take(self) -> "_Worker":
+        """The next worker that has nothing to do, to `run` a job; first come, first served."""
+        while True:
+            worker = await self._idle.get()
+            if worker in self._workers:  # and not dead
+                return worker
 
     def close(self) -> None:
         """End every worker, whatever it does."""
@@ -148,20 +129,14 @@ class WorkerPool:
         if self._nursery is not None:
             self._nursery.close()
 
-    async def _take(self) -> "_Worker":
-        while True:
-            worker = await self._idle.get()
-            if worker in self._workers:  # and not dead
-                return worker
-
     async def _beat(self) -> None:
         """Ask a worker that has nothing to do, now and then, whether it is there."""
         while True:
             await asyncio.sleep(BEAT_SECONDS)
             with contextlib.suppress(TimeoutError, EdgeGraspError):
                 async with asyncio.timeout(PULSE_SECONDS):  # or it is killed
-                    beat = Job("Beat", "http", b"", 0.0)
-                    await self.run(beat, time.monotonic() + PULSE_SECONDS)
+                    worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
+                    await worker.run(beat, time.monotonic() + PULSE_SECONDS)
 
     async def _tend(self, worker: "_Worker") -> None:
         """Give a worker jobs until it dies, and start another in its place then."""
@@ -345,15 +320,31 @@ class _Worker:
         except (asyncio.IncompleteReadError, OSError):
             return None
 
-    def begin(self, job: Job) -> asyncio.Future[Answer]:
-        """Give it a job."""
-        self.answer = asyncio.get_running_loop().create_future()
+    async def run(self, job: Job, deadline: float) -> Answer:
+        """Do a job. Where this is cancelled, the process is killed unless it is done soon.
+
+        Args:
+            job: What to do.
+            deadline: By the clock of the event loop; the process gives up after it.
+
+        Raises:
+            HarmfulRequest: The process died of the job.
+            WorkerLost: It died of something else.
+        """
+        loop = asyncio.get_running_loop()
+        self.answer = loop.create_future()
         self.answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
-        assert self._writer is not None
         self.at_work = job.method != "Beat"
-        for part in pack(job):
+        assert self._writer is not None
+        for part in pack(replace(job, remaining=deadline - loop.time())):
             self._writer.write(part)
-        return self.answer
+        del job
+        try:
+            return await asyncio.shield(self.answer)
+        except asyncio.CancelledError:
+            if self.answer is not None:
+                self._killing = loop.call_later(KILL_SECONDS, self.kill)
+            raise
 
     def finish(self, answer: Answer | EdgeGraspError) -> None:
         """Hand on the answer of its job, or why there is none, if it has a job."""
@@ -368,12 +359,6 @@ class _Worker:
             waiting.set_exception(answer)
         else:
             waiting.set_result(answer)
-
-    def abandon(self) -> None:
-        """Nobody waits for its answer: kill it unless it is done soon."""
-        if self.answer is not None and self._killing is None:
-            loop = asyncio.get_running_loop()
-            self._killing = loop.call_later(KILL_SECONDS, self.kill)
 
     def kill(self) -> None:
         """End it at once."""

@@ -1,0 +1,431 @@
+"""Connections and what they may hold: how many, how long silent, how slow, and who loses one.
+
+All defences against clients that send or take slowly or not at all are here: `Places` bounds
+connections, streams, pages and reads; `receive` and `send` bound the time of bodies and answers;
+`HttpProtocol` is HTTP/1.1 with the bounds that uvicorn leaves open; `grpc_bounds` and `trim_grpc`
+are those of gRPC.
+"""
+
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
+from edgegrasp_service.errors import (
+    Cancelled,
+    HeadersTooLarge,
+    Overloaded,
+    RequestTimeout,
+    problem_document,
+    report,
+)
+from edgegrasp_service.observability import network_of
+from edgegrasp_service.settings import Settings
+
+# Connections of HTTP
+HEALTH_PLACES = 16  # beside max_connections, which no request but for health holds
+BACKLOG = 1024  # that wait to be accepted; what does not fit tries again a second later
+ACCEPTED = 16  # at once, between which others have their turn
+KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
+LINGER_SECONDS = 5.0  # for a client to take what is not sent yet, though it may still send
+MANY_PIECES, SMALL_PIECE = 1024, 16  # so many chunks of so few bytes are no body of a cloud
+PAGES = 16  # answered at a time
+PAGE_GRACE_SECONDS = 10.0  # for a page to be taken, while others wait for its place
+
+# Calls of gRPC
+CALLS = 100  # of one connection at a time; those beyond wait at their client
+SMALL_READS = 8  # messages of health checks and reflection read at a time
+SMALL_READ_SECONDS = 2.0
+WATCHERS = 64  # of health
+STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
+STREAM_GRACE_SECONDS = 10.0  # the same, while others wait for its place
+
+# Connections of gRPC
+LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
+SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
+SPARE_CONNECTIONS = 2  # times as many as may stay are accepted
+TRIM_SECONDS = 0.5  # until those that are too many are closed
+DESCRIPTORS = Path("/proc/self/fd")
+LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
+
+T = TypeVar("T")
+
+
+class Place:
+    """One of the places below."""
+
+    def __init__(self, owner: str, lose: Callable[[], None]) -> None:
+        self.owner, self.lose = owner, lose
+        self.idle = True  # nothing is lost with it
+        self.used = time.monotonic()
+
+
+class Places:
+    """So many connections, streams, pages or reads at a time.
+
+    Where all are taken, a newcomer ends one that is idle: of whoever has most of those, the one
+    that was idle for longest. One that was used within `grace` seconds is lost only to a newcomer
+    who then still has less. `spare` places are never busy, so that there is always one for a
+    newcomer.
+    """
+
+    def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
+        self._most, self._grace, self._spare = most + spare, grace, spare
+        self._taken: dict[Place, None] = {}  # the latest used at the end
+
+    def __len__(self) -> int:
+        return len(self._taken)
+
+    def take(self, owner: str, lose: Callable[[], None]) -> Place:
+        """A place, until `leave`; `lose` is called if it is lost. Raises Overloaded."""
+        if len(self._taken) >= self._most:
+            since, counts = (
+                time.monotonic() - self._grace,
+                Counter(one.owner for one in self._taken),
+            )
+            mine = counts[owner] + 1
+            idle = [
+                place
+                for place in self._taken
+                if place.idle and (place.used <= since or counts[place.owner] > mine)
+            ]
+            if not idle:
+                raise Overloaded(f"All {self._most} places are in use. Try again in 1 s.")
+            greedy = Counter(place.owner for place in idle).most_common(1)[0][0]
+            lost = next(place for place in idle if place.owner == greedy)
+            self.leave(lost)
+            lost.lose()
+        place = Place(owner, lose)
+        self._taken[place] = None
+        return place
+
+    def use(self, place: Place, idle: bool = True) -> None:
+        """Something happens at a place, which is idle then or not; raises Overloaded."""
+        if place.idle and not idle and self._spare:
+            busy = sum(not other.idle for other in self._taken)
+            if busy >= self._most - self._spare:
+                raise Overloaded(f"{busy} connections have requests. Try again in 1 s.")
+        place.idle, place.used = idle, time.monotonic()
+        if place in self._taken:
+            self._taken[place] = self._taken.pop(place)
+
+    def leave(self, place: Place) -> None:
+        """Give a place back."""
+        self._taken.pop(place, None)
+
+    @asynccontextmanager
+    async def hold(self, owner: str) -> AsyncIterator[Place]:
+        """Have a place for a while; what happens inside is cancelled if it is lost.
+
+        Raises:
+            Overloaded: There is no place, or it was lost.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(None) as ends:
+                place = self.take(owner, lambda: ends.reschedule(loop.time()))
+                try:
+                    yield place
+                finally:
+                    self.leave(place)
+        except TimeoutError:
+            if not ends.expired():
+                raise
+            raise Overloaded("The server is full, and others wait. Try again in 1 s.") from None
+
+
+async def receive(
+    settings: Settings, part: Awaitable[T], received: int = 0, start: float = 0.0
+) -> T:
+    """The next part of a body; raises RequestTimeout where it arrives too slowly.
+
+    Args:
+        settings: How slow is too slow.
+        part: Reads it.
+        received: Bytes that came before.
+        start: When the body began, by the clock of the event loop; 0: now.
+    """
+    slowest = settings.min_bytes_per_second
+    seconds = settings.read_seconds + received / slowest
+    try:
+        async with asyncio.timeout_at((start or time.monotonic()) + seconds):
+            return await part
+    except TimeoutError:
+        fix = f"Send at least {slowest} bytes a second."
+        value = f"{received} bytes in {seconds:.0f} s"
+        raise RequestTimeout("body", value, fix) from None
+
+
+async def send(settings: Settings, sending: Awaitable[None], size: int) -> None:
+    """Wait until so many bytes are taken; raises Cancelled where that takes too long."""
+    try:
+        async with asyncio.timeout(settings.write_seconds + size / settings.min_bytes_per_second):
+            await sending
+    except TimeoutError:
+        raise Cancelled(f"The client did not take {size} bytes.") from None
+
+
+# HTTP
+
+
+class HttpProtocol(HttpToolsProtocol):
+    """Ends connections whose headers do not come or whose answers nobody takes; closes gently."""
+
+    def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self._settings = settings
+        self._places = places
+        self._write_timer: asyncio.TimerHandle | None = None
+        self._header_timer: asyncio.TimerHandle | None = None
+        self._header_bytes = 0
+        self._in_headers = self._receiving = True
+        self._pieces = self._body_bytes = 0
+        self._refusal: EdgeGraspError | None = None  # why the parser is ended
+        self._place = Place("", lambda: None)
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first header."""
+        super().connection_made(transport)
+        self.transport = _GentleTransport(  # type: ignore[assignment]
+            transport, lambda: self._receiving
+        )
+        self._await_headers()
+        try:
+            owner = network_of(self.client[0] if self.client else "")
+            self._place = self._places.take(owner, transport.abort)
+        except Overloaded as error:
+            self._refuse(error)
+
+    def data_received(self, data: bytes) -> None:
+        """Take a part of a request; nothing of one that was refused."""
+        if self.transport.is_closing():
+            return
+        self._header_bytes += len(data)
+        self._places.use(self._place, self._place.idle)
+        super().data_received(data)
+        if not self._in_headers:
+            self._header_bytes = 0
+        elif self._header_bytes > self._settings.max_header_bytes:
+            most = f"Send at most {self._settings.max_header_bytes}."
+            self._refuse(HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
+
+    def on_message_begin(self) -> None:
+        """A request begins."""
+        super().on_message_begin()
+        self.scope["state"]["abort"] = self.transport.abort
+        self._receiving = True
+        self._pieces = self._body_bytes = 0
+        self._await_headers()
+
+    def on_headers_complete(self) -> None:
+        """Its headers are there."""
+        self._in_headers = False
+        _cancel(self._header_timer)
+        self._header_timer = None
+        # How many of these there are is bounded elsewhere, and somebody waits for each.
+        try:
+            self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
+        except Overloaded as error:
+            self._refusal = error
+            raise  # ends the parser too
+        super().on_headers_complete()
+
+    def on_body(self, body: bytes) -> None:
+        """A piece of its body."""
+        self._pieces += 1
+        self._body_bytes += len(body)
+        if self._pieces > MANY_PIECES and self._body_bytes < self._pieces * SMALL_PIECE:
+            value = f"{self._body_bytes} bytes in {self._pieces} pieces"
+            self._refusal = InvalidRequest("body", value, "Send larger pieces.")
+            raise self._refusal  # ends the parser too
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """It is all there."""
+        self._receiving = False
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """It is answered."""
+        self._places.use(self._place)
+        super().on_response_complete()
+
+    def pause_writing(self) -> None:
+        """The client takes its answer more slowly than it is made: for some time only."""
+        super().pause_writing()
+        seconds = self._settings.write_seconds
+        seconds += self.transport.get_write_buffer_size() / self._settings.min_bytes_per_second
+        self._write_timer = self.loop.call_later(seconds, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """It has taken most of it."""
+        _cancel(self._write_timer)
+        super().resume_writing()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """The end."""
+        _cancel(self._header_timer)
+        self.resume_writing()
+        self._places.leave(self._place)
+        super().connection_lost(exc)
+
+    def send_400_response(self, msg: str) -> None:
+        """Say why what came is no request."""
+        fix = "Send an HTTP/1.1 request."
+        self._refuse(self._refusal or InvalidRequest("request", "malformed HTTP", fix))
+
+    def _refuse(self, error: EdgeGraspError) -> None:
+        """Answer past the application, and close."""
+        pending = self.cycle is not None and not self.cycle.response_complete
+        if pending and self.cycle.response_started:
+            self.transport.abort()  # it has half an answer
+            return
+        problem = report(error)
+        body = problem_document(problem)
+        head = (
+            f"HTTP/1.1 {problem.status} {problem.kind}\r\n"
+            "content-type: application/problem+json\r\n"
+            f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
+        )
+        if pending:
+            self.cycle.disconnected = True  # the application answers nothing any more
+            self.cycle.message_event.set()
+        self.transport.write(head.encode() + body)
+        self.transport.close()
+
+    def _await_headers(self) -> None:
+        self._in_headers = True
+        if self._header_timer is None:
+            seconds = self._settings.read_seconds
+            self._header_timer = self.loop.call_later(seconds, self._headers_late)
+
+    def _headers_late(self) -> None:
+        if not self.transport.is_closing():
+            value = f"not whole in {self._settings.read_seconds:g} s"
+            self._refuse(RequestTimeout("headers", value, "Send them at once."))
+
+
+def _cancel(timer: asyncio.TimerHandle | None) -> None:
+    if timer is not None:
+        timer.cancel()
+
+
+class _GentleTransport:
+    """A transport whose `close` lets the client read its answer, but not hold the connection.
+
+    A socket that is closed while bytes arrive is reset, and an answer on its way may be lost.
+    """
+
+    def __init__(self, transport: asyncio.Transport, receiving: Callable[[], bool]) -> None:
+        self._transport = transport
+        self._receiving = receiving
+        self._closing = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def is_closing(self) -> bool:
+        """Whether it is closed, or soon will be."""
+        return self._closing or self._transport.is_closing()
+
+    def write(self, data: bytes) -> None:
+        """Send, unless nothing more can be."""
+        if not self._closing:
+            self._transport.write(data)
+
+    def close(self) -> None:
+        """Send what is written, drop what comes in, and close."""
+        if self.is_closing():
+            return
+        self._closing = True
+        if self._receiving() and self._transport.can_write_eof():
+            self._transport.write_eof()
+            self._transport.resume_reading()
+        else:
+            self._transport.close()
+        asyncio.get_running_loop().call_later(LINGER_SECONDS, self._transport.abort)
+
+
+# gRPC
+
+
+def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
+    """Options of a gRPC server."""
+    return [
+        ("grpc.max_receive_message_length", settings.max_body_bytes + SPARE_BYTES),
+        ("grpc.max_metadata_size", settings.max_header_bytes),
+        ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
+        # What is compressed is unpacked before its length is known: none of it.
+        ("grpc.compression_enabled_algorithms_bitset", 1),
+        ("grpc.so_reuseport", 0),
+        # Python accepts one call in a turn of its event loop: few may wait before a health check.
+        ("grpc.max_concurrent_streams", CALLS),
+        ("grpc.max_allowed_incoming_connections", SPARE_CONNECTIONS * settings.max_connections),
+        ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
+        ("grpc.max_connection_idle_ms", 300_000),
+        # A cloud comes in one go, without waiting for leave to send the rest of it.
+        ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
+        ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
+        # A client that vanished without a word is found out, and its streams end.
+        ("grpc.keepalive_time_ms", 30_000),
+        ("grpc.keepalive_timeout_ms", 10_000),
+        # Clients look up the servers anew now and then, and so find those that were added.
+        ("grpc.max_connection_age_ms", 300_000),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
+    ]
+
+
+async def trim_grpc(port: int, most: int, others: Callable[[], int]) -> None:
+    """Close connections to gRPC's port that are too many; gRPC cannot tell whose they are.
+
+    Does not end.
+
+    Args:
+        port: Of gRPC.
+        most: Connections that may stay.
+        others: How many connections there are to other ports, whose descriptors do not count.
+    """
+    while True:
+        await asyncio.sleep(TRIM_SECONDS)
+        if len([*DESCRIPTORS.iterdir()]) - others() > most:
+            with contextlib.ExitStack() as stack:
+                _trim(_accepted(port, stack), most)
+
+
+def _trim(connections: list[socket.socket], most: int) -> None:
+    """Shut down, of whoever has most of them, those that have been silent for longest."""
+    found: dict[str, list[tuple[int, socket.socket]]] = {}
+    for connection in connections:
+        with contextlib.suppress(OSError):
+            owner = network_of(connection.getpeername()[0])
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, LAST_RECEIVED.size)
+            found.setdefault(owner, []).append((*LAST_RECEIVED.unpack(info), connection))
+    for rows in found.values():
+        rows.sort(key=lambda row: row[0])
+    for _ in range(sum(map(len, found.values())) - most):
+        _, connection = max(found.values(), key=len).pop()
+        with contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+
+
+def _accepted(port: int, stack: contextlib.ExitStack) -> list[socket.socket]:
+    """Those that this process has accepted at a port, until the stack closes."""
+    found = []
+    for link in DESCRIPTORS.iterdir():
+        with contextlib.suppress(OSError):
+            if not link.is_socket():
+                continue
+            one = stack.enter_context(socket.socket(fileno=os.dup(int(link.name))))
+            if one.family != socket.AF_UNIX and one.getsockname()[1] == port and one.getpeername():
+                found.append(one)
+    return found
