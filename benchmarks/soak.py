@@ -58,7 +58,7 @@ SECONDS = 30.0  # until a request counts as lost
 TOGETHER = 8  # requests of one stream
 ALONE = 0.1  # of the time, before the attacks begin
 PROBE_SECONDS = 0.1  # between two questions for health
-HEALTH_TIMEOUT = 5.0  # of a question, as in docker/kubernetes
+HEALTH_TIMEOUT = 5.0 * float(os.environ.get("SOAK_PATIENCE", "1"))  # as in docker/kubernetes
 MEMORY_SAMPLES = 60
 MAX_GROWTH = 0.1  # of memory, from the middle of the attacks to their end
 ATTACKER = "127.0.0.2"  # fairness is between addresses
@@ -304,10 +304,10 @@ def lock_out(url: str, address: str, stop: Any, told: Any) -> None:
     told.send(dict(came))
 
 
-def connect(address: str, source: str = ATTACKER) -> socket.socket:
+def connect(address: str, source: str = ATTACKER, timeout: float = SECONDS) -> socket.socket:
     """A connection with a small buffer."""
     host, _, port = address.removeprefix("http://").rpartition(":")
-    made = socket.create_connection((host, int(port)), HEALTH_TIMEOUT, (source, 0))
+    made = socket.create_connection((host, int(port)), timeout, (source, 0))
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     return made
 
@@ -351,7 +351,7 @@ def probe(url: str, address: str, stop: Any, told: Any) -> None:
 
 def ask_http(url: str) -> None:
     """As Kubernetes asks for liveness; raises OSError or ValueError unless the answer is 200."""
-    with connect(url, "127.0.0.1") as connection:
+    with connect(url, "127.0.0.1", HEALTH_TIMEOUT) as connection:
         connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
         said = connection.recv(4096)
     if not said.startswith(b"HTTP/1.1 200"):

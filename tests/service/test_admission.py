@@ -130,6 +130,18 @@ async def test_a_newcomer_ends_what_was_idle_for_longest_of_whoever_has_most() -
     assert lost == [1]
 
 
+async def test_a_newcomer_with_less_need_not_wait_until_another_was_idle_for_long() -> None:
+    places, lost = Places(3, grace=FAR), []
+    for row in range(3):
+        places.take("a", partial(lost.append, row))
+    with pytest.raises(Overloaded):
+        places.take("a", lambda: None)
+    places.take("b", lambda: None)
+    assert lost == [0]
+    with pytest.raises(Overloaded):
+        places.take("b", lambda: None)  # would have as many as the other
+
+
 async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:
     inside = Inside(Admission(workers=2, max_waiting=0, max_bytes=100))
     await inside.enter("a", size=1000)
@@ -164,7 +176,7 @@ async def test_an_empty_server_tries_any_deadline() -> None:
 
 
 async def test_one_slow_request_does_not_change_the_pace() -> None:
-    """Row 11: a request of 18 s among many of 50 ms, and then nobody with 5 s was let in."""
+    """One of 18 s among many of 50 ms, and then nobody with 5 s was let in."""
     inside = Inside(Admission(workers=1, max_waiting=10, max_bytes=100))
     for seconds in (0.05, 0.05, 18.0, 0.05):
         inside.admission.worked(seconds)

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import subprocess
 import sys
 import time
@@ -31,16 +32,21 @@ async def test_clocks_that_jump(serve, cloud: np.ndarray, monkeypatch: pytest.Mo
 
 
 def test_a_short_soak(tmp_path: Path) -> None:
-    """Mixed sizes, malformed, abandoned: every request comes to something, none to another's."""
-    command = [sys.executable, "-m", "benchmarks.soak", "--requests", "400"]
+    """Beside attacks each request comes to something, none to another's; health is answered."""
+    command = [sys.executable, "-m", "benchmarks.soak", "--minutes", "0.2", "--clients", "3"]
     done = subprocess.run(
-        [*command, "--output", tmp_path], cwd=ROOT, capture_output=True, text=True, timeout=300
+        [*command, "--output", tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"SOAK_PATIENCE": "10"},  # on a busy machine
     )
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads((tmp_path / "soak.json").read_text())
     assert found["faults"] == []
-    assert sum(found["outcomes"].values()) == 400
-    kinds = {name.partition(":")[0] for name in found["outcomes"]}
-    assert {f"{way} good" for way in ("grpc", "stream", "rest")} <= kinds
-    assert any("malformed: refused" in name for name in found["outcomes"])
-    assert any("cancelled: cancelled" in name for name in found["outcomes"])
+    assert {"grpc good: answered", "stream good: answered", "rest good: answered"} <= {
+        *found["alone"]["outcomes"],
+        *found["attacked"]["outcomes"],
+    }
+    assert found["attacked"]["attacks"][0].keys() == {"json: 400", "x-npy: 400", "x-npz: 400"}

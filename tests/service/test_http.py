@@ -10,7 +10,6 @@ import pytest
 
 
 def test_pages_work_without_internet(dummy_server) -> None:
-    """Row 13."""
     with httpx.Client(base_url=dummy_server.http_url, follow_redirects=True) as http:
         for path in ("/", "/docs"):
             page = http.get(path)
@@ -84,6 +83,16 @@ def test_what_is_no_good_request_is_told_why(dummy_server, data: bytes, status: 
     assert b'"status":%d' % status in body
 
 
+async def test_a_refused_client_that_sends_on_leaves_no_traceback(serve, caplog) -> None:
+    running = await serve()
+    refused = POST + b"Content-Length: 99999999\r\n\r\n"
+    said = await asyncio.to_thread(talk, running.server.http_url, refused + 2 * POST + bytes(10**6))
+    assert said.startswith(b"HTTP/1.1 413")
+    assert said.count(b"HTTP/1.1") == 1
+    await running.until(lambda: running.ended == ["payload-too-large"])
+    assert not [record for record in caplog.records if record.exc_info]
+
+
 async def test_headers_that_do_not_come_are_not_waited_for(serve) -> None:
     running = await serve(read_seconds=0.3)
     for data in (POST, b""):
@@ -106,7 +115,7 @@ async def test_headers_that_do_not_come_are_not_waited_for(serve) -> None:
     ],
 )
 async def test_names_of_the_server(serve, host: str, given: dict[str, Any], status: int) -> None:
-    """Row 6: a web page can have its own name point to this server."""
+    """A web page can have its own name point to this server."""
     running = await serve(**given)
     async with httpx.AsyncClient(base_url=running.server.http_url) as http:
         for path in ("/v1/models", "/docs", "/metrics"):

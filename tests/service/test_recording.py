@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import os
 from pathlib import Path
 
 import httpx
@@ -77,6 +78,21 @@ async def test_what_is_there_already_counts_and_is_looked_at_once(
     assert sum(path.stat().st_size for path in tmp_path.glob("*.job")) <= 2**20
     assert (tmp_path / "notes.txt").exists()
     assert running.server.service.admission.held_bytes == 0
+
+
+async def test_how_many_files_lie_there_costs_nothing_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(60_000):
+        os.mknod(tmp_path / f"20200101T000000{number:06}Z-old.job")
+    recorder = Recorder(tmp_path, 2**20, lambda size: True)
+    for looks in ("scandir", "listdir"):
+        monkeypatch.setattr(os, looks, lambda *path: pytest.fail("the folder was read again"))
+    for _ in range(3):
+        recorder.record(Job("DetectGrasps", "http", bytes(600), 1.0), Answer(b"", Facts()))
+    recorder.close()
+    monkeypatch.undo()
+    assert len([*tmp_path.glob("*.job")]) == 60_003
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:

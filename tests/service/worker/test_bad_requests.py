@@ -418,7 +418,7 @@ MANY = 200_000
 def test_many_empty_messages_are_counted_not_read(
     field: str, body: dict[str, Any], grpc_: GrpcAsker
 ) -> None:
-    """Row 6: two bytes each on the wire, and once half a kilobyte each in Python."""
+    """Two bytes each on the wire, and once half a kilobyte each in Python."""
     content = grasp_pb2.ScoreGraspsRequest(points=POINTS.tobytes(), **body).SerializeToString()
     method = "ScoreGrasps" if field in ("edges", "hand_poses") else "DetectGrasps"
     tracemalloc.start()
