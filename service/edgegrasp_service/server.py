@@ -23,6 +23,7 @@ from edgegrasp_service.front.connections import (
     KEEP_ALIVE_SECONDS,
     HttpProtocol,
     Places,
+    trim_grpc,
 )
 from edgegrasp_service.front.grpc import GrpcServer
 from edgegrasp_service.front.http import HttpMiddleware, create_app
@@ -118,12 +119,15 @@ class Server:
         with _listen(settings.host, settings.http_port) as http_socket:
             credentials = None if self._tls is None else self._tls.grpc
             http_connections = Places(settings.max_connections, spare=HEALTH_PLACES)
-            grpc_server = GrpcServer(self.service, self.reloader, credentials, http_connections)
+            grpc_server = GrpcServer(self.service, self.reloader, credentials)
             http_server = self._http_server(http_connections)
             scheme = "http" if self._tls is None else "https"
             self.http_url = _url(scheme, http_socket)
             self.grpc_address = grpc_server.address
             await grpc_server.start()
+            trimming = asyncio.create_task(
+                trim_grpc(grpc_server.port, settings.max_connections, http_connections.__len__)
+            )
             http_task = asyncio.create_task(http_server.serve(sockets=[http_socket]))
             load_task = asyncio.create_task(self._load(grpc_server, ready))
             opened()
@@ -139,6 +143,7 @@ class Server:
                 http_server.should_exit = True
                 await asyncio.gather(http_task, grpc_server.stop(CLOSE_SECONDS))
                 stopped.cancel()
+                trimming.cancel()
                 self.pool.close()
                 if self._recorder is not None:
                     self._recorder.close()

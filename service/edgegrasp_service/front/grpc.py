@@ -52,7 +52,6 @@ from edgegrasp_service.front.connections import (
     grpc_bounds,
     receive,
     send,
-    trim_grpc,
 )
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, current_call
@@ -92,7 +91,6 @@ class GrpcServer:
         service: GraspService,
         reloader: Reloader,
         credentials: grpc.ServerCredentials | None,
-        http_connections: Places,
     ) -> None:
         settings = service.settings
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
@@ -109,16 +107,12 @@ class GrpcServer:
         except RuntimeError as error:
             raise AddressInUse("gRPC", place, str(error)) from None
         self.address = place if sockets else f"{host}:{port}"
-        self._has_port = not sockets
-        self._trim = partial(trim_grpc, port, settings.max_connections, http_connections.__len__)
-        self._trimming: asyncio.Task[None] | None = None
+        self.port = 0 if sockets else port
 
     async def start(self) -> None:
         """Open for requests, as not serving yet."""
         await self.set_serving(False)
         await self._server.start()
-        if self._has_port:
-            self._trimming = asyncio.create_task(self._trim())
 
     async def set_serving(self, serving: bool) -> None:
         """Tell health checks."""
@@ -128,8 +122,6 @@ class GrpcServer:
 
     async def stop(self, grace_seconds: float) -> None:
         """Refuse new requests, and wait for those in flight."""
-        if self._trimming is not None:
-            self._trimming.cancel()
         await self._server.stop(grace_seconds)
 
 
@@ -216,17 +208,49 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         return Job(method, "grpc", body)
 
     async def _stream(self, context: Any) -> None:
-        call = current_call()
-        async with self._streams.hold(call.client) as place:
+        """Answer the requests of one stream, at work side by side, in their order.
 
-            def use(idle: bool) -> None:
-                self._streams.use(place, idle)
+        A request is read only when fewer than `max_stream_requests` are unanswered; what the client
+        sends beyond that stays with it. Where it leaves, what is under way is cancelled.
 
-            async for response in answer_stream(self._service, call, context, use):
-                await send(self._service.settings, context.write(response), len(response))
+        Raises:
+            NotReady: The server is stopping; what was read is answered before.
+            InvalidRequest: A message is no DetectGraspsStreamRequest.
+            RequestTimeout: No message came for long.
+            Overloaded: There is no place for the stream, or another client has it.
+        """
+        service, call = self._service, current_call()
+        ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
+        stopping = asyncio.create_task(service.stopping.wait())
+        reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
+        try:
+            async with self._streams.hold(call.client) as place:
+                while reading or ahead:
+                    self._streams.use(place, idle=not ahead)
+                    waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
+                    if reading and len(ahead) < service.settings.max_stream_requests:
+                        waiting |= {reading, stopping}
+                    await _first_of(waiting, None if ahead else STREAM_IDLE_SECONDS)
+                    if ahead and ahead[0].done():
+                        response = ahead.popleft().result()
+                        await send(service.settings, context.write(response), len(response))
+                    elif reading and reading.done():
+                        if (request := reading.result()) is not None:
+                            ahead.append(asyncio.create_task(_answer(service, call, request)))
+                        last = request is None or stopping.done()
+                        reading = None if last else asyncio.create_task(_next_request(context))
+                    elif reading:  # the server is stopping
+                        reading.cancel()
+                        reading = None
+                if stopping.done():
+                    raise NotReady(STOPPING)
+        finally:
+            for task in (stopping, reading, *ahead):
+                if task is not None:
+                    task.cancel()
 
     async def _list_models(self, context: Any) -> None:
-        models = [grasp_pb2.Model(**facts) for facts in self._service.models()]
+        models = [grasp_pb2.Model(**facts) for facts in self._service.loaded().models]
         await context.write(grasp_pb2.ListModelsResponse(models=models))
 
     async def _reload_models(self, context: Any) -> None:
@@ -329,58 +353,15 @@ def _details(problem: Problem) -> list[AnyMessage]:
     return [any_message.pack(detail) for detail in details]
 
 
-# Streams: requests of one at work side by side, answered in their order
+# Streams
 
 
-async def answer_stream(
-    service: GraspService, stream: Call, context: Any, use: Callable[[bool], None]
-) -> AsyncIterator[bytes]:
-    """Answer the requests of one stream.
-
-    A request is read only when fewer than `max_stream_requests` are unanswered; what the client
-    sends beyond that stays with it. Where this is closed early, what is under way is cancelled.
-
-    Gives serialized DetectGraspsStreamResponses; calls `use` when there is something to do or not.
-
-    Raises:
-        NotReady: The server is stopping; what was read is answered before.
-        InvalidRequest: A message is no DetectGraspsStreamRequest.
-        RequestTimeout: No message came for long.
-    """
-    ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
-    stopping = asyncio.create_task(service.stopping.wait())
-    reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
-    try:
-        while reading or ahead:
-            waiting: set[asyncio.Task[Any]] = {ahead[0]} if ahead else set()
-            if reading and len(ahead) < service.settings.max_stream_requests:
-                waiting |= {reading, stopping}
-            use(not ahead)
-            done, _ = await asyncio.wait(
-                waiting,
-                timeout=None if ahead else STREAM_IDLE_SECONDS,
-                return_when=asyncio.FIRST_COMPLETED,
-            )
-            if not done:
-                value = f"no message in {STREAM_IDLE_SECONDS:.0f} s"
-                raise RequestTimeout("request", value, "Open another stream.")
-            if ahead and ahead[0].done():
-                yield ahead.popleft().result()
-            elif reading and reading.done():
-                request = reading.result()
-                if request is not None:
-                    ahead.append(asyncio.create_task(_answer(service, stream, request)))
-                last = request is None or stopping.done()
-                reading = None if last else asyncio.create_task(_next_request(context))
-            elif reading:  # the server is stopping
-                reading.cancel()
-                reading = None
-        if stopping.done():
-            raise NotReady(STOPPING)
-    finally:
-        for task in (stopping, reading, *ahead):
-            if task is not None:
-                task.cancel()
+async def _first_of(tasks: set[asyncio.Task[Any]], timeout: float | None) -> None:
+    """Return once one is done; raises RequestTimeout."""
+    done, _ = await asyncio.wait(tasks, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+    if not done:
+        value = f"no message in {timeout:.0f} s"
+        raise RequestTimeout("request", value, "Open another stream.")
 
 
 async def _next_request(context: Any) -> dict[str, Any] | None:

@@ -178,11 +178,11 @@ def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> F
 
     @app.get("/v1/models")
     async def list_models() -> Response:
-        return JSONResponse({"models": service.models()})
+        return JSONResponse({"models": service.loaded().models})
 
     @app.get("/v1/robots")
     async def list_robots() -> Response:
-        return JSONResponse({"robots": service.robots()})
+        return JSONResponse({"robots": service.loaded().robots})
 
     @app.post("/v1/models:reload")
     async def reload() -> Response:

@@ -72,22 +72,13 @@ class GraspService:
         """Whether requests are answered."""
         return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
 
-    def models(self) -> list[dict[str, Any]]:
-        """The weights a request can name, keyed as edgegrasp.v1.Model; raises NotReady."""
-        self.check_ready()
-        return self.pool.models
-
-    def robots(self) -> list[dict[str, Any]]:
-        """The robots that a request can name; raises NotReady."""
-        self.check_ready()
-        return self.pool.robots
-
-    def check_ready(self) -> None:
-        """Raise NotReady while weights are loading, and when the server is stopping."""
+    def loaded(self) -> WorkerPool:
+        """The workers; raises NotReady while weights are loading or the server is stopping."""
         if self.stopping.is_set():
             raise NotReady(STOPPING)
         if not self.pool.models:
             raise NotReady("Weights are still loading. Try again in some seconds.")
+        return self.pool
 
     @contextmanager
     def observe(self, call: Call) -> Iterator[None]:
@@ -129,7 +120,7 @@ class GraspService:
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
         """
-        self.check_ready()
+        self.loaded()
         self.check_size(size)
         call.limit(self.settings.max_request_seconds)
         async with self.admission.admit(call.client, call.deadline, size) as ticket:
@@ -247,18 +238,17 @@ class Reloader:
         self._tls = tls
         self._reloaded = reloaded
         self._lock = asyncio.Lock()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: set[asyncio.Task[Any]] = set()
 
     def reload_soon(self) -> None:
         """Begin a reload in the running event loop; what comes of it is in the log."""
-        task = asyncio.get_running_loop().create_task(self._reload_quietly())
+        task = asyncio.get_running_loop().create_task(self.reload())
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._reloaded_soon)
 
-    async def _reload_quietly(self) -> None:
-        try:
-            await self.reload()
-        except EdgeGraspError as error:
+    def _reloaded_soon(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()):
             logger.warning("SIGHUP: %s", error)
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
@@ -274,7 +264,7 @@ class Reloader:
         if call is not None and not call.is_admin:  # however its path was spelled
             raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
         service = self._service
-        service.check_ready()
+        service.loaded()
         if self._lock.locked():
             raise ReloadFailed("A reload is under way already. Try again later.")
         async with self._lock:

@@ -161,24 +161,19 @@ class _Work:
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
-        size = len(self._job.body)
+        size, most = len(self._job.body), self._settings.max_points
+        in_time = most
         try:
             with limited_memory(DECODE_BYTES + DECODE_FACTOR * size):
-                return self._decode_within_memory()
+                fields = self._encoding.read_request(self._job)
+                self.options = options = parse_options(fields["options"])
+                detector = self._catalogue.get(options.model)
+                given = {} if self._job.method == "DetectGrasps" else _given(fields, most)
+                in_time = self._within_deadline(most, self._catalogue.pace.point)
+                cloud, options = decode_cloud(fields, options, in_time)
         except MemoryError:
             value, fix = f"{size} bytes that take too much memory to read", "Send packed arrays."
             raise PayloadTooLarge("body", value, fix) from None
-
-    def _decode_within_memory(
-        self,
-    ) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
-        fields = self._encoding.read_request(self._job)
-        self.options = options = parse_options(fields["options"])
-        detector, most = self._catalogue.get(options.model), self._settings.max_points
-        given = {} if self._job.method == "DetectGrasps" else _given(fields, most)
-        in_time = self._within_deadline(most, self._catalogue.pace.point)
-        try:
-            cloud, options = decode_cloud(fields, options, in_time)
         except PayloadTooLarge as error:
             if in_time == most:
                 raise
