@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Coroutine
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +119,7 @@ class HttpMiddleware:
                 scope = {**scope, "method": "GET"}
             try:
                 self._check(scope, call, headers)
-                if method != "Docs":
-                    await self._app(scope, receive_noting, send_named)
-                    return
-                async with self._pages.hold(call.client):
+                async with self._pages.hold(call.client) if method == "Docs" else nullcontext():
                     await self._app(scope, receive_noting, send_named)
             except EdgeGraspError as error:
                 if call.code:

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -106,7 +107,7 @@ class WorkerPool:
         self._answered = time.monotonic()
         if old_nursery is None:
             self._spawn(self._beat())
-        if old_nursery is not None:
+        else:
             old_nursery.close()
         for worker in old_workers:
             if worker.answer is None:  # the others finish what they have begun
@@ -209,7 +210,9 @@ class _Nursery:
         self._process = process
         self.pid = process.pid
         self._control = control
-        self._crashed: dict[int, asyncio.Future[bool]] = {}  # by process, while one asks
+        # Of workers that have ended, by process: whether they did so by themselves.
+        self._crashed: defaultdict[int, asyncio.Future[bool]]
+        self._crashed = defaultdict(asyncio.get_running_loop().create_future)
 
     @classmethod
     async def start(cls, command: Sequence[str], settings: Settings) -> "_Nursery":
@@ -243,9 +246,8 @@ class _Nursery:
                 told = self._control.recv(ENDED.size * 64)
             for pid, status in ENDED.iter_unpack(told[: len(told) // ENDED.size * ENDED.size]):
                 crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
-                ended = self._ended(pid)
-                if not ended.done():
-                    ended.set_result(crashed or os.WIFEXITED(status))
+                if not self._crashed[pid].done():
+                    self._crashed[pid].set_result(crashed or os.WIFEXITED(status))
             if not told:
                 loop.remove_reader(self._control)
                 lost()
@@ -256,13 +258,8 @@ class _Nursery:
         """Whether a worker that has ended did so by itself, and was not killed."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_SECONDS):
-                return await self._ended(pid)
+                return await self._crashed[pid]
         return False
-
-    def _ended(self, pid: int) -> "asyncio.Future[bool]":
-        if pid not in self._crashed:
-            self._crashed[pid] = asyncio.get_running_loop().create_future()
-        return self._crashed[pid]
 
     def fork(self) -> socket.socket:
         """A socket to a new worker."""

@@ -40,9 +40,14 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
+    # Here, for the front imports this module, and parses nothing.
+    from edgegrasp_service.worker.answer import load_catalogue
+
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(told))
+    loading = partial(load or load_catalogue, settings)
     try:
-        start = _prepare(settings, load)
+        # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
+        catalogue = loading() if settings.device == "cpu" else None
     except EdgeGraspError as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
@@ -59,7 +64,7 @@ def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
             try:
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                 pool.close()
-                _work(socket.socket(fileno=descriptors[0]), settings, start)
+                _work(socket.socket(fileno=descriptors[0]), settings, catalogue, loading)
             except Exception:
                 traceback.print_exc()
             finally:
@@ -73,38 +78,21 @@ def _tell_of_ended(pool: socket.socket) -> None:
             pool.send(ENDED.pack(*ended), socket.MSG_DONTWAIT)
 
 
-def _prepare(settings: Settings, load: Callable[[Settings], Any] | None) -> Callable[[], Any]:
-    """Import and load; returns what gives each worker its `answer`, facts of models and robots.
-
-    A GPU's context cannot be forked: with one, every worker loads the weights for itself.
-    """
-    from edgegrasp_service.worker import answer
-
-    load = load or answer.load_catalogue
-    catalogue = load(settings) if settings.device == "cpu" else None
-
-    def start() -> tuple[Any, list[dict[str, Any]], list[dict[str, Any]]]:
-        loaded = catalogue or load(settings)
-        robots = [robot.describe() for robot in answer.load_robots(settings).values()]
-        return (
-            partial(answer.answer, catalogue=loaded, settings=settings),
-            loaded.describe(),
-            robots,
-        )
-
-    return start
-
-
-def _work(pool: socket.socket, settings: Settings, start: Callable[[], Any]) -> None:
+def _work(
+    pool: socket.socket, settings: Settings, catalogue: Any, loading: Callable[[], Any]
+) -> None:
     """Answer jobs, one after the other, until the pool closes the socket."""
+    from edgegrasp_service.worker.answer import answer, load_robots
+
     try:
-        work, models, robots = start()
+        catalogue = catalogue or loading()
     except EdgeGraspError as error:
         _send(pool, Ready(os.getpid(), [], str(error)))
         return
+    robots = [robot.describe() for robot in load_robots(settings).values()]
     with limited_memory(settings.max_worker_bytes):
-        _send(pool, Ready(os.getpid(), models, robots=robots))
-        _answer_jobs(pool, work)
+        _send(pool, Ready(os.getpid(), catalogue.describe(), robots=robots))
+        _answer_jobs(pool, partial(answer, catalogue=catalogue, settings=settings))
 
 
 def _answer_jobs(pool: socket.socket, work: Callable[[Any], Answer]) -> None:
