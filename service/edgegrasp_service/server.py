@@ -26,7 +26,7 @@ from edgegrasp_service.front.connections import (
     trim_grpc,
 )
 from edgegrasp_service.front.grpc import GrpcServer
-from edgegrasp_service.front.http import HttpMiddleware, create_app
+from edgegrasp_service.front.http import HttpMiddleware, create_router
 from edgegrasp_service.front.service import GraspService, Observer, Reloader
 from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_logging, write_line
 from edgegrasp_service.recording import Recorder, check_outcomes
@@ -164,9 +164,9 @@ class Server:
 
     def _http_server(self, places: Places) -> "_HttpServer":
         tls = self._tls
-        app = create_app(self.service, self.metrics, self.reloader)
+        router = create_router(self.service, self.metrics, self.reloader)
         config = uvicorn.Config(
-            HttpMiddleware(app, self.service),
+            HttpMiddleware(router, self.service),
             log_config=None,
             access_log=False,
             lifespan="off",

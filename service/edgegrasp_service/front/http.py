@@ -3,6 +3,7 @@
 import asyncio
 import ipaddress
 import json
+import logging
 import math
 import re
 from collections.abc import Coroutine
@@ -10,12 +11,13 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse, PlainTextResponse, RedirectResponse, Response
-from fastapi_offline import FastAPIOffline
+from fastapi.encoders import jsonable_encoder
+from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.routing import Route
+from starlette.requests import Request
+from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, Router
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -34,6 +36,8 @@ from edgegrasp_service.front.connections import PAGE_GRACE_SECONDS, PAGES, Place
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
 from edgegrasp_service.worker.job import Answer, Job, Method
+
+logger = logging.getLogger(__name__)
 
 ASSETS = "/docs/assets"
 PLAYGROUND = "/playground/"
@@ -75,7 +79,7 @@ DOCUMENT = json.loads(Path(grasp_pb2.__file__).with_name("openapi.json").read_te
 
 
 class HttpMiddleware:
-    """ASGI middleware outside of everything else: request ids, tokens, limits of headers."""
+    """ASGI middleware around the routes: request ids, tokens, limits of headers, errors."""
 
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
@@ -115,17 +119,22 @@ class HttpMiddleware:
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
                 await send(message)
 
+            scope = {**scope, "app": self}  # with it, routing raises what is not there
             if scope["method"] == "HEAD":  # the protocol leaves the body out
-                scope = {**scope, "method": "GET"}
+                scope["method"] = "GET"
             try:
                 self._check(scope, call, headers)
                 async with self._pages.hold(call.client) if method == "Docs" else nullcontext():
                     await self._app(scope, receive_noting, send_named)
-            except EdgeGraspError as error:
-                if call.code:
-                    await _break_off(call, error, scope, receive)
+            except Exception as error:
+                if not isinstance(error, EdgeGraspError | HTTPException):
+                    logger.exception("%s failed", method)
+                if call.code:  # half an answer is none
+                    call.problem, call.code = report(error), ""
+                    scope["state"]["abort"]()
+                    await _gone(receive)
                 else:
-                    await _problem_response(call, report(error))(scope, receive, send_named)
+                    await _error_response(call, scope, error)(scope, receive, send_named)
 
     def _check(self, scope: Scope, call: Call, headers: dict[str, str]) -> None:
         size = sum(len(name) + len(value) for name, value in scope["headers"])
@@ -159,63 +168,60 @@ def is_address(name: str) -> bool:
         return False
 
 
-def create_app(service: GraspService, metrics: Metrics, reloader: Reloader) -> FastAPI:
-    """The application, without its middleware."""
+def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -> Router:
+    """The routes. Starlette alone: the document is written by hand, and bodies are for workers."""
     settings = service.settings
-    app: FastAPI = FastAPIOffline(
-        title="EdgeGrasp", redoc_url=None, static_url=ASSETS, redirect_slashes=False
-    )
-    app.openapi = lambda: DOCUMENT  # type: ignore[method-assign]
-    for kind in (EdgeGraspError, Exception):
-        app.add_exception_handler(kind, _answer_error)
-    app.add_exception_handler(HTTPException, _answer_http_error)
 
-    for path, method in WORK.items():
-        if method != "RecordOutcome" or settings.outcomes_file is not None:
-            app.router.routes.append(Route(path, _Work(service, method), methods=["POST"]))
-
-    @app.get("/v1/models")
-    async def list_models() -> Response:
+    async def list_models(request: Request) -> Response:
         return JSONResponse({"models": service.loaded().models})
 
-    @app.get("/v1/robots")
-    async def list_robots() -> Response:
+    async def list_robots(request: Request) -> Response:
         return JSONResponse({"robots": service.loaded().robots})
 
-    @app.post("/v1/models:reload")
-    async def reload() -> Response:
+    async def reload(request: Request) -> Response:
         return JSONResponse({"models": await reloader.reload(current_call())})
 
-    @app.get("/health/live")
-    async def live() -> Response:
-        return JSONResponse({"status": "live"})
-
-    @app.get("/health/ready")
-    async def ready() -> Response:
+    async def ready(request: Request) -> Response:
         status = "ready" if service.ready else "not ready"
         return JSONResponse({"status": status}, status_code=200 if service.ready else 503)
 
-    @app.get("/metrics")
     async def read_metrics(request: Request) -> Response:
         body, content_type = metrics.page(request.headers.get("accept", ""))
-        return PlainTextResponse(body, headers={"content-type": content_type})
+        return Response(body, headers={"content-type": content_type})
 
-    @app.get("/")
-    async def index() -> Response:
-        return RedirectResponse(PLAYGROUND if settings.playground else "/docs")
-
+    page = get_swagger_ui_html(
+        openapi_url="/openapi.json",
+        title="EdgeGrasp",
+        swagger_js_url=f"{ASSETS}/swagger-ui-bundle.js",
+        swagger_css_url=f"{ASSETS}/swagger-ui.css",
+        swagger_favicon_url=f"{ASSETS}/favicon.png",
+    )
+    index = RedirectResponse(PLAYGROUND if settings.playground else "/docs")
+    work = [path for path in WORK if path != "/v1/outcomes" or settings.outcomes_file is not None]
+    routes: list[BaseRoute] = [
+        *(Route(path, _Work(service, WORK[path]), methods=["POST"]) for path in work),
+        Route("/v1/models", list_models),
+        Route("/v1/robots", list_robots),
+        Route("/v1/models:reload", reload, methods=["POST"]),
+        Route("/health/live", JSONResponse({"status": "live"}), methods=["GET"]),
+        Route("/health/ready", ready),
+        Route("/metrics", read_metrics),
+        Route("/openapi.json", JSONResponse(DOCUMENT), methods=["GET"]),
+        Route("/docs", page, methods=["GET"]),
+        Route("/", index, methods=["GET"]),
+        Mount(ASSETS, StaticFiles(packages=[("fastapi_offline", "static")])),
+    ]
     if settings.playground:
-        grippers = {name: load_gripper(name) for name in gripper_names()}
-        grippers |= {file.stem: load_gripper(file) for file in settings.grippers}
-
-        @app.get(f"{PLAYGROUND}grippers.json")
-        async def show_grippers() -> dict[str, Any]:
-            return grippers
-
+        found = {name: load_gripper(name) for name in gripper_names()}
+        found |= {file.stem: load_gripper(file) for file in settings.grippers}
+        grippers = JSONResponse(jsonable_encoder(found))
         samples = settings.samples or PLAYGROUND_FILES / "samples"
-        app.mount(f"{PLAYGROUND}samples", StaticFiles(directory=samples))
-        app.mount(PLAYGROUND.rstrip("/"), StaticFiles(directory=PLAYGROUND_FILES, html=True))
-    return app
+        routes += [
+            Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]),
+            Mount(f"{PLAYGROUND}samples", StaticFiles(directory=samples)),
+            Mount(PLAYGROUND.rstrip("/"), StaticFiles(directory=PLAYGROUND_FILES, html=True)),
+        ]
+    return Router(routes, redirect_slashes=False)
 
 
 class _Work:
@@ -230,17 +236,11 @@ class _Work:
         service, call, headers = self._service, current_call(), Headers(scope=scope)
         call.limit(requested_timeout(headers))
         size = int(headers.get("content-length", service.settings.max_body_bytes))
-        try:
-            async with service.admit(call, size) as ticket:
-                job = self._read_job(scope, headers, receive)
-                answer = await _unless_gone(receive, service.answer(call, ticket, await job))
-                await connections.send(
-                    service.settings, _send_answer(call, answer, send), call.bytes_out
-                )
-        except EdgeGraspError as error:
-            if not call.code:
-                raise
-            await _break_off(call, error, scope, receive)
+        async with service.admit(call, size) as ticket:
+            job = self._read_job(scope, headers, receive)
+            answer = await _unless_gone(receive, service.answer(call, ticket, await job))
+            sending = _send_answer(call, answer, send)
+            await connections.send(service.settings, sending, call.bytes_out)
 
     async def _read_job(self, scope: Scope, headers: Headers, receive: Receive) -> Job:
         pieces: list[bytes] = []
@@ -269,13 +269,6 @@ async def _send_answer(call: Call, answer: Answer, send: Send) -> None:
     await send({**start, "headers": response.raw_headers})
     await send({"type": "http.response.body", "body": response.body, "more_body": True})
     await send({"type": "http.response.body"})
-
-
-async def _break_off(call: Call, error: EdgeGraspError, scope: Scope, receive: Receive) -> None:
-    """Close a connection whose client has half an answer, which is none."""
-    call.problem, call.code = report(error), ""
-    scope["state"]["abort"]()
-    await _gone(receive)
 
 
 async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> Answer:
@@ -321,15 +314,12 @@ def _problem_response(call: Call, problem: Problem) -> Response:
     return Response(document, problem.status, headers, "application/problem+json")
 
 
-async def _answer_error(request: Request, error: Exception) -> Response:
-    return _problem_response(current_call(), report(error))
-
-
-async def _answer_http_error(request: Request, error: Exception) -> Response:
-    """Errors of the routing itself: no such path, no such method."""
-    assert isinstance(error, HTTPException)
-    detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
+def _error_response(call: Call, scope: Scope, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        return _problem_response(call, report(error))
+    # Of the routing itself: no such path, no such method.
+    detail = f"{scope['method']} {scope['path']}: {error.detail}. See /docs."
     problem = Problem("http", detail, "", "", "", "", error.status_code)
-    response = _problem_response(current_call(), problem)
+    response = _problem_response(call, problem)
     response.headers.update(error.headers or {})
     return response
