@@ -160,6 +160,7 @@ class Running:
     calls: list[Call]  # that have ended, and had to do with grasps
     stop: asyncio.Event
     serving: "asyncio.Task[None]"
+    clients: list[Grpc | Rest] = dataclasses.field(default_factory=list)
 
     @property
     def ended(self) -> list[str]:
@@ -183,7 +184,9 @@ class Running:
         await self.until(lambda: not admission.tickets and not pool.busy)
 
     def connect(self, transport: str) -> "Grpc | Rest":
-        return Grpc(self.server) if transport == "grpc" else Rest(self.server)
+        """A client, until the test ends."""
+        self.clients.append(Grpc(self.server) if transport == "grpc" else Rest(self.server))
+        return self.clients[-1]
 
     def address(self, transport: str) -> str:
         return self.server.grpc_address if transport == "grpc" else self.server.http_url
@@ -255,6 +258,8 @@ async def begin(
 
     yield start
     for each in running:
+        for client in each.clients:
+            await client.close()
         each.stop.set()
         await asyncio.wait([each.serving])
 
@@ -279,20 +284,6 @@ def serve(begin: Serve) -> Serve:
 def transport(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name
-
-
-@pytest.fixture
-async def connect(transport: str) -> AsyncIterator[Callable[[Running], Grpc | Rest]]:
-    """A client of the transport that the test runs over."""
-    made: list[Grpc | Rest] = []
-
-    def make(running: Running) -> Grpc | Rest:
-        made.append(running.connect(transport))
-        return made[-1]
-
-    yield make
-    for each in made:
-        await each.close()
 
 
 @pytest.fixture

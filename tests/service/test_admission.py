@@ -185,9 +185,9 @@ async def test_one_slow_request_does_not_change_the_pace() -> None:
     await inside.leave()
 
 
-async def test_a_full_server_refuses_at_once(serve, connect, is_error, cloud) -> None:
+async def test_a_full_server_refuses_at_once(serve, transport, is_error, cloud) -> None:
     running = await serve(max_queue_length=1)
-    client = connect(running)
+    client = running.connect(transport)
     running.stages.shut("evaluate")
     accepted = [asyncio.create_task(client.detect(cloud))]
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
@@ -249,13 +249,12 @@ async def test_turns_come_in_order(serve, cloud) -> None:
         await running.until(lambda turn=turn: len(answered) == turn)
         stages.shut("evaluate")
     await asyncio.gather(*asked)
-    await client.close()
     assert answered == [0, 1, 2, 3]
 
 
-async def test_requests_over_a_bound(serve, connect, is_error, cloud) -> None:
+async def test_requests_over_a_bound(serve, transport, is_error, cloud) -> None:
     running = await serve(max_points=600, max_body_bytes=100_000)
-    client = connect(running)
+    client = running.connect(transport)
     within = {"num_approach_points": 256, "num_candidates": 16_000}
     assert (await client.detect(cloud, **within)).fine
     for option, most in within.items():

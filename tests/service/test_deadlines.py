@@ -7,10 +7,10 @@ import pytest
 
 
 async def test_a_request_that_expires_while_it_waits_is_never_computed(
-    serve, connect, is_error, cloud
+    serve, transport, is_error, cloud
 ) -> None:
     running = await serve()
-    client = connect(running)
+    client = running.connect(transport)
     running.stages.shut("evaluate")
     first = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
@@ -22,10 +22,10 @@ async def test_a_request_that_expires_while_it_waits_is_never_computed(
 
 
 async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
-    serve, connect, is_error, cloud
+    serve, transport, is_error, cloud
 ) -> None:
     running = await serve()
-    client, before = connect(running), running.server.pool.pids
+    client, before = running.connect(transport), running.server.pool.pids
     running.stages.fail("evaluate", "spin")
     assert is_error(await client.detect(cloud, timeout=0.3), "deadline-exceeded")
     assert (await client.detect(cloud)).fine
@@ -33,9 +33,11 @@ async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_the_worker_itself_stops_after_the_deadline(serve, connect, is_error, cloud) -> None:
+async def test_the_worker_itself_stops_after_the_deadline(
+    serve, transport, is_error, cloud
+) -> None:
     running = await serve()
-    client, before = connect(running), running.server.pool.pids
+    client, before = running.connect(transport), running.server.pool.pids
     running.stages.shut("prepare")
     assert is_error(await client.detect(cloud, timeout=0.2), "deadline-exceeded")
     running.stages.open("prepare")
@@ -44,9 +46,9 @@ async def test_the_worker_itself_stops_after_the_deadline(serve, connect, is_err
     assert running.server.pool.pids == before
 
 
-async def test_a_request_whose_client_left_frees_its_worker(serve, connect, cloud) -> None:
+async def test_a_request_whose_client_left_frees_its_worker(serve, transport, cloud) -> None:
     running = await serve()
-    client = connect(running)
+    client = running.connect(transport)
     running.stages.shut("evaluate")
     asked = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
@@ -57,9 +59,11 @@ async def test_a_request_whose_client_left_frees_its_worker(serve, connect, clou
     assert (await running.connect("grpc").detect(cloud)).fine
 
 
-async def test_a_client_that_left_while_it_waited_is_never_computed(serve, connect, cloud) -> None:
+async def test_a_client_that_left_while_it_waited_is_never_computed(
+    serve, transport, cloud
+) -> None:
     running = await serve()
-    client = connect(running)
+    client = running.connect(transport)
     running.stages.shut("evaluate")
     first = asyncio.create_task(client.detect(cloud))
     await running.until(lambda: running.stages.begun["evaluate"] == 1)
@@ -74,11 +78,11 @@ async def test_a_client_that_left_while_it_waited_is_never_computed(serve, conne
 
 
 async def test_the_servers_own_limit_holds_without_a_deadline(
-    serve, connect, is_error, cloud
+    serve, transport, is_error, cloud
 ) -> None:
     running = await serve(max_request_seconds=0.2)
     running.stages.shut("evaluate")
-    assert is_error(await connect(running).detect(cloud), "deadline-exceeded")
+    assert is_error(await running.connect(transport).detect(cloud), "deadline-exceeded")
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])

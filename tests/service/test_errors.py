@@ -63,7 +63,6 @@ async def test_every_error_of_the_table(serve, cloud) -> None:
     running.stages.folder.joinpath("fault-prepare").unlink(missing_ok=True)
     client = running.connect("grpc")
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 def check_google_details(data: bytes, ours: grasp_pb2.ErrorDetail) -> None:

@@ -98,7 +98,6 @@ async def test_messages_that_never_end(serve, cloud) -> None:
     await running.until_idle()
     client = running.connect("grpc")
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 class Http2:
@@ -222,7 +221,6 @@ async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transpor
         slow = grpc.StatusCode.DEADLINE_EXCEEDED if transport == "grpc" else b"HTTP/1.1 408"
         assert all(each is slow if transport == "grpc" else each.startswith(slow) for each in told)
         assert (await client.detect(cloud)).fine
-        await client.close()
     for writer in writers:
         writer.close()
 
@@ -309,7 +307,6 @@ async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> No
     async with asyncio.timeout(PATIENCE):
         while not (await client.detect(cloud)).fine:
             await asyncio.sleep(0.1)
-    await client.close()
     for connection in held:
         connection.close()
 
@@ -367,7 +364,6 @@ async def test_errors_in_a_stream_that_is_left_open_hold_up_nobody(serve, cloud)
         assert (await client.http.get("/health/live")).status_code == 200
         assert (await client.detect(cloud)).fine
         stream.cancel()
-    await client.close()
 
 
 async def test_silent_streams_give_their_places_to_others(serve, cloud, monkeypatch) -> None:

@@ -90,9 +90,9 @@ async def test_a_taken_port_is_named(begin, name: str) -> None:
             await running.serving
 
 
-async def test_while_draining_both_transports_say_so(serve, connect, cloud) -> None:
+async def test_while_draining_both_transports_say_so(serve, transport, cloud) -> None:
     running = await serve()
-    client, server = connect(running), running.server
+    client, server = running.connect(transport), running.server
     async with (
         httpx.AsyncClient(base_url=server.http_url, timeout=PATIENCE) as http,
         aio.insecure_channel(server.grpc_address) as channel,
@@ -121,10 +121,10 @@ async def test_while_draining_both_transports_say_so(serve, connect, cloud) -> N
         httpx.get(f"{server.http_url}/health/live")
 
 
-async def test_when_grace_is_over_callers_are_told(serve, connect, is_error, cloud) -> None:
+async def test_when_grace_is_over_callers_are_told(serve, transport, is_error, cloud) -> None:
     running = await serve(grace_seconds=0.2)
     running.stages.shut("finish")
-    asked = asyncio.create_task(connect(running).detect(cloud))
+    asked = asyncio.create_task(running.connect(transport).detect(cloud))
     await running.until(lambda: running.stages.begun["finish"] == 1)
     running.stop.set()
     assert is_error(await asked, "not-ready")

@@ -16,10 +16,10 @@ def grown(running) -> int:
 
 @pytest.mark.parametrize("fault", ["kill", "eat"])
 async def test_a_worker_that_dies_fails_its_own_request_only(
-    serve, connect, is_error, cloud, fault: str
+    serve, transport, is_error, cloud, fault: str
 ) -> None:
     running = await serve(max_worker_bytes=2**28)
-    client, before = connect(running), running.server.pool.pids
+    client, before = running.connect(transport), running.server.pool.pids
     running.stages.fail("evaluate", fault)
     assert is_error(await client.detect(cloud), "worker-lost")
     assert (await client.detect(cloud)).fine
@@ -28,11 +28,11 @@ async def test_a_worker_that_dies_fails_its_own_request_only(
 
 
 async def test_a_request_that_workers_die_of_is_not_tried_again(
-    serve, connect, is_error, cloud
+    serve, transport, is_error, cloud
 ) -> None:
     """A crash is enough; a worker that was killed may have been killed for something else."""
     running = await serve()
-    client = connect(running)
+    client = running.connect(transport)
     running.stages.fail("evaluate", "crash")
     for _ in range(3):
         assert is_error(await client.detect(cloud), "harmful-request")
@@ -55,7 +55,6 @@ async def test_a_nursery_that_is_stopped_is_replaced(serve, cloud, monkeypatch) 
     await running.until(lambda: running.server.service.ready)
     assert pool._nursery.pid != nursery
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 async def test_a_worker_that_is_stopped_is_replaced(serve, monkeypatch) -> None:
@@ -92,7 +91,6 @@ async def test_workers_killed_under_load(serve, cloud) -> None:
     await asyncio.gather(*asking)
     assert set(outcomes) <= {"", "worker-lost"}
     assert outcomes["worker-lost"] <= 4
-    await client.close()
 
 
 async def test_an_idle_worker_that_dies_is_replaced(serve, cloud) -> None:
@@ -102,7 +100,6 @@ async def test_an_idle_worker_that_dies_is_replaced(serve, cloud) -> None:
     await running.until(lambda: running.server.pool.pids not in ([], [before]))
     client = running.connect("grpc")
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
@@ -115,7 +112,6 @@ async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
     os.kill(pool.pids[0], signal.SIGKILL)
     await running.until(lambda: grown(running) == 0)
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 async def test_workers_end_with_the_server(serve) -> None:

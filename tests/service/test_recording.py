@@ -26,10 +26,10 @@ def npy(cloud: np.ndarray) -> bytes:
 
 
 async def test_recorded_requests_are_replayed(
-    serve, connect, cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    serve, transport, cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = await serve(record_folder=tmp_path / "recorded")
-    client = connect(running)
+    client = running.connect(transport)
     assert (await client.detect(cloud, seed=3)).fine
     assert not (await client.detect(cloud[:0])).fine
     running.stop.set()
@@ -70,7 +70,6 @@ async def test_what_is_there_already_counts_and_is_looked_at_once(
     running = await serve(record_folder=tmp_path, record_bytes=2**20)
     client = running.connect("rest")
     assert (await client.detect(cloud)).fine
-    await client.close()
     running.stop.set()
     await running.serving
     kept = sorted(path.name for path in tmp_path.glob("*.job"))

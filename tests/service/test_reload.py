@@ -155,7 +155,6 @@ async def test_what_was_begun_with_the_old_weights_ends_with_them(serve, cloud) 
     running.stages.open("finish")
     assert (await asked).fine
     assert (await client.detect(cloud)).fine
-    await client.close()
 
 
 async def test_tokens_are_read_anew(serve, tmp_path: Path, transport: str) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from benchmarks.dummy import DummyCatalogue
 
-from edgegrasp_model.results import Pace
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
 from edgegrasp_service.worker.job import Answer, Job, pack, receive
@@ -59,16 +58,6 @@ def test_the_deadline_is_kept_between_stages(points: np.ndarray) -> None:
     passed = answer(job(points, remaining=-1.0), DummyCatalogue(), Settings())
     assert passed.error is not None
     assert passed.facts.seconds == {}
-
-
-def test_what_cannot_be_done_in_time_is_refused_before_the_work(points: np.ndarray) -> None:
-    catalogue = DummyCatalogue()
-    catalogue.pace = Pace(point=1.0)  # a second each
-    late = answer(job(points, remaining=10.0), catalogue, Settings())
-    assert late.error is not None
-    assert late.error.kind == "deadline-exceeded"
-    assert "60 points take longer than the deadline allows" in late.error.detail
-    assert list(late.facts.seconds) == ["decode"]
 
 
 def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
