@@ -16,7 +16,6 @@ from edgegrasp_service.worker.job import Answer, Job, pack
 
 logger = logging.getLogger(__name__)
 
-
 MAX_LINE = 4096  # bytes of an outcome, and more
 MAX_OUTCOMES = 64 * 2**20  # bytes at which their file takes no more
 

@@ -87,11 +87,9 @@ class GraspService:
         self.in_flight += 1
         try:
             yield
-        except Exception as error:
-            call.problem = call.problem or report(error)
-            raise
-        except BaseException:
-            call.problem = call.problem or report(Cancelled("The caller cancelled the request."))
+        except BaseException as error:
+            gone = Cancelled("The caller cancelled the request.")
+            call.problem = call.problem or report(error if isinstance(error, Exception) else gone)
             raise
         finally:
             self.in_flight -= 1
@@ -195,37 +193,31 @@ class HarmfulRequests:
 
     async def check(self, job: Job) -> None:
         """Raise HarmfulRequest for a request that is not to be tried again."""
-        if self._deaths and (await self._of(job))[1] >= MOST_DEATHS:
-            raise HarmfulRequest("request", CRASHED, CRASH_FIX)
+        if self._deaths:
+            until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
+            if deaths >= MOST_DEATHS and time.monotonic() < until:
+                raise HarmfulRequest("request", CRASHED, CRASH_FIX)
 
     async def note(self, job: Job, deaths: int) -> None:
         """A request ended a worker; one that was killed counts less than one that crashed."""
-        _, before = await self._of(job)
-        until = time.monotonic() + HARMFUL_SECONDS
-        self._deaths[await _digest(job)] = until, before + deaths
-        while len(self._deaths) > MOST_HARMFUL:
+        digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
+        until, before = self._deaths.pop(digest, (0.0, 0))
+        self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
+        if len(self._deaths) > MOST_HARMFUL:
             del self._deaths[next(iter(self._deaths))]
 
     async def forget(self, job: Job) -> None:
         """A request was answered: what killed its worker before was something else."""
         if self._deaths:
-            self._deaths.pop(await _digest(job), None)
-
-    async def _of(self, job: Job) -> tuple[float, int]:
-        until, deaths = self._deaths.get(await _digest(job), (0.0, 0))
-        return (until, deaths) if time.monotonic() < until else (0.0, 0)
+            self._deaths.pop(await asyncio.to_thread(_digest, job), None)
 
 
-async def _digest(job: Job) -> bytes:
-    """Of all that a worker would see of a request; in a thread, for a body may be large."""
+def _digest(job: Job) -> bytes:
+    """Of all that a worker would see of a request; for a thread: a body may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
-
-    def compute() -> bytes:
-        digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
-        digest.update(job.body)
-        return digest.digest()
-
-    return await asyncio.to_thread(compute)
+    digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
+    digest.update(job.body)
+    return digest.digest()
 
 
 class Reloader:

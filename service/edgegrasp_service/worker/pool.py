@@ -141,8 +141,8 @@ class WorkerPool:
 
     async def _tend(self, worker: "_Worker") -> None:
         """Give a worker jobs until it dies, and start another in its place then."""
+        usable, lost = True, False
         try:
-            usable = True
             while True:
                 if worker not in self._workers:
                     worker.close()  # there are newer ones
@@ -150,6 +150,8 @@ class WorkerPool:
                     self._idle.put_nowait(worker)
                 answer = await worker.receive()
                 if answer is None:
+                    lost = worker in self._workers
+                    self._workers.discard(worker)  # nobody else takes it
                     if await worker.nursery.crashed(worker.pid):
                         worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
                     break
@@ -161,9 +163,8 @@ class WorkerPool:
         finally:
             worker.finish(WorkerLost(LOST))
             worker.close()
-        if worker in self._workers:
+        if lost:
             logger.warning("worker %d died and is replaced", worker.pid)
-            self._workers.discard(worker)
             self._replaced()
             await self._until_done(worker.nursery, lambda: self._replace(worker.nursery))
 
