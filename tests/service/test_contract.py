@@ -13,22 +13,13 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from PIL import Image
+from tests.cloud_files import npy, npz, xyz
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
-from edgegrasp_client.clouds import npy_bytes
 from edgegrasp_service.front.http import DOCUMENT
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
-
-
-def files_of(cloud: np.ndarray) -> dict[str, bytes]:
-    """Each format by itself: test_formats.py."""
-    npy, npz = io.BytesIO(), io.BytesIO()
-    np.save(npy, cloud)
-    np.savez_compressed(npz, points=cloud)
-    xyz = "\n".join(f"{x!r} {y!r} {z!r}" for x, y, z in cloud.tolist()).encode()
-    return {"npy": npy.getvalue(), "npz": npz.getvalue(), "xyz": xyz}
 
 
 def grasps_of(answer: Any) -> list[dict[str, Any]]:
@@ -66,7 +57,8 @@ def test_every_way_in_gives_the_same_grasps(cloud: np.ndarray, channel, http) ->
     text = json.dumps(OPTIONS)
     posted: list[dict[str, Any]] = [{"json": {"points": cloud.tolist(), "options": OPTIONS}}]
     messages = [{"points": cloud.tobytes()}]
-    for file_format, data in files_of(cloud).items():
+    files = {"npy": npy(cloud), "npz": npz(points=cloud), "xyz": xyz(cloud)}
+    for file_format, data in files.items():
         media_type = f"application/x-{file_format}"
         messages.append({"encoded": {"format": file_format, "data": data}})
         posted += [
@@ -102,8 +94,8 @@ def test_a_form_of_camera_files(http) -> None:
     expected = http.post("/v1/grasps", json={"depth_images": [image]}).json()
     labels = (depth > 5000).astype(np.uint8)
     png = {"depth": ("depth.png", png_of(depth)), "segment_ids": ("labels.png", png_of(labels))}
-    npy = {"depth": ("depth.npy", npy_bytes(depth))}
-    for files, text in ((png, "60,50,15.5,11.5"), (npy, json.dumps(nested))):
+    array = {"depth": ("depth.npy", npy(depth))}
+    for files, text in ((png, "60,50,15.5,11.5"), (array, json.dumps(nested))):
         parts = {"intrinsics": text, "depth_scale": "0.0001"}
         answer = http.post("/v1/grasps", files=files, data=parts)
         assert answer.status_code == 200, answer.text

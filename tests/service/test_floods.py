@@ -20,10 +20,10 @@ import pytest
 from benchmarks.soak import connect, http2_frame, http2_headers, http2_opening
 from grpc import aio
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from tests.cloud_files import npy
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
-from edgegrasp_client.clouds import npy_bytes
 from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
 
 PATIENCE = 30
@@ -233,7 +233,7 @@ async def test_answers_that_nobody_takes_are_given_up(serve, cloud, transport: s
     with contextlib.ExitStack() as stack:
         if transport == "rest":
             connection = stack.enter_context(connect(running.server.http_url))
-            body = npy_bytes(crowd)
+            body = npy(crowd)
             head = (
                 HEAD.replace(" HTTP", "?debug=true HTTP") + f"Content-Length: {len(body)}\r\n\r\n"
             )
@@ -275,7 +275,7 @@ async def test_connections_beyond_the_bound_end_the_oldest_idle_ones(serve) -> N
 async def test_health_is_answered_while_every_connection_has_a_request(serve, cloud) -> None:
     running = await serve(max_connections=2, workers=1)
     running.stages.shut("evaluate")
-    url, body = running.server.http_url, npy_bytes(cloud)
+    url, body = running.server.http_url, npy(cloud)
     async with httpx.AsyncClient(base_url=url, timeout=PATIENCE) as http:
         kind = {"content-type": "application/x-npy"}
 

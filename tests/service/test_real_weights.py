@@ -1,6 +1,5 @@
 """A real network behind the server: every way in gives the detector's own grasps."""
 
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.cloud_files import npy
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
@@ -177,10 +177,9 @@ def test_clouds_that_take_too_long_are_refused(
     catalogue: ModelCatalogue, monkeypatch: pytest.MonkeyPatch, pace: Pace, kind: str, named: str
 ) -> None:
     monkeypatch.setattr(catalogue, "pace", pace)
-    room, file = np.random.default_rng(0).random((50_000, 3), np.float32) * 4, io.BytesIO()
-    np.save(file, room)
+    room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
     whole = "objects=off&support=null"
-    job = Job("DetectGrasps", "http", file.getvalue(), 60.0, "application/x-npy", whole)
+    job = Job("DetectGrasps", "http", npy(room), 60.0, "application/x-npy", whole)
     error = answer(job, catalogue, Settings(max_voxels=20_000)).error
     assert error is not None
     assert error.kind == kind

@@ -8,9 +8,9 @@ import httpx
 import numpy as np
 import pytest
 from benchmarks.dummy import DummyCatalogue
+from tests.cloud_files import npy
 
 from edgegrasp_cli.replay import answer_again
-from edgegrasp_client.clouds import npy_bytes
 from edgegrasp_service.errors import InvalidSettings
 from edgegrasp_service.front.admission import Admission
 from edgegrasp_service.recording import Recorder
@@ -43,7 +43,7 @@ async def test_recorded_requests_are_replayed(
 
 async def test_the_oldest_are_deleted(serve, cloud, tmp_path: Path) -> None:
     running = await serve(record_folder=tmp_path / "recorded", record_bytes=2**20)
-    body = npy_bytes(np.tile(cloud, (60, 1)))  # 360 kB
+    body = npy(np.tile(cloud, (60, 1)))  # 360 kB
     headers = {"content-type": "application/x-npy"}
     async with httpx.AsyncClient(base_url=running.server.http_url, headers=headers) as http:
         for number in range(5):

@@ -1,7 +1,6 @@
 """Bad requests: each gets an error that names field, value and fix, the same on both transports."""
 
 import base64
-import io
 import json
 import tracemalloc
 from dataclasses import dataclass, field
@@ -9,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cloud_files import npy
 
 from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client.grpc_wire import fill
@@ -286,12 +286,6 @@ def test_the_shortest_points_and_edges_there_are(rest: RestAsker) -> None:
     edges = b",".join([b"[0,1]"] * 4_000)
     for beside, score in ((b"", False), (b',"edges":[' + edges + b"]", True)):
         assert rest.send(b'{"points":[' + points + b"]" + beside + b"}", score).error is None
-
-
-def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, array)
-    return stream.getvalue()
 
 
 @pytest.mark.parametrize("media_type", ["", "text/plain", "application/x-las"])
