@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
+from dataclasses import replace
 from typing import Any
 
 from edgegrasp_model.errors import EdgeGraspError
@@ -139,6 +140,7 @@ class GraspService:
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
         ticket.whole = True
+        job = replace(job, request_id=call.request_id)
         await self._harmful.check(job)
         worker = await self.pool.take()
         call.end_stage("wait")
