@@ -6,8 +6,8 @@ import json
 import logging
 import math
 import re
-from collections.abc import Coroutine
-from contextlib import nullcontext
+from collections.abc import AsyncIterator, Coroutine
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ class HttpMiddleware:
     def __init__(self, app: ASGIApp, service: GraspService) -> None:
         self._app = app
         self._service = service
-        self._pages = Places(PAGES, PAGE_GRACE_SECONDS)
+        self._pages, self._page_begins = Places(PAGES, PAGE_GRACE_SECONDS), asyncio.Lock()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or refuse it."""
@@ -124,7 +124,7 @@ class HttpMiddleware:
                 scope["method"] = "GET"
             try:
                 self._check(scope, call, headers)
-                async with self._pages.hold(call.client) if method == "Docs" else nullcontext():
+                async with self._page(call.client) if method == "Docs" else nullcontext():
                     await self._app(scope, receive_noting, send_named)
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
@@ -135,6 +135,14 @@ class HttpMiddleware:
                     await _gone(receive)
                 else:
                     await _error_response(call, scope, error)(scope, receive, send_named)
+
+    @asynccontextmanager
+    async def _page(self, client: str) -> AsyncIterator[None]:
+        """Answer a page: one begins in a turn of the event loop, however many come at once."""
+        async with self._page_begins:
+            await asyncio.sleep(0)
+        async with self._pages.hold(client):
+            yield
 
     def _check(self, scope: Scope, call: Call, headers: dict[str, str]) -> None:
         size = sum(len(name) + len(value) for name, value in scope["headers"])
