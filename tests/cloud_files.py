@@ -1,10 +1,15 @@
-"""Clouds as the bytes of files, written plainly: what readers are tested with."""
+"""Clouds as files and as PointCloud2, written plainly: what readers are tested with."""
 
 import io
 import struct
+from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 
+from edgegrasp_camera.clouds import POINT_TYPES
+
+CODES = {kind: code for code, kind in POINT_TYPES.items()}
 PLY = {"binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -65,3 +70,29 @@ def lzf_literals(plain: bytes) -> bytes:
 def xyz(points: np.ndarray) -> bytes:
     rows = [f"{x!r} {y!r}\t{z!r}" for x, y, z in points.astype(float).tolist()]
     return ("# x y z\n\n" + "\n".join(rows) + "\n").encode()
+
+
+def point_cloud2(points: np.ndarray, padding: int = 0, big: bool = False) -> dict[str, Any]:
+    """The fields of a sensor_msgs/PointCloud2, with bytes after every row of points.
+
+    Points are (N, 3) or (H, W, 3), or a structured array (H, W) of whatever fields.
+    """
+    rows = points
+    if rows.dtype.names is None:
+        kind = [(axis, rows.dtype) for axis in "xyz"]
+        rows = np.atleast_2d(unstructured_to_structured(rows, np.dtype(kind)))
+    record = rows.dtype.newbyteorder(">" if big else "<")
+    fields = [
+        {
+            "name": name,
+            "offset": int(record.fields[name][1]),
+            "datatype": CODES[rows.dtype[name].base.str[1:]],
+            "count": int(np.prod(rows.dtype[name].shape, dtype=int)),
+        }
+        for name in record.names
+    ]
+    height, width = rows.shape
+    size = {"height": height, "width": width, "point_step": record.itemsize}
+    data = b"".join(row.astype(record).tobytes() + bytes(padding) for row in rows)
+    layout = {"is_bigendian": big, "row_step": width * record.itemsize + padding, "data": data}
+    return size | {"fields": fields} | layout

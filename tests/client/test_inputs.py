@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cloud_files import point_cloud2
 
 from edgegrasp_client import InvalidRequestError
 from edgegrasp_client.results import Detection
@@ -15,22 +16,11 @@ def contacts(detection: Detection) -> list[list[float]]:
     return [grasp.contact_point.tolist() for grasp in detection.grasps]
 
 
-def ros_message(cloud: np.ndarray, data: Any = None) -> SimpleNamespace:
-    fields = [
-        SimpleNamespace(name=name, offset=4 * row, datatype=7, count=1)
-        for row, name in enumerate("xyz")
-    ]
-    height, width = cloud.shape[:-1] if cloud.ndim == 3 else (1, len(cloud))
+def ros_message(cloud: np.ndarray, **changes: Any) -> SimpleNamespace:
+    layout = point_cloud2(cloud)
+    fields = [SimpleNamespace(**field) for field in layout["fields"]]
     return SimpleNamespace(
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=False,
-        point_step=12,
-        row_step=12 * width,
-        data=cloud.tobytes() if data is None else data,
-        is_dense=True,
-        header=None,
+        **layout | {"fields": fields, "is_dense": True, "header": None} | changes
     )
 
 
@@ -62,10 +52,10 @@ def test_organised_clouds_may_have_holes(client, cloud) -> None:
 def test_point_cloud2_messages_are_sent_as_they_are(client, cloud) -> None:
     expected = contacts(client.detect(cloud))
     assert contacts(client.detect(ros_message(cloud))) == expected
-    listed = ros_message(cloud, list(cloud.tobytes()))
+    listed = ros_message(cloud, data=list(cloud.tobytes()))
     assert contacts(client.detect(listed)) == expected
     assert contacts(client.detect(ros_message(cloud.reshape(20, 25, 3)))) == expected
-    short = ros_message(cloud, b"")
+    short = ros_message(cloud, data=b"")
     with pytest.raises(InvalidRequestError) as caught:
         client.detect(short)
     assert caught.value.field == "point_cloud2.data"

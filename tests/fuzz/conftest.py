@@ -10,7 +10,7 @@ from typing import Any
 import hypothesis
 import numpy as np
 from hypothesis import strategies as st
-from tests.cloud_files import npy, npz, pcd, ply, xyz
+from tests.cloud_files import npy, npz, pcd, ply, point_cloud2, xyz
 
 given = hypothesis.given  # `make fuzz` sets the profile with many examples
 
@@ -148,14 +148,7 @@ DEPTH_IMAGE = {
     "T_cloud_camera": np.eye(4).tolist(),
 }  # fmt: skip
 DEPTH_ROWS = DEPTH_IMAGE | {"depth": np.full((5, 8), 0.4).tolist()}
-POINT_CLOUD2 = {
-    "height": 1, "width": 40, "is_bigendian": False, "point_step": 12, "row_step": 480,
-    "fields": [
-        {"name": name, "offset": 4 * row, "datatype": 7, "count": 1}
-        for row, name in enumerate("xyz")
-    ],
-    "data": POINTS.tobytes(),
-}  # fmt: skip
+POINT_CLOUD2 = point_cloud2(POINTS)
 
 
 @contextmanager

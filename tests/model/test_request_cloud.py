@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.cloud_files import point_cloud2
 
-from edgegrasp_camera.clouds import POINT_TYPES, CloudInput, read_point_cloud2
+from edgegrasp_camera.clouds import CloudInput, read_point_cloud2
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import (
@@ -178,35 +179,6 @@ def read(fields: dict[str, Any]) -> CloudInput:
     return read_point_cloud2(parse(PointCloud2, fields, "point_cloud2"), MANY)
 
 
-CODES = {kind: code for code, kind in POINT_TYPES.items()}
-
-
-def layout(rows: np.ndarray, padding: int = 0, big: bool = False) -> dict[str, Any]:
-    """A structured array (H, W) as a PointCloud2, with bytes after every row of points."""
-    record = rows.dtype.newbyteorder(">" if big else "<")
-    data = b"".join(row.astype(record).tobytes() + bytes(padding) for row in rows)
-    fields = [
-        {
-            "name": name,
-            "offset": int(record.fields[name][1]),
-            "datatype": CODES[rows.dtype[name].base.str[1:]],
-            "count": int(np.prod(rows.dtype[name].shape, dtype=int)),
-        }
-        for name in record.names
-    ]
-    height, width = rows.shape
-    step = record.itemsize
-    return {
-        "height": height,
-        "width": width,
-        "fields": fields,
-        "is_bigendian": big,
-        "point_step": step,
-        "row_step": width * step + padding,
-        "data": data,
-    }
-
-
 def cloud_of(shape: tuple[int, int], kind: str = "f4", extra: tuple[Any, ...] = ()) -> np.ndarray:
     names = [("x", kind), ("intensity", "u2"), ("y", kind), ("z", kind), ("ring", "u1", 3), *extra]
     rows = np.zeros(shape, np.dtype(names, align=True))
@@ -232,7 +204,7 @@ def xyz(rows: np.ndarray, names: tuple[str, ...] = ("x", "y", "z")) -> np.ndarra
 )
 def test_every_layout_gives_the_points(height, width, padding, big, kind, text) -> None:
     rows = cloud_of((height, width), kind)
-    fields = layout(rows, padding, big)
+    fields = point_cloud2(rows, padding, big)
     if text:
         fields["data"] = base64.b64encode(fields["data"]).decode()
     cloud = read(fields)
@@ -249,7 +221,7 @@ def test_normals_and_colours(kind: str) -> None:
     packed = np.arange(12, dtype=np.uint32).reshape(3, 4) + 0x112200
     rows["rgb"] = packed.view(kind)
     for big in (False, True):
-        cloud = read(layout(rows, big=big))
+        cloud = read(point_cloud2(rows, big=big))
         np.testing.assert_array_equal(cloud.normals, xyz(rows, names))
         np.testing.assert_array_equal(cloud.colors[0, 2], [0x11, 0x22, 0x02])
 
@@ -257,7 +229,7 @@ def test_normals_and_colours(kind: str) -> None:
 # NumPy adds the size to this offset in 32 bits: it read 2 GB behind the data.
 FAR_FIELDS = [
     field | ({"offset": 2**31 - 4} if field["name"] == "z" else {})
-    for field in layout(cloud_of((1, 4)))["fields"]
+    for field in point_cloud2(cloud_of((1, 4)))["fields"]
 ]
 
 
@@ -272,14 +244,14 @@ FAR_FIELDS = [
         ({"row_step": 2**30, "height": 1000}, "point_cloud2.data"),
         ({"point_step": 0}, "point_cloud2.fields"),
         ({"row_step": 1}, "point_cloud2.row_step"),
-        ({"fields": layout(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields"),
+        ({"fields": point_cloud2(cloud_of((1, 4)))["fields"] * 2}, "point_cloud2.fields"),
         ({"height": -1}, "point_cloud2.height"),
         ({"fields": FAR_FIELDS}, "point_cloud2.fields"),
     ],
 )
 def test_bad_layouts_are_refused_by_field(changes: dict[str, Any], field: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        read(layout(cloud_of((1, 4))) | changes)
+        read(point_cloud2(cloud_of((1, 4))) | changes)
     assert caught.value.field == field
     assert caught.value.fix
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cloud_files import point_cloud2
 
 from edgegrasp_bridge import bridge
 from edgegrasp_bridge.bridge import Inbox, Scene, Settings
@@ -42,30 +43,14 @@ def client(dummy_server) -> Iterator[GraspClient]:
 @pytest.fixture
 def make_cloud(sent) -> Callable[..., Any]:
     def make_cloud(points: np.ndarray, frame_id: str = "camera", bigendian: bool = False) -> Any:
-        """x, y, z and a colour in 20 bytes, rows padded to 4 more."""
-        rows = points.reshape(-1, *points.shape[-2:])
-        order = ">" if bigendian else "<"
-        data = np.zeros((rows.shape[0], rows.shape[1] * 20 + 4), np.uint8)
-        table = np.zeros((*rows.shape[:2], 5), f"{order}f4")
-        table[..., :3] = rows
-        data[:, : rows.shape[1] * 20] = table.view(np.uint8).reshape(rows.shape[0], -1)
-        fields = [
-            {"name": name, "offset": 4 * number, "datatype": 7, "count": 1}
-            for number, name in enumerate(("x", "y", "z", "rgb"))
-        ]
-        return sent(
-            "sensor_msgs/msg/PointCloud2",
-            {
-                "header": HEADER | {"frame_id": frame_id},
-                "height": rows.shape[0],
-                "width": rows.shape[1],
-                "fields": fields,
-                "is_bigendian": bigendian,
-                "point_step": 20,
-                "row_step": data.shape[1],
-                "data": data.ravel(),
-            },
-        )
+        """x, y, z and a colour in 20 bytes, rows padded by 4 more."""
+        kind = np.dtype([*((name, "f4") for name in ("x", "y", "z", "rgb")), ("more", "u4")])
+        rows = np.zeros(points.shape[:-1], kind)
+        rows["x"], rows["y"], rows["z"] = np.moveaxis(points, -1, 0)
+        layout = point_cloud2(np.atleast_2d(rows), padding=4, big=bigendian)
+        layout["data"] = np.frombuffer(layout["data"], np.uint8)
+        header = HEADER | {"frame_id": frame_id}
+        return sent("sensor_msgs/msg/PointCloud2", layout | {"header": header})
 
     return make_cloud
 
