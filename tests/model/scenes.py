@@ -13,6 +13,8 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.balls import BallBatch, nearest_in_ball
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
+from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
+from edgegrasp_model.scene.scene import Scene
 
 SEED = 2**32 - 1  # the greatest
 PANDA = load_gripper("panda")
@@ -53,6 +55,22 @@ def box_on_table(count: int = 2000, table: bool = False) -> np.ndarray:
         flat = np.stack([u * 0.5, v * 0.5, np.zeros(count)], axis=1)
         points = np.concatenate([points, flat])
     return (points + rng.normal(0, 0.0003, points.shape)).astype(np.float32)
+
+
+def scene_of(points: np.ndarray, **fields: object) -> Scene:
+    """A scene of one object's points (N, 3) float32, as they are sent: no plane, no obstacles."""
+    every = np.ones(len(points), dtype=bool)
+    plain = {"support": None, "obstacles": None} | fields
+    return Scene(
+        frame=CanonicalFrame(np.eye(4)),
+        cloud=Cloud(points, points),
+        points_in_cloud=points,
+        point_of_row=np.arange(len(points)),
+        approach_allowed=every,
+        contact_allowed=every,
+        object_of_point=np.zeros(len(points), dtype=np.int64),
+        **plain,
+    )
 
 
 def random_hands(count: int, seed: int, reach: float = 0.2) -> np.ndarray:

@@ -15,7 +15,7 @@ from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.scene import Scene
 
-from .scenes import PANDA
+from .scenes import PANDA, scene_of
 
 HAND = np.eye(4, dtype=np.float32)[None]
 POSES = 600
@@ -54,19 +54,9 @@ def test_a_point_hits_the_hand_or_its_way(point: tuple[float, float, float], hit
 
 
 def scene() -> Scene:
-    everywhere = np.ones(len(POINTS), dtype=bool)
-    frame = CanonicalFrame(np.eye(4))
-    return Scene(
-        frame=frame,
-        cloud=Cloud(POINTS, POINTS),
-        points_in_cloud=POINTS,
-        point_of_row=np.arange(len(POINTS)),
-        approach_allowed=everywhere,
-        contact_allowed=everywhere,
-        object_of_point=np.zeros(len(POINTS), dtype=np.int64),
-        support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=FLOOR),
-        obstacles=SolidBoxes.from_shapes([WALL], frame),
-    )
+    obstacles = SolidBoxes.from_shapes([WALL], CanonicalFrame(np.eye(4)))
+    support = SupportPlane(normal=(0.0, 0.0, 1.0), offset=FLOOR)
+    return scene_of(POINTS, support=support, obstacles=obstacles)
 
 
 def hands_about_the_points(count: int, seed: int) -> np.ndarray:
@@ -132,19 +122,8 @@ def bullet_scene() -> BulletScene:
 def test_a_palm_in_space_that_no_camera_saw_counts_as_colliding(camera, blocked) -> None:
     y, z = np.meshgrid(np.arange(-0.2, 0.2, 0.004), np.arange(-0.2, 0.3, 0.004))
     plate = np.stack([np.full_like(y, -0.1), y, z], axis=-1).reshape(-1, 3).astype(np.float32)
-    every = np.ones(len(plate), dtype=bool)
-    behind = Scene(
-        frame=CanonicalFrame(np.eye(4)),
-        cloud=Cloud(plate, plate),
-        points_in_cloud=plate,
-        point_of_row=np.arange(len(plate)),
-        approach_allowed=every,
-        contact_allowed=every,
-        object_of_point=np.zeros(len(plate), dtype=np.int64),
-        support=None,
-        obstacles=None,
-        viewpoints=None if camera is None else np.array([camera], dtype=np.float32),
-    )
+    viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
+    behind = scene_of(plate, viewpoints=viewpoints)
     assert collides(behind, HAND, PANDA, Collision()).tolist() == [blocked]
 
 

@@ -8,10 +8,8 @@ from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.ranking import objects_first, openings
-from edgegrasp_model.scene.cloud import CanonicalFrame, Cloud
-from edgegrasp_model.scene.scene import Scene
 
-from .scenes import PANDA, TINY
+from .scenes import PANDA, TINY, scene_of
 
 
 def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
@@ -35,19 +33,8 @@ def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening) -> Non
     # A plate that faces the camera: across the closing direction y, or along it.
     axes = (along, flat + 0.015, height) if camera and camera[1] else (flat, along, height)
     points = np.stack(axes, axis=-1).reshape(-1, 3).astype(np.float32)
-    every = np.ones(len(points), dtype=bool)
-    scene = Scene(
-        frame=CanonicalFrame(np.eye(4)),
-        cloud=Cloud(points, points),
-        points_in_cloud=points,
-        point_of_row=np.arange(len(points)),
-        approach_allowed=every,
-        contact_allowed=every,
-        object_of_point=np.zeros(len(points), dtype=np.int64),
-        support=None,
-        obstacles=None,
-        viewpoints=None if camera is None else np.array([camera], dtype=np.float32),
-    )
+    viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
+    scene = scene_of(points, viewpoints=viewpoints)
     width = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
     np.testing.assert_allclose(width, opening, atol=1e-6)
 
