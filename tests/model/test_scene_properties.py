@@ -79,6 +79,15 @@ def test_stray_readings_are_left_out_and_never_a_reason_to_refuse() -> None:
     assert len(ask(cloud).objects) == 4
 
 
+def test_a_thinned_cloud_without_rows_shows_the_same_objects() -> None:
+    pose = camera(0.6, -1.2, 0.9)
+    cloud = render([table(), *boxes_on_table(6)], pose).reshape(-1, 3)
+    some = np.random.default_rng(0).choice(np.flatnonzero(np.isfinite(cloud[:, 0])), 20_000, False)
+    found = ask(cloud[some])
+    assert len(found.objects) >= 3
+    assert found.grasps
+
+
 def test_a_mask_of_the_caller_wins() -> None:
     objects, pose = boxes_on_table(2), camera(0.75, -1.5, 0.9)
     boxes = [PANEL, table(), *objects]
@@ -146,6 +155,8 @@ NO_SCENES = {
     "too close": flat(0.04),
     "too far": flat(12.0),
     "a room from inside": render(ROOM, camera(1.2, 0.3, 0.4)),
+    "the camera itself": np.zeros((50, 3), np.float32),
+    "one place": np.full((50, 3), 1e-3, np.float32),
 }
 
 
