@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,8 @@ Float64 = NDArray[np.float64]
 
 TRIED = 200  # grasps that the arm may be asked for, in their order
 SPARE = 4  # more than asked for that are brought within reach, as some may get no motion
-LINE_STEP = 0.01  # metres between the poses of a straight way
-MAX_JUMP = 0.4  # radians that a joint turns between two of them at most
+LINE_STEP = 0.05  # metres between the poses of a straight way; each costs more than its checks
+MAX_JUMP = 1.0  # radians that a joint turns between two of them at most
 OFF_LINE = 0.002  # metres that the hand leaves a straight way by at most
 SHARE = 0.99  # of the limits, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
@@ -149,6 +150,9 @@ class _Arm:
     def __init__(self, robot: Robot, asked: RobotArm, scene: Scene, options: DetectOptions) -> None:
         self._robot, self._scene, self._options = robot, scene, options
         self._start = np.array(asked.joints)
+        at_home = np.allclose(self._start, robot.home)
+        self._starts = [self._start] if at_home else [self._start, robot.home]
+        self._T_hand_flange = np.linalg.inv(robot.T_flange_hand)
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
         self._to_pregrasp = self._solver(robot.scene, restarts=2)
         self._along = self._solver(robot.straight, restarts=0)
@@ -159,7 +163,7 @@ class _Arm:
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
         poses = self._line_of(grasp, -self._options.collision.approach_length, 0.0)
-        for start in (self._start, self._robot.home):
+        for start in self._starts:
             first = self._solve(self._to_pregrasp, poses[0], start)
             line = None if first is None else self._follow(poses, first)
             if line is not None:
@@ -208,7 +212,7 @@ class _Arm:
     def _solve(self, solver: SimpleIk, T_base_hand: Float64, start: Float64) -> Float64 | None:
         """Joints (J,) that bring the hand there, within their limits."""
         robot = self._robot
-        T_base_flange = np.asfortranarray(T_base_hand @ np.linalg.inv(robot.T_flange_hand))
+        T_base_flange = np.asfortranarray(T_base_hand @ self._T_hand_flange)
         goal = core.CartesianConfiguration(robot.base_frame, robot.flange_frame, T_base_flange)
         found = core.JointConfiguration(robot.joint_names, start)
         solver.setRngSeed(self._options.seed % 2**31)
@@ -234,11 +238,13 @@ class _Arm:
         return list(self._T_base_cloud @ poses)
 
     def _follow(self, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
-        """Joints along a straight way, each near to those before."""
+        """Joints along a straight way, each near to those before, and nothing in between."""
         line = [first]
         for pose in poses[1:]:
             joints = self._solve(self._along, pose, line[-1])
             if joints is None or np.abs(joints - line[-1]).max() > MAX_JUMP:
+                return None
+            if core.hasCollisionsAlongPath(self._robot.straight, line[-1], joints, PATH_STEP):
                 return None
             line.append(joints)
         return line
@@ -291,23 +297,19 @@ class _Arm:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
         except RuntimeError:
             return None
-        way = None if kind is None else [self._robot.hand_pose(joints[at])[:3, 3] for at in (0, -1)]
-        before = np.array(joints[0])
-        for row in np.array(found.positions):
-            if not self._within_limits(row):
+        rows = np.array(found.positions)
+        if not self._within_limits(rows):
+            return None
+        if kind is not None:
+            hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
+            along = (hand[-1] - hand[0]) / np.linalg.norm(hand[-1] - hand[0])
+            away = hand - hand[0]
+            if np.linalg.norm(away - (away @ along)[:, None] * along, axis=1).max() > OFF_LINE:
                 return None
+        for before, row in pairwise([joints[0], *rows]):
             if core.hasCollisionsAlongPath(scene, before, row, FINE):
                 return None
-            if way is not None and _off_line(self._robot.hand_pose(row)[:3, 3], *way) > OFF_LINE:
-                return None
-            before = row
         return found
-
-
-def _off_line(point: Float64, start: Float64, end: Float64) -> float:
-    """Distance of a point (3,) from the line through two others, metres."""
-    along = (end - start) / np.linalg.norm(end - start)
-    return float(np.linalg.norm(np.cross(point - start, along)))
 
 
 def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:

@@ -150,12 +150,16 @@ def _cloud(
     T_base_scene: Float64,
 ) -> Thing | None:
     """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
-    flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-    seen = scene.frame.points(flat[np.isfinite(flat @ np.ones(3))])
+    flat = np.asarray(points).reshape(-1, 3)
+    if scene.support is None:
+        kept = np.isfinite(flat).all(axis=1)
+    else:  # in single precision, as most of an image is of the support
+        plane = np.append(scene.support.normal, -scene.support.offset)
+        plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
+        kept = flat @ plane[:3] > CELL / 2 - plane[3]  # NaN is not
+    seen = scene.frame.points(flat[kept])
     base = np.linalg.inv(T_base_scene)[:3, 3]
     seen = seen[np.einsum("ij,ij->i", seen - base, seen - base) < AROUND**2]
-    if scene.support is not None:
-        seen = seen[scene.support.heights(seen) > CELL / 2]
     if len(seen) == 0:
         return None
     cell = np.floor(seen / CELL).astype(np.int64)
