@@ -51,7 +51,7 @@ class BenchmarkFlags(Cluster):
     scene: str = Field("pile", description="packed, pile, bin, bin-full, table or shelf")
     protocol: str = Field(
         "edgegrasp",
-        description="edgegrasp, giga, vgn, bin, table, shelf, or a .toml file of the same kind",
+        description="edgegrasp, giga, vgn, bin, table, shelf, ur5, or a .toml file like them",
     )
     planner: str = Field(
         "server", description="server, in-process, an installed one, or module:callable"
@@ -68,6 +68,10 @@ class BenchmarkFlags(Cluster):
     gripper: str | None = Field(
         None,
         description="Hand to grasp with: a gripper's name or .toml file; else the Panda",
+    )
+    robot: str | None = Field(
+        None,
+        description="Arm that executes the grasps with its own hand, in MuJoCo: name or .toml file",
     )
     server: str | None = Field(
         None, description="host:port (gRPC) or http://host:port; else one is started"
@@ -138,17 +142,26 @@ def _plan(
     from edgegrasp_sim.protocol import load_protocol
 
     rules = load_protocol(asked.protocol)
-    chosen = choose_engine(asked.engine, rules.engine)
+    chosen = choose_engine("mujoco" if asked.robot else asked.engine, rules.engine)
     print(chosen)
     # The Panda's hand has shapes of its own.
     hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
+    arm = None
+    if hand is not None:
+        options = options | {"gripper": hand}
+    if asked.robot is not None:
+        from edgegrasp_cli.arm import benchmark_arm
+
+        arm, hand, fields = benchmark_arm(asked.robot, rules.camera)
+        options = fields | options
     choice = PlannerChoice(
         asked.planner,
         asked.model,
         tuple(path.resolve() for path in asked.weights),
         asked.server,
         connection,
-        options if hand is None else options | {"gripper": hand},
+        options,
+        asked.robot,
     )
     config = BenchmarkConfig(
         SceneKind(asked.scene),
@@ -159,6 +172,7 @@ def _plan(
         asked.split,
         chosen.name,
         hand,
+        arm,
     )
     if asked.ray not in (None, "local") and asked.planner == "server" and asked.server is None:
         raise ValueError(
@@ -293,6 +307,13 @@ def _print_summary(summary: dict[str, Any], planner: str) -> None:
         console.print(
             f"{wide['objects']} objects are wider than the hand opens; of the others: "
             f"GSR {gsr} %, DR {dr} %"
+        )
+    if arm := summary["arm"]:
+        console.print(
+            f"{arm['picks_per_hour']:.0f} picks per hour; a motion out and home takes "
+            f"{arm['motion_seconds']:.1f} s; {arm['touched_on_the_way']} touched something before "
+            f"the pregrasp; {arm['scenes_with_a_reachable_grasp']} of {summary['rounds']} scenes "
+            "had a grasp within reach"
         )
     failures = {cause: count for cause, count in summary["failures"].items() if count}
     console.print(f"failures: {failures}; rounds ended: {summary['round_ends']}")

@@ -213,12 +213,9 @@ class OwnDetector:
         detector = self._catalogue.get(parsed.model)
         if parsed.robot is None:
             return detector.detect(sent, parsed)
-        from edgegrasp_robot import load_robot, plan_picks, with_robot
+        from edgegrasp_robot import detect_picks, load_robot
 
-        robot = load_robot(parsed.robot.name)
-        prepared = detector.prepare(sent, with_robot(parsed, robot))
-        detection = detector.finish(prepared, detector.evaluate(prepared))
-        return plan_picks(detection, prepared.scene, sent.points, parsed, robot)
+        return detect_picks(detector, sent, parsed, load_robot(parsed.robot.name))
 
     def models(self) -> "list[Model]":
         """The weights that can be used."""

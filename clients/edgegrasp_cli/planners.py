@@ -36,6 +36,7 @@ class PlannerChoice:
     connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
     # Of each request, in place of the protocol's.
     options: dict[str, Any] = field(default_factory=dict)
+    robot: str | None = None  # that the options name: one that ships, or its file
 
     def weights_and_model(self) -> tuple[tuple[Path, ...], str]:
         """The weights to load, and the name to ask for.
@@ -80,12 +81,14 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
         from edgegrasp_model.detector import ModelCatalogue
 
         used = ModelCatalogue.load(weights).get(model).metadata
-        planner = partial(InProcessPlanner, weights, model, rules, choice.options)
+        planner = partial(InProcessPlanner, weights, model, rules, choice.options, choice.robot)
         yield ChosenPlanner(planner, facts | {"model": used.name, "digest": used.digest})
         return
     from edgegrasp_client.connection import Addresses, local_server
 
     flags = [text for path in weights for text in ("--weights", str(path))]
+    if choice.robot is not None:
+        flags += ["--robots", choice.robot]
     own = nullcontext(Addresses("", choice.server)) if choice.server else local_server(*flags)
     with own as addresses:
         address = addresses.grpc_address
@@ -145,10 +148,10 @@ class ServerPlanner:
             self._client.detect, observation.image, view_ids=view_ids(observation), **options
         )
         try:
-            return _best(ask().grasps)
+            return _best(ask().grasps, options)
         except ServerUnavailableError:
             self._client.wait_until_ready(REQUEST_SECONDS)
-            return _best(ask().grasps)
+            return _best(ask().grasps, options)
 
     def close(self) -> None:
         """Close the connection."""
@@ -169,11 +172,12 @@ class InProcessPlanner:
         model: str,
         rules: PlanningRules,
         options: Mapping[str, Any],
+        robot: str | None = None,
     ) -> None:
         from edgegrasp_model.detector import ModelCatalogue
 
         self._detector = ModelCatalogue.load(weights).get(model)
-        self._rules, self._options = rules, options
+        self._rules, self._options, self._robot = rules, options, robot
 
     def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
         """The best grasp; None if there is none."""
@@ -182,12 +186,18 @@ class InProcessPlanner:
         from edgegrasp_model.options import parse_options
         from edgegrasp_model.scene.cloud import CloudInput
 
-        options = parse_options(request_options(observation, seed, self._rules, self._options))
+        asked = request_options(observation, seed, self._rules, self._options)
+        options = parse_options(asked)
         cloud = CloudInput(observation.image, view_ids=view_ids(observation))
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # sums then do not depend on how many there are elsewhere
         try:
-            return _best(self._detector.detect(cloud, options).grasps)
+            if self._robot is None:
+                return _best(self._detector.detect(cloud, options).grasps, asked)
+            from edgegrasp_robot import detect_picks, load_robots
+
+            (robot,) = load_robots((Path(self._robot),)).values()
+            return _best(detect_picks(self._detector, cloud, options, robot).grasps, asked)
         finally:
             torch.set_num_threads(threads)
 
@@ -236,8 +246,12 @@ def view_ids(observation: Observation) -> NDArray[np.int32] | None:
     return observation.view_ids if len(observation.camera_positions) > 1 else None
 
 
-def _best(grasps: Sequence[Any]) -> PlannedGrasp | None:
-    """The first of the grasps, which come best first."""
+def _best(grasps: Sequence[Any], options: Mapping[str, Any]) -> PlannedGrasp | None:
+    """The first of the grasps, which come best first; for an arm, only with a motion."""
     if not grasps:
         return None
-    return PlannedGrasp(grasps[0].T_cloud_hand, grasps[0].score, grasps[0].width)
+    best = grasps[0]
+    motion = best.arm.trajectory if best.arm is not None else None
+    if "robot" in options and motion is None:
+        return None
+    return PlannedGrasp(best.T_cloud_hand, best.score, best.width, motion)

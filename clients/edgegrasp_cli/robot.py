@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import typer
 
 robot = typer.Typer(help="Make and check robot files.", no_args_is_help=True)
-ACCELERATION = 2.0  # per second squared, where nobody says more: careful
 
 GripperName = Annotated[str, typer.Option(help="Name of a gripper that ships, or its file.")]
 Links = Annotated[str, typer.Option(help="Link of the URDF.")]
@@ -23,16 +22,12 @@ def add(
     srdf: Annotated[str, typer.Option(help="SRDF with links that may touch.")] = "",
     packages: Annotated[list[str] | None, typer.Option(help="Folder that holds packages.")] = None,
 ) -> None:
-    """Write a robot file for an arm's URDF, with what is left to fill in, and check it.
+    """Write a robot file for an arm's URDF, and check it.
 
     edgegrasp robot add my.urdf --base base_link --flange tool0 --output my.toml
     """
-    from edgegrasp_robot.robot import urdf_joints
-
     if output.suffix != ".toml" or output.exists():
         raise ValueError(f"--output: got {str(output)!r}. Name a new file, .toml.")
-    joints = urdf_joints(urdf, base, flange)
-    middle = [min(max(0.0, joint.lower), joint.upper) for joint in joints]
     fields: dict[str, Any] = {
         "urdf": str(urdf.absolute()),
         "srdf": str(Path(srdf).absolute()) if srdf else "",
@@ -40,9 +35,6 @@ def add(
         "base_frame": base,
         "flange_frame": flange,
         "gripper": gripper,
-        "home": middle,
-        "max_velocity": [joint.velocity for joint in joints],
-        "max_acceleration": [ACCELERATION] * len(joints),
     }
     lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
     pose = [
@@ -51,8 +43,8 @@ def add(
         "position = [0.0, 0.0, 0.0]",
         "quaternion = [0.0, 0.0, 0.0, 1.0]",
     ]
-    output.write_text("\n".join([f"# {', '.join(one.name for one in joints)}", *lines, *pose, ""]))
-    print(f"{output}: now set T_flange_hand, home and max_acceleration.")
+    output.write_text("\n".join([*lines, *pose, ""]))
+    print(f"{output}: now set T_flange_hand, and home, max_velocity, max_acceleration if need be.")
     check(output)
 
 

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from edgegrasp_sim.engine import choose_engine, engine_constants
+from edgegrasp_sim.engine import ArmModel, choose_engine, engine_constants
 from edgegrasp_sim.hand import (
     CLOSE_SECONDS,
     MIN_OPENING,
@@ -47,6 +47,7 @@ class BenchmarkConfig:
         split: of that folder.
         engine: to simulate with; by default see `choose_engine`, with the protocol's.
         gripper: the fields of a gripper file; by default the Panda's hand.
+        arm: what carries the hand; None: it floats.
     """
 
     scene: SceneKind
@@ -57,6 +58,7 @@ class BenchmarkConfig:
     split: str = "test"
     engine: str = ""
     gripper: dict[str, Any] | None = None
+    arm: ArmModel | None = None
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -134,7 +136,9 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
     """
     drawn = config.object_set()
     # Named where it is not the Panda's, so that earlier results can be resumed.
-    hand = {} if config.gripper is None else {"gripper": config.gripper}
+    hand: dict[str, Any] = {} if config.gripper is None else {"gripper": config.gripper}
+    if config.arm is not None:
+        hand["arm"] = config.arm.joint_names
     return {
         "run": {
             "scene": config.scene.value,
@@ -202,7 +206,10 @@ class RoundRunner:
         self.config = config
         self.planner: Planner = make_planner()
         self.simulation = ClutterSimulation(
-            {config.scene: objects}, engine=config.engine, gripper=config.gripper
+            {config.scene: objects},
+            engine=config.engine,
+            gripper=config.gripper,
+            arm=config.arm,
         )
 
     def __call__(self, task: Task) -> Round:

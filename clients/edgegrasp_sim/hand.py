@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edgegrasp_sim.engine import TIME_STEP, Body, HandModel, Parts, World
+from edgegrasp_sim.engine import TIME_STEP, Body, Hand, HandModel, Parts, World
 from edgegrasp_sim.engine.urdf import read_obj
 from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 from edgegrasp_sim.scene import SceneObject
@@ -64,6 +64,7 @@ class GraspResult:
         target: the object between the fingers before the hand came, None if there was none.
         cause: why it failed, None if it did not.
         held_after_shaking: whether it was still held then; None if the hand was not shaken.
+        touched_on_the_way: whether an arm overlapped anything before its pregrasp.
     """
 
     opening: float
@@ -72,6 +73,7 @@ class GraspResult:
     target: SceneObject | None = None
     cause: FailureCause | None = None
     held_after_shaking: bool | None = None
+    touched_on_the_way: bool = False
 
     @property
     def success(self) -> bool:
@@ -99,19 +101,24 @@ def run_grasp(
             otherwise stop once the outcome is clear.
         shake: shake a held object at the end of the retreat; this does not change `success`.
     """
-    gripper.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
+    gripper.start(T_world_hand)
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
 
+    touched = False
+
     def failed(cause: FailureCause) -> GraspResult:
-        return GraspResult(gripper.opening, start_contact, None, target, cause)
+        return GraspResult(
+            gripper.opening, start_contact, None, target, cause, touched_on_the_way=touched
+        )
 
     if _cut_into(gripper) & obstacles:
         return failed(FailureCause.START_COLLISION)
     collided = False
-    for _ in gripper.steps_to(T_world_hand, step_length=STEP_LENGTH):
+    for _ in gripper.approach(T_world_hand):
         cut = _cut_into(gripper)
+        touched = touched or (gripper.on_the_way and bool(cut))
         if cut & obstacles:
             return failed(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
@@ -121,7 +128,9 @@ def run_grasp(
     if not missed or to_the_end:
         held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
         if held is not None and gripper.opening > MIN_OPENING:
-            result = GraspResult(gripper.opening, start_contact, held, target)
+            result = GraspResult(
+                gripper.opening, start_contact, held, target, touched_on_the_way=touched
+            )
             if not shake:
                 return result
             still = _holds_when_shaken(gripper, T_world_hand, held, objects)
@@ -147,6 +156,9 @@ def retreat_pose(T_world_hand: Matrix) -> Matrix:
 class Gripper:
     """The simulated hand, in the hand frame of its file: z out of the palm, y closes."""
 
+    body: Hand
+    on_the_way = False  # whether it is on an arm that has not come to its pregrasp
+
     def __init__(self, world: World, model: HandModel | None = None) -> None:
         self.world = world
         self.model = model or panda()
@@ -162,6 +174,18 @@ class Gripper:
     def park(self) -> None:
         """Put the open hand where it touches nothing and no camera sees it."""
         self.place(_PARKED)
+
+    def start(self, T_world_hand: Matrix) -> None:
+        """Put it a little behind the grasp."""
+        self.place(T_world_hand @ translation(0.0, 0.0, -PREGRASP_DISTANCE))
+
+    def approach(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Go straight on to the grasp."""
+        return self.steps_to(T_world_hand, step_length=STEP_LENGTH)
+
+    def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Go to `retreat_pose`."""
+        return self.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH)
 
     def place(self, T_world_hand: Matrix) -> None:
         """Put the open hand there at once, at rest."""
@@ -286,7 +310,7 @@ def _retreat(
         The object in contact with the hand, None if there is none.
     """
     watch = _Watch(gripper, objects)
-    for _ in gripper.steps_to(retreat_pose(T_world_hand), step_length=STEP_LENGTH):
+    for _ in gripper.retreat(T_world_hand):
         if not to_the_end and watch.is_clear():
             break
     return next(iter(_touched(gripper, objects)), None)

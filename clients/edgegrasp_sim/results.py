@@ -147,6 +147,7 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         },
         "wrong_object_successes": sum(attempt.wrong_object for attempt in attempts),
         "start_contacts": sum(attempt.start_contact for attempt in attempts),
+        "arm": _arm_figures(rounds),
         "round_ends": dict(Counter(item.end.value for item in rounds)),
         "planning_seconds": {
             "mean": fmean(planning),
@@ -157,6 +158,20 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         else None,
         "objects_by_name": by_object(rounds),
         "attempts_digest": attempts_digest(rounds),
+    }
+
+
+def _arm_figures(rounds: Sequence[Round]) -> dict[str, Any] | None:
+    """What an arm did, None where the hand floated; times are simulated and the planner's."""
+    attempts = [attempt for item in rounds for attempt in item.attempts]
+    if not any(attempt.motion_seconds for attempt in attempts):
+        return None
+    seconds = sum(a.motion_seconds + a.planning_seconds for a in attempts)
+    return {
+        "picks_per_hour": 3600 * sum(a.success for a in attempts) / seconds,
+        "motion_seconds": median(a.motion_seconds for a in attempts),
+        "touched_on_the_way": sum(a.touched_on_the_way for a in attempts),
+        "scenes_with_a_reachable_grasp": sum(bool(item.attempts) for item in rounds),
     }
 
 
@@ -197,7 +212,8 @@ def attempts_digest(rounds: Sequence[Round]) -> str:
     for table in tables:
         del table["too_wide"]
         for attempt in table["attempts"]:
-            del attempt["planning_seconds"]
+            for name in ("planning_seconds", "motion_seconds", "touched_on_the_way"):
+                del attempt[name]
     return hashlib.sha256(json.dumps(tables, sort_keys=True).encode()).hexdigest()
 
 

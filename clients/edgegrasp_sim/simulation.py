@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edgegrasp_camera.picture import lit
+from edgegrasp_sim.arm import ArmGripper, ArmMotion
 from edgegrasp_sim.camera import (
     CAMERA,
     EVALUATION_VIEWS,
@@ -21,7 +22,7 @@ from edgegrasp_sim.camera import (
     points_of,
     seen_box,
 )
-from edgegrasp_sim.engine import make_world
+from edgegrasp_sim.engine import ArmModel, make_world
 from edgegrasp_sim.engine.urdf import least_width, read_urdf
 from edgegrasp_sim.hand import GraspResult, Gripper, hand_of, panda, run_grasp
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
@@ -127,6 +128,7 @@ class ClutterSimulation:
         objects: what to make scenes from, for each kind; the built-in sets by default.
         engine: see `choose_engine`.
         gripper: the fields of a gripper file; by default the Panda's hand with the vendor's shapes.
+        arm: what carries the hand, on MuJoCo; None: it floats.
     """
 
     def __init__(
@@ -135,8 +137,9 @@ class ClutterSimulation:
         *,
         engine: str | None = None,
         gripper: Mapping[str, Any] | None = None,
+        arm: ArmModel | None = None,
     ) -> None:
-        self.gripper = gripper
+        self.gripper, self.arm = gripper, arm
         self.hand = panda() if gripper is None else hand_of(gripper)
         self.object_sets = (
             dict(objects)
@@ -231,7 +234,7 @@ class ClutterSimulation:
         around = self._clear(open_table(table_thickness) if surround is None else surround(rng))
         layout = Layout(self.world, around, objects, rng, num_objects, scales or usual)
         self._objects = make(layout)
-        self._gripper = Gripper(self.world, self.hand)
+        self._gripper = self._add_gripper()
         return self.num_objects
 
     def reset_from_poses(
@@ -253,7 +256,7 @@ class ClutterSimulation:
             )
             item.body.set_pose(placement.position, placement.quaternion_xyzw)
             self._objects.append(item)
-        self._gripper = Gripper(self.world, self.hand)
+        self._gripper = self._add_gripper()
 
     def observe(
         self,
@@ -360,17 +363,22 @@ class ClutterSimulation:
         self._restore_rest()
         return result
 
-    def execute_grasp(self, T_world_hand: ArrayLike) -> GraspResult:
+    def execute_grasp(
+        self, T_world_hand: ArrayLike, motion: ArmMotion | None = None
+    ) -> GraspResult:
         """Grasp for real: a held object leaves the scene, and the others come to rest.
 
         The outcome is that of `try_grasp(..., to_the_end=True)`.
 
         Args:
             T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
+            motion: how an arm comes there, where there is one.
 
         Raises:
-            ValueError: `T_world_hand` is not a rigid transform.
+            ValueError: `T_world_hand` is not a rigid transform, or an arm has no motion.
         """
+        if isinstance(self._hand, ArmGripper):
+            self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)
         self._forget_rest_state()
         self._hand.park()
@@ -379,6 +387,11 @@ class ClutterSimulation:
             self._objects.remove(result.held)
         self._objects = settle(self.world, self._objects, self.surroundings)
         return result
+
+    def _add_gripper(self) -> Gripper:
+        if self.arm is None:
+            return Gripper(self.world, self.hand)
+        return ArmGripper(self.world, self.hand, self.arm)
 
     @property
     def _hand(self) -> Gripper:

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgegrasp_sim.arm import ArmMotion, seconds_of
 from edgegrasp_sim.camera import Observation, crop
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import SceneKind
@@ -29,11 +30,13 @@ class PlannedGrasp:
         T_world_hand: (4, 4) pose of the `panda_hand` link in the world, metres.
         score: how good the planner believes the grasp is; higher is better.
         width: opening that the grasp needs, metres.
+        motion: of the arm that carries the hand, if one does.
     """
 
     T_world_hand: ArrayLike
     score: float
     width: float
+    motion: ArmMotion | None = None
 
 
 # From an observation, and a seed for randomness in planning, to the grasp to execute; None if
@@ -67,6 +70,8 @@ class Attempt:
         points: size of the cloud that was seen.
         planning_seconds: wall-clock time of the planner.
         T_world_hand: (4, 4) row-major pose of the hand.
+        motion_seconds: that an arm took from home to the grasp, away and home again.
+        touched_on_the_way: whether an arm overlapped anything before its pregrasp.
     """
 
     cause: FailureCause | None
@@ -81,6 +86,8 @@ class Attempt:
     points: int
     planning_seconds: float
     T_world_hand: list[list[float]]
+    motion_seconds: float = 0.0
+    touched_on_the_way: bool = False
 
     @property
     def success(self) -> bool:
@@ -231,7 +238,7 @@ class RoundDriver:
         Raises:
             ValueError: its pose is not a rigid transform.
         """
-        result = self.simulation.execute_grasp(grasp.T_world_hand)
+        result = self.simulation.execute_grasp(grasp.T_world_hand, grasp.motion)
         attempt = Attempt(
             cause=result.cause,
             object=result.held.model.name if result.held is not None else None,
@@ -245,6 +252,8 @@ class RoundDriver:
             points=len(self._seen.cloud) if self._seen is not None else 0,
             planning_seconds=self._planning_seconds,
             T_world_hand=np.asarray(grasp.T_world_hand, dtype=np.float64).tolist(),
+            motion_seconds=0.0 if grasp.motion is None else seconds_of(grasp.motion),
+            touched_on_the_way=result.touched_on_the_way,
         )
         self._failures = 0 if attempt.success else self._failures + 1
         self._round = replace(self._round, attempts=(*self._round.attempts, attempt))

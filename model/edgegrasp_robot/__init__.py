@@ -1,6 +1,14 @@
 """From grasps to the joints and the motion of an arm; needs the extra `robot`."""
 
-from edgegrasp_robot.picks import plan_picks, with_robot
+from edgegrasp_robot.picks import detect_picks, plan_picks, with_robot
 from edgegrasp_robot.robot import Robot, load_robot, load_robots, robot_names
 
-__all__ = ["Robot", "load_robot", "load_robots", "plan_picks", "robot_names", "with_robot"]
+__all__ = [
+    "Robot",
+    "detect_picks",
+    "load_robot",
+    "load_robots",
+    "plan_picks",
+    "robot_names",
+    "with_robot",
+]

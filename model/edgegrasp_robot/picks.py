@@ -13,9 +13,11 @@ from roboplan.rrt import RRT, RRTOptions
 from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
+from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, RobotArm
 from edgegrasp_model.results import ArmPlan, ArmTrajectory, Detection, Grasp
+from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.held import can_leave
 from edgegrasp_robot.robot import GROUP, Robot
@@ -62,6 +64,15 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
         raise InvalidRequest("options.gripper", "another gripper than the robot's", fix)
     changes = {"top_k": max(options.top_k, TRIED), "gripper": robot.hand}
     return options.model_copy(update=changes)
+
+
+def detect_picks(
+    detector: GraspDetector, cloud: CloudInput, options: DetectOptions, robot: Robot
+) -> Detection:
+    """Find grasps, and say how the robot gets there; raises as the detector and `plan_picks`."""
+    prepared = detector.prepare(cloud, with_robot(options, robot))
+    detection = detector.finish(prepared, detector.evaluate(prepared))
+    return plan_picks(detection, prepared.scene, cloud.points, options, robot)
 
 
 def plan_picks(
@@ -162,7 +173,8 @@ class _Arm:
         """Joints at the pregrasp and on straight to the grasp."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
-        poses = self._line_of(grasp, -self._options.collision.approach_length, 0.0)
+        length = self._options.collision.approach_length
+        poses = self._straight(grasp, grasp.approach_direction, -length, 0.0)
         for start in self._starts:
             first = self._solve(self._to_pregrasp, poses[0], start)
             line = None if first is None else self._follow(poses, first)
@@ -181,22 +193,21 @@ class _Arm:
         back = self._retreat(pick)
         if path is None or back is None:
             return pick
-        parts = [
-            self._timed(self._robot.scene, path, None),
-            self._timed(self._robot.straight, pick.line, "line"),
-            self._timed(self._robot.straight, back, "line"),
+        timed = [self._timed(path), self._timed(pick.line, True), self._timed(back, True)]
+        parts = [part for part in timed if part is not None]
+        if len(parts) < len(timed):
+            return pick
+        begins = np.cumsum([0.0, *(part.times[-1] for part in parts)])
+        later = [
+            begin + np.array(part.times[1:]) for begin, part in zip(begins[:-1], parts, strict=True)
         ]
-        times, positions, velocities, ends = np.zeros(1), self._start[None], np.zeros((1, 1)), []
-        velocities = np.zeros_like(positions)
-        for part in parts:
-            if part is None:
-                return pick
-            times = np.concatenate([times, times[-1] + np.array(part.times[1:])])
-            positions = np.concatenate([positions, part.positions[1:]])
-            velocities = np.concatenate([velocities, part.velocities[1:]])
-            ends.append(len(times) - 1)
         trajectory = ArmTrajectory(
-            self._robot.joint_names, times, positions, velocities, ends[0], ends[1]
+            self._robot.joint_names,
+            np.concatenate([[0.0], *later]),
+            np.concatenate([self._start[None], *(part.positions[1:] for part in parts)]),
+            np.concatenate([np.zeros((1, len(self._start))), *(p.velocities[1:] for p in parts)]),
+            len(later[0]),
+            len(later[0]) + len(later[1]),
         )
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
@@ -224,16 +235,12 @@ class _Arm:
     def _within_limits(self, joints: Float64) -> bool:
         return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
 
-    def _line_of(self, grasp: Grasp, begin: float, end: float) -> list[Float64]:
-        """Poses T_base_hand along the approach, `begin` to `end` metres from the grasp."""
-        T_cloud_hand = grasp.T_cloud_hand.astype(np.float64)
-        return self._straight(T_cloud_hand, T_cloud_hand[:3, 2], begin, end)
-
     def _straight(
-        self, T_cloud_hand: Float64, direction: Float64, begin: float, end: float
+        self, grasp: Grasp, direction: NDArray[np.floating], begin: float, end: float
     ) -> list[Float64]:
+        """Poses T_base_hand along a direction, `begin` to `end` metres from the grasp."""
         steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
-        poses = np.repeat(T_cloud_hand[None], steps + 1, axis=0)
+        poses = np.repeat(grasp.T_cloud_hand[None].astype(np.float64), steps + 1, axis=0)
         poses[:, :3, 3] += np.linspace(begin, end, steps + 1)[:, None] * direction
         return list(self._T_base_cloud @ poses)
 
@@ -261,7 +268,7 @@ class _Arm:
         length = rules.retreat_length or rules.approach_length
         if not can_leave(grasp, self._scene, self._robot.gripper, direction * length, rules):
             return None
-        poses = self._straight(grasp.T_cloud_hand.astype(np.float64), direction, 0.0, length)
+        poses = self._straight(grasp, direction, 0.0, length)
         return self._follow(poses, pick.line[-1])
 
     def _free_path(self, start: Float64, end: Float64) -> list[Float64] | None:
@@ -285,13 +292,13 @@ class _Arm:
         return [np.array(joints) for joints in shorter.positions]
 
     def _timed(
-        self, scene: core.Scene, joints: Sequence[Float64], kind: str | None
+        self, joints: Sequence[Float64], straight: bool = False
     ) -> core.JointTrajectory | None:
         """A path with times, from rest to rest, checked all along."""
+        scene = self._robot.straight if straight else self._robot.scene
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
-        modes = SplineFittingMode
-        mode = modes.Adaptive if kind is None else modes.Cubic
+        mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
         options = TOPPRAOptions(dt=DT, mode=mode, velocity_scale=SHARE, acceleration_scale=SHARE)
         try:
             found = PathParameterizerTOPPRA(scene, GROUP).generate(path, options)
@@ -300,7 +307,7 @@ class _Arm:
         rows = np.array(found.positions)
         if not self._within_limits(rows):
             return None
-        if kind is not None:
+        if straight:
             hand = np.array([self._robot.hand_pose(row)[:3, 3] for row in (*rows, joints[-1])])
             along = (hand[-1] - hand[0]) / np.linalg.norm(hand[-1] - hand[0])
             away = hand - hand[0]

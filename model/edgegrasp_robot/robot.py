@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import xacro
@@ -26,9 +26,9 @@ Element = ElementTree.Element
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
-LIMITS = {"lower": -2 * np.pi, "upper": 2 * np.pi, "velocity": 1.0}  # where a URDF has none
+CAREFUL = 2.0  # per second squared: acceleration where nobody says more
 MOVING = ("revolute", "continuous", "prismatic")
-Joints = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)]
+Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
 
 class InvalidRobot(EdgeGraspError):  # noqa: N818
@@ -60,9 +60,13 @@ class RobotFile(Strict):
     flange_frame: str = Field(description="link that the gripper is on; all beyond is left out")
     gripper: str = Field(description="name of a gripper that ships, or its file")
     T_flange_hand: HandPose
-    home: Joints = Field(description="joints where the arm touches nothing of itself")
-    max_velocity: Joints = Field(description="of each joint")
-    max_acceleration: Joints = Field(description="of each joint")
+    home: Joints = Field(
+        default=(), description="joints where the arm touches nothing of itself; empty: near zero"
+    )
+    max_velocity: Joints = Field(default=(), description="of each joint; empty: the URDF's")
+    max_acceleration: Joints = Field(
+        default=(), description=f"of each joint; empty: {CAREFUL} each"
+    )
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,8 @@ class Robot:
 class Model:
     """What the planner's scenes are made of."""
 
-    urdf: str  # of the arm without what is beyond its flange, and with the gripper's boxes
+    arm: str  # URDF without what is beyond the flange, and with the meshes' absolute paths
+    urdf: str  # the same with the gripper's boxes
     packages: list[str]
     links: list[str]  # those that have a shape
     standing: list[str]  # those of them that no joint moves: they may touch what they stand on
@@ -188,7 +193,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     joint_names = _chain(path, root, file.base_frame, file.flange_frame)
     for field in ("home", "max_velocity", "max_acceleration"):
         given = getattr(file, field)
-        if len(given) != len(joint_names):
+        if given and len(given) != len(joint_names):
             fix = f"The arm has {len(joint_names)} joints: {', '.join(joint_names)}."
             raise InvalidRobot(f"{path.name}: {field}: got {len(given)} numbers. {fix}")
     gripper_file = path.parent / file.gripper
@@ -198,8 +203,9 @@ def _load(path: Path, file: RobotFile) -> Robot:
     beyond = _cut_beyond(root, file.flange_frame)
     T_flange_hand = file.T_flange_hand.matrix
     _fix_other_joints(root, joint_names)
-    _add_hand(root, file.flange_frame, T_flange_hand, gripper)
     _check_meshes(path, root, packages)
+    arm = ElementTree.tostring(root, encoding="unicode")
+    _add_hand(root, file.flange_frame, T_flange_hand, gripper)
     allowed: list[tuple[str, str]] = []
     if file.srdf:
         srdf = ElementTree.parse(_located(path, "srdf", file.srdf, packages)).getroot()
@@ -208,19 +214,20 @@ def _load(path: Path, file: RobotFile) -> Robot:
     text = ElementTree.tostring(root, encoding="unicode")
     links = [link for link in _links(root) if _has_shape(root, link)]
     standing = [link for link in links if not _moves(root, link)]
-    model = Model(text, packages, links, standing, allowed, limits)
+    model = Model(arm, text, packages, links, standing, allowed, limits)
     scenes = [
         model.scene(path.stem, file.base_frame, file.flange_frame) for _ in ("free", "straight")
     ]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
-    home = np.array(file.home)
+    home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():
         fix = f"Give joints between {lower.tolist()} and {upper.tolist()}."
         raise InvalidRobot(f"{path.name}: home: got {home.tolist()}. {fix}")
     robot = Robot(
         path.stem, gripper,
         hand, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
-        lower, upper, np.array(file.max_velocity), np.array(file.max_acceleration), model, *scenes,
+        lower, upper, scenes[0].getVelocityLimitVectors(GROUP)[1],
+        scenes[0].getAccelerationLimitVectors(GROUP)[1], model, *scenes,
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
@@ -229,42 +236,17 @@ def _load(path: Path, file: RobotFile) -> Robot:
     return robot
 
 
-class UrdfJoint(NamedTuple):
-    """A moving joint of a URDF; radians, metres of sliding joints, and seconds."""
-
-    name: str
-    lower: float
-    upper: float
-    velocity: float
-
-
-def urdf_joints(urdf: Path, base: str, flange: str) -> list[UrdfJoint]:
-    """The moving joints of an arm between two links, in order; raises InvalidRobot."""
-    try:
-        root = _read_urdf(urdf)
-    except (OSError, ElementTree.ParseError, xacro.XacroException) as error:
-        raise InvalidRobot(f"{urdf}: {error}") from None
-    joints = {joint.get("name"): joint.find("limit") for joint in root.findall("joint")}
-    found = []
-    for name in _chain(urdf, root, base, flange):
-        limit = joints[name]
-        given = {} if limit is None else limit.attrib
-        numbers = (float(given.get(which, other)) for which, other in LIMITS.items())
-        found.append(UrdfJoint(name, *numbers))
-    return found
-
-
-def touching(scene: core.Scene, model: Model, joints: Float64, things: Sequence[str] = ()) -> str:
+def touching(scene: core.Scene, model: Model, joints: Float64, around: Sequence[str] = ()) -> str:
     """Two that touch at joints (J,), as words; the scene is of no use afterwards.
 
     Args:
         scene: Of the robot and what is around it.
         model: The robot's.
         joints: Where it has collisions.
-        things: Names of what is around it.
+        around: Names of the obstacles.
     """
     for row, link in enumerate(model.links):
-        for other in (*things, *model.links[row + 1 :]):
+        for other in (*around, *model.links[row + 1 :]):
             scene.setCollisions(link, other, False)
             if not scene.hasCollisions(joints):
                 return f"{link} and {other}".replace(HAND, "the hand")
@@ -418,10 +400,10 @@ def _allowed(srdf: Element, root: Element, beyond: set[str]) -> list[tuple[str, 
 
 
 def _limits(joint_names: Sequence[str], file: RobotFile) -> str:
+    accelerations = file.max_acceleration or [CAREFUL] * len(joint_names)
     lines = ["joint_limits:"]
-    for name, velocity, acceleration in zip(
-        joint_names, file.max_velocity, file.max_acceleration, strict=True
-    ):
-        lines += [f"  {name}:", f"    max_velocity: [{velocity}]"]
-        lines += [f"    max_acceleration: [{acceleration}]"]
+    for row, name in enumerate(joint_names):
+        lines += [f"  {name}:", f"    max_acceleration: [{accelerations[row]}]"]
+        if file.max_velocity:
+            lines.append(f"    max_velocity: [{file.max_velocity[row]}]")
     return "\n".join(lines)

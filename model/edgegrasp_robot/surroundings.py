@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +24,7 @@ INSIDE = 10  # voxels of objects that may lie within the arm, as the camera errs
 SLAB = (6.0, 6.0, 0.5)  # metres, of the support
 GREY = np.ones(4)
 
-Thing = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose in the base frame
+Obstacle = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose in the base frame
 
 
 @contextmanager
@@ -32,7 +33,7 @@ def surrounded(
     scene: Scene,
     points: object,
     asked: RobotArm,
-    obstacles: Sequence[Box | OrientedBox],
+    boxes: Sequence[Box | OrientedBox],
 ) -> Iterator[set[int | None]]:
     """Put what is around the robot into its scenes, and take it away afterwards.
 
@@ -43,7 +44,7 @@ def surrounded(
         scene: What the camera's cloud shows.
         points: (..., 3) metres, cloud frame: the whole cloud.
         asked: Where the robot is.
-        obstacles: Boxes beside the cloud, cloud frame.
+        boxes: Obstacles beside the cloud, cloud frame.
 
     Yields:
         Numbers of objects that are the arm itself, as the camera sees it.
@@ -54,20 +55,20 @@ def surrounded(
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
     own = _own_objects(robot, joints, scene, T_base_cloud)
-    things = [_obstacle(row, box, T_base_cloud) for row, box in enumerate(obstacles)]
+    around = [_box(row, box, T_base_cloud) for row, box in enumerate(boxes)]
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
-        things.append(_support(scene, T_base_scene))
+        around.append(_support(scene, T_base_scene))
     if (cloud := _cloud(robot, joints, scene, points, T_base_scene)) is not None:
-        things.append(cloud)
-    names = [name for name, _, _ in things]
+        around.append(cloud)
+    names = [name for name, _, _ in around]
     for planned in (robot.scene, robot.straight):
-        _add(planned, robot, things)
+        _add(planned, robot, around)
     try:
         robot.straight.setCollisions([(HAND, name) for name in names], False)
         if robot.scene.hasCollisions(joints):
             again = robot.model.scene(robot.name, robot.base_frame, robot.flange_frame)
-            _add(again, robot, things)
+            _add(again, robot, around)
             pair = touching(again, robot.model, joints, names)
             fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
             raise InvalidRequest("options.robot.joints", f"a start where {pair} touch", fix)
@@ -78,19 +79,15 @@ def surrounded(
                 planned.removeGeometry(name)
 
 
-def _add(planned: core.Scene, robot: Robot, things: Sequence[Thing]) -> None:
+def _add(planned: core.Scene, robot: Robot, around: Sequence[Obstacle]) -> None:
+    """Put obstacles into a scene; they and the links that no joint moves may touch each other."""
     T_root_base = planned.forwardKinematics(robot.home, robot.base_frame)
-    for name, shape, pose in things:
+    for name, shape, pose in around:
         add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
         add(name, "universe", shape, np.asfortranarray(T_root_base @ pose), GREY)  # type: ignore[arg-type]
-    names = [name for name, _, _ in things]
-    still = [*robot.model.standing, *names]  # no joint moves them
-    pairs = [
-        (one, name)
-        for row, one in enumerate(still)
-        for name in names
-        if name not in still[: row + 1]
-    ]
+    names = [name for name, _, _ in around]
+    still = combinations([*robot.model.standing, *names], 2)
+    pairs = [(one, other) for one, other in still if other in names]
     planned.setCollisions(pairs, False)
 
 
@@ -125,12 +122,12 @@ def _near_robot(
     )
 
 
-def _obstacle(row: int, box: Box | OrientedBox, T_base_cloud: Float64) -> Thing:
+def _box(row: int, box: Box | OrientedBox, T_base_cloud: Float64) -> Obstacle:
     T_cloud_box, half = box_pose(box)
     return f"collision.obstacles.{row}", core.Box(*(2 * half)), T_base_cloud @ T_cloud_box
 
 
-def _support(scene: Scene, T_base_scene: Float64) -> Thing:
+def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
     """A slab below the support plane, its middle below the arm's base."""
     assert scene.support is not None
     normal = np.array(scene.support.normal)
@@ -148,7 +145,7 @@ def _cloud(
     scene: Scene,
     points: object,
     T_base_scene: Float64,
-) -> Thing | None:
+) -> Obstacle | None:
     """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
     flat = np.asarray(points).reshape(-1, 3)
     if scene.support is None:

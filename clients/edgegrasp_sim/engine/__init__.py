@@ -172,6 +172,27 @@ class HandModel:
     meshes: tuple[str, str] | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class ArmModel:
+    """An arm that carries a hand; J joints.
+
+    Attributes:
+        urdf: XML with absolute paths of meshes, without what is beyond the flange.
+        T_world_root: where its first link stands, (4, 4).
+        flange: link that the hand is on.
+        T_flange_hand: where the hand's frame is in the flange's, (4, 4).
+        joint_names: of the moving joints, J.
+        home: where they rest, (J,) radians or metres.
+    """
+
+    urdf: str
+    T_world_root: Matrix
+    flange: str
+    T_flange_hand: Matrix
+    joint_names: Sequence[str]
+    home: Matrix
+
+
 class World(ABC):
     """A physics world; a process may have several. Bodies that are removed are gone for good."""
 
@@ -245,6 +266,14 @@ class World(ABC):
     def add_hand(self, model: HandModel, position: Matrix) -> "Hand":
         """Add an open hand with its centre of mass there; a world may have one."""
 
+    def add_arm(self, arm: ArmModel, model: HandModel) -> "Arm":
+        """Add an arm at its home with an open hand on it, in place of a hand.
+
+        Raises:
+            ValueError: this engine has no arms.
+        """
+        raise ValueError(f"engine is {self.name}; an arm takes mujoco")
+
     @abstractmethod
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         """Distance along the line of sight for every pixel: (height, width) metres.
@@ -310,3 +339,17 @@ class Hand(Body):
     @abstractmethod
     def close_fingers(self) -> None:
         """Drive the fingers together with full force from now on."""
+
+
+class Arm(Hand):
+    """A hand on an arm: its joints move it, not its pose. Its contacts are those of all links."""
+
+    substeps: ClassVar[int]  # of a time step
+
+    @abstractmethod
+    def rest(self) -> None:
+        """Put the arm to its home at once, at rest, its hand open."""
+
+    @abstractmethod
+    def drive(self, positions: Matrix, velocities: Matrix) -> None:
+        """Have the joints' controllers follow (substeps, J) in the next time step."""

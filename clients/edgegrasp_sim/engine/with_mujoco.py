@@ -17,6 +17,8 @@ from edgegrasp_sim.engine import (
     GRAVITY,
     SLIDE_MASS,
     TIME_STEP,
+    Arm,
+    ArmModel,
     Body,
     Contact,
     Hand,
@@ -27,9 +29,13 @@ from edgegrasp_sim.engine import (
     World,
 )
 from edgegrasp_sim.engine.urdf import Surface, read_urdf
-from edgegrasp_sim.poses import Matrix
+from edgegrasp_sim.poses import Matrix, quaternion_xyzw, translation
 
 SUBSTEPS = 4  # of 3.125 ms in each time step
+ARM_SUBSTEPS = 13  # with an arm, for joints that hardly give: more than 1 kHz
+JOINT_INERTIA = 0.5  # kg m² or kg, of a joint's drive
+JOINT_STIFFNESS = 20000.0  # N m/rad or N/m, of its controller
+JOINT_DAMPING = 400.0  # N m s/rad, about critical
 CONTACT_SECONDS = 0.00625  # in which a contact pushes bodies apart; no less than two substeps
 IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # of contacts, see MuJoCo's `solimp`
 COLLISION_DEPTH = 0.0002  # metres, which the hand overlaps something hard by at about 100 N
@@ -58,6 +64,10 @@ CONSTANTS = {
 }
 _SHARES = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
 _OBJECTS, _HAND = 1, 2  # bits of what collides: objects with all, the hand not with itself
+# What MuJoCo would do to a URDF besides: join links that no joint moves, look for meshes nearby.
+_URDF_AS_IT_IS = (
+    '<mujoco><compiler fusestatic="false" strippath="false" discardvisual="true"/></mujoco></robot>'
+)
 _VISIBLE, _SOLID = 0, 3  # groups of shapes: seen by the camera, and met by rays
 
 
@@ -83,6 +93,7 @@ class MujocoWorld(World):
         self._bodies = 0
         self._states: dict[int, Any] = {}
         self._hand: MujocoHand | None = None
+        self.substeps = SUBSTEPS
         self._uid_of_geom: list[int] = []
         self._places: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
 
@@ -110,19 +121,22 @@ class MujocoWorld(World):
             tree = model.body_treeid[model.body(str(uid)).id]
             first, last = model.tree_dofadr[tree], model.tree_dofadr[tree] + model.tree_dofnum[tree]
             start = model.jnt_qposadr[model.dof_jntid[first]]
-            # Of a body, place and quaternion wxyz; behind it its links' joints.
-            self._places[uid] = (data.qpos[start : start + last - first + 1], data.qvel[first:last])
+            floats = model.jnt_type[model.dof_jntid[first]] == mujoco.mjtJoint.mjJNT_FREE
+            # Of a body that floats, place and quaternion wxyz; behind it its links' joints.
+            end = start + last - first + int(floats)
+            self._places[uid] = (data.qpos[start:end], data.qvel[first:last])
         return self._places[uid]
 
     def step(self, steps: int = 1) -> None:
         model, data, hand = self.model, self.data, self._hand
         for _ in range(steps):
             if hand is None or hand.way is None:
-                mujoco.mj_step(model, data, SUBSTEPS)
+                mujoco.mj_step(model, data, self.substeps)
                 continue
             for place in hand.way:
-                data.mocap_pos[0] = place
+                hand.aim(place)
                 mujoco.mj_step(model, data)
+                hand.watch()
             hand.way = None
 
     def first_hits(self, starts: Matrix, ends: Matrix) -> list[int]:
@@ -201,6 +215,49 @@ class MujocoWorld(World):
         body = self._add(np.asarray(position), (0.0, 0.0, 0.0, 1.0))
         joint = body.add_freejoint()
         joint.armature = ARM_INERTIA
+        palm = self._build_hand(body, model)
+        self._drag(body, model.tool_force)
+        self._hand = MujocoHand(self, body, palm, model)
+        self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
+        return self._hand
+
+    def add_arm(self, arm: ArmModel, model: HandModel) -> "MujocoArm":
+        self.substeps = ARM_SUBSTEPS
+        self.spec.option.timestep = TIME_STEP / ARM_SUBSTEPS
+        added = mujoco.MjSpec.from_string(arm.urdf.replace("</robot>", _URDF_AS_IT_IS))
+        for body in added.bodies[1:]:
+            body.gravcomp = 1.0
+            for geom in body.geoms:
+                geom.contype, geom.group = _HAND, _SOLID
+                geom.solref, geom.solimp = (CONTACT_SECONDS, 1.0), IMPEDANCE
+        name = str(self._bodies)
+        self._bodies += 1
+        x, y, z, w = quaternion_xyzw(arm.T_world_root)
+        place = self.spec.worldbody.add_frame(pos=arm.T_world_root[:3, 3], quat=(w, x, y, z))
+        self.spec.attach(added, prefix=f"{name} ", frame=place)
+        T_flange_body = arm.T_flange_hand @ translation(*model.centre)
+        x, y, z, w = quaternion_xyzw(T_flange_body)
+        flange = self.spec.body(f"{name} {arm.flange}")
+        body = flange.add_body(name=name, pos=T_flange_body[:3, 3], quat=(w, x, y, z))
+        palm = self._build_hand(body, model)
+        for joint in arm.joint_names:
+            self.spec.joint(f"{name} {joint}").armature = JOINT_INERTIA
+            self.spec.add_actuator(
+                name=f"{name} {joint}",
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                target=f"{name} {joint}",
+                gainprm=[JOINT_STIFFNESS] + 9 * [0.0],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[0.0, -JOINT_STIFFNESS, -JOINT_DAMPING] + 7 * [0.0],
+            )
+        self._changed = True
+        self._hand = added_arm = MujocoArm(self, body, palm, model)
+        added_arm.home = np.asarray(arm.home)
+        added_arm.rest()
+        return added_arm
+
+    def _build_hand(self, body: Any, model: HandModel) -> Matrix:
+        """Give a body palm and fingers; returns the palm's corners (P, 3)."""
         body.gravcomp = 1.0
         palm = [part - model.centre for part in model.palm]
         _weigh(body, model.mass, np.concatenate(palm))
@@ -244,14 +301,11 @@ class MujocoWorld(World):
                 forcelimited=True,
                 forcerange=(-model.finger_force, model.finger_force),
             )
-        self._drag(body, model.tool_force)
-        *slide, one, other = (joint.name for joint in body.find_all("joint")[1:])
+        *slide, one, other = (joint.name for joint in body.find_all("joint") if joint.name)
         self._couple(one, other, (0.0, 1.0))
         if model.advance is not None:
             self._couple(slide[0], one, model.advance)
-        self._hand = MujocoHand(self, body, np.concatenate(palm), model)
-        self._hand.set_pose(position, (0.0, 0.0, 0.0, 1.0))
-        return self._hand
+        return np.concatenate(palm)
 
     def render_depth(self, T_world_camera: Matrix, camera: Intrinsics) -> NDArray[np.float64]:
         return self._images.depth(self.model, self.data, T_world_camera, camera)
@@ -392,7 +446,7 @@ class MujocoHand(MujocoBody, Hand):
     def __init__(self, world: MujocoWorld, body: Any, points: Matrix, model: HandModel) -> None:
         super().__init__(world, body, points)
         self.hand = model
-        self.way: Matrix | None = None  # (SUBSTEPS, 3) of its target in the next time step
+        self.way: Matrix | None = None  # (substeps, D) of its target in the next time step
 
     @property
     def opening(self) -> float:
@@ -418,6 +472,54 @@ class MujocoHand(MujocoBody, Hand):
 
     def close_fingers(self) -> None:
         self.world.data.ctrl[:2] = -FINGER_SPEED
+
+    def aim(self, place: Matrix) -> None:
+        """Have its target there, (3,), in the next substep."""
+        self.world.data.mocap_pos[0] = place
+
+    def watch(self) -> None:
+        """Look at what the last substep did."""
+
+
+class MujocoArm(MujocoHand, Arm):
+    """A hand on an arm whose joints have controllers of place, which know the velocity too.
+
+    Its contacts are those of all substeps of the last time step that it was driven in.
+    """
+
+    substeps = ARM_SUBSTEPS
+    home: Matrix  # (J,)
+    _found: tuple[Contact, ...] = ()
+
+    @property
+    def position(self) -> Matrix:
+        return np.array(self.world.data.body(str(self.uid)).xpos)
+
+    def rest(self) -> None:
+        joints, velocities = self.world.places(self.uid)
+        data, count = self.world.data, len(self.home)
+        joints[:count], joints[count:-2], joints[-2:] = self.home, 0.0, self.hand.max_opening / 2
+        velocities[:] = 0.0
+        data.ctrl[:2] = FINGER_SPEED
+        self.aim(self.home)
+        self.way, self._found = None, ()
+
+    def drive(self, positions: Matrix, velocities: Matrix) -> None:
+        self.way = positions + JOINT_DAMPING / JOINT_STIFFNESS * velocities
+        self._found = ()
+
+    def aim(self, place: Matrix) -> None:
+        self.world.data.ctrl[2 : 2 + len(place)] = place
+
+    def watch(self) -> None:
+        self._found += tuple(self.world.contacts(self.uid))
+
+    def contacts(self) -> list[Contact]:
+        return list(self._found) or super().contacts()
+
+    def close_fingers(self) -> None:
+        super().close_fingers()
+        self._found = ()
 
 
 class _Images:

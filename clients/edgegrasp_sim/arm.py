@@ -1,0 +1,89 @@
+"""A hand on an arm, which follows a planned motion."""
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from edgegrasp_sim.engine import TIME_STEP, ArmModel, HandModel, World
+from edgegrasp_sim.hand import CLOSE_SECONDS, Gripper
+from edgegrasp_sim.poses import Matrix
+
+SETTLE_SECONDS = 0.25  # at the grasp and at the end, in which the joints arrive
+
+
+class ArmMotion(Protocol):
+    """A timed motion of J joints: to the pregrasp, on to the grasp, and away with what is held.
+
+    Attributes:
+        times: (T,) seconds.
+        positions: (T, J) radians or metres.
+        velocities: (T, J).
+        pregrasp_row: where the straight way in begins.
+        grasp_row: where the fingers close.
+    """
+
+    times: Any
+    positions: Any
+    velocities: Any
+    pregrasp_row: int
+    grasp_row: int
+
+
+def seconds_of(motion: ArmMotion) -> float:
+    """From home to the grasp, away, and home again as it came."""
+    return float(motion.times[-1] + motion.times[motion.pregrasp_row]) + CLOSE_SECONDS
+
+
+class ArmGripper(Gripper):
+    """The hand on an arm; `motion` is that of the next grasp."""
+
+    motion: ArmMotion | None = None
+
+    def __init__(self, world: World, hand: HandModel, arm: ArmModel) -> None:
+        self.world, self.model = world, hand
+        self.body = self._arm = world.add_arm(arm, hand)
+
+    def park(self) -> None:
+        """Put the arm to its home, the hand open."""
+        self._arm.rest()
+
+    def start(self, T_world_hand: Matrix) -> None:
+        """Begin at home, wherever the grasp is."""
+        self.park()
+
+    def approach(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Follow the motion to the grasp."""
+        motion = self._planned
+        self.on_the_way = True
+        for seconds in self._follow(0, motion.grasp_row):
+            self.on_the_way = seconds < motion.times[motion.pregrasp_row]
+            yield
+
+    def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
+        """Follow the motion away from the grasp."""
+        motion = self._planned
+        for _ in self._follow(motion.grasp_row, len(motion.times) - 1):
+            yield
+
+    @property
+    def _planned(self) -> ArmMotion:
+        if self.motion is None:
+            raise ValueError("the grasp has no motion of the arm; plan it with a robot")
+        return self.motion
+
+    def _follow(self, first: int, last: int) -> Iterator[float]:
+        """Yields the time after every time step."""
+        motion, substeps = self._planned, self._arm.substeps
+        begin, end = motion.times[first], motion.times[last]
+        steps = int(np.ceil((end - begin + SETTLE_SECONDS) / TIME_STEP))
+        for step in range(steps):
+            times = begin + (step + np.arange(1, substeps + 1) / substeps) * TIME_STEP
+            times = times.clip(max=end)
+            rows = [
+                np.column_stack([np.interp(times, motion.times, joint) for joint in table.T])
+                for table in (motion.positions, motion.velocities)
+            ]
+            self._arm.drive(*rows)
+            self.world.step()
+            yield float(times[-1])
