@@ -64,6 +64,8 @@ MAX_GROWTH = 0.05  # of memory, from the third quarter of the attacks to the las
 ATTACKER = "127.0.0.2"  # fairness is between addresses
 HELD_SECONDS = 8.0  # for which the second attacker holds what it opened
 PAGES, CHECKS, STREAMS = 540, 200, 16  # that it opens
+OF_ONE = 90  # calls of one connection, fewer than the server allows
+CHECK, STREAM = "/grpc.health.v1.Health/Check", "/edgegrasp.v1.GraspService/DetectGraspsStream"
 ROOM = ("--max-queue-length", "512", "--max-streams", "64")  # for all of the clients
 
 
@@ -301,14 +303,12 @@ def lock_out(url: str, address: str, stop: Any, told: Any) -> None:
             for _ in range(PAGES):
                 with contextlib.suppress(OSError):
                     came["pages"] += bool(stack.enter_context(connect(url)).send(page))
-            with contextlib.suppress(OSError):
-                calls = stack.enter_context(connect(address))
-                calls.sendall(http2_opening())
-                for number in range(CHECKS + STREAMS):
-                    check = number < CHECKS
-                    path = "/grpc.health.v1.Health/Check"
-                    path = path if check else "/edgegrasp.v1.GraspService/DetectGraspsStream"
-                    calls.sendall(http2_headers(path, 2 * number + 1))
+            for number, path in enumerate([CHECK] * CHECKS + [STREAM] * STREAMS):
+                with contextlib.suppress(OSError):
+                    if number % OF_ONE == 0:
+                        connection = stack.enter_context(connect(address))
+                        connection.sendall(http2_opening())
+                    connection.sendall(http2_headers(path, 2 * (number % OF_ONE) + 1))
                     came["silent calls"] += 1
             stop.wait(HELD_SECONDS)
     told.send(dict(came))

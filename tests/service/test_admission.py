@@ -51,7 +51,7 @@ async def test_a_client_alone_may_have_every_place() -> None:
     inside = Inside(Admission(workers=2, max_waiting=4, max_bytes=100))
     for _ in range(6):
         assert not (await inside.enter("a")).done()
-    with pytest.raises(Overloaded, match="6 requests are in it"):
+    with pytest.raises(Overloaded, match="it holds 6 requests"):
         await (await inside.enter("a"))
     await inside.leave()
     await inside.admission.empty()

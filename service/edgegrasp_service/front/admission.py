@@ -1,4 +1,4 @@
-"""Who is let in: how many requests and bytes the server holds, and whose turn it is."""
+"""Admission: how many requests and bytes the server holds, shared fairly between clients."""
 
 import asyncio
 import math
@@ -14,19 +14,19 @@ MARGIN = 1.5  # the wait is told from a median; half of the requests take longer
 
 
 class Ticket:
-    """The right of one request to be in the server."""
+    """The place of one request in the server."""
 
     def __init__(self, client: str) -> None:
         self.client = client
-        self.whole = False  # whether its body is here
-        self.at_work = False  # whether a worker has its job
+        self.whole = False  # whether its body has arrived
+        self.at_work = False  # whether a worker has begun it
         self.bytes = 0
         self.left = False
         self._reason: ServiceError | None = None
         self._timeout: asyncio.Timeout | None = None
 
     def refuse(self, reason: ServiceError) -> None:
-        """End the request, wherever it is, with an error."""
+        """End the request with an error, at whatever stage it is."""
         self._reason = reason
         if self._timeout is not None and not self._timeout.expired():
             self._timeout.reschedule(asyncio.get_running_loop().time())
@@ -35,8 +35,8 @@ class Ticket:
 class Admission:
     """Bounds the requests and the bytes in the server; used in the event loop only.
 
-    Every client may have all places and half of the bytes while nobody else asks. Where there is no
-    room left, who holds most of it gives some up to a client that would still hold less.
+    A single client may use all places and half of the bytes. When there is no room left, the
+    client that holds most loses a request to a client that would still hold less.
 
     Args:
         workers: Requests worked on at a time.
@@ -63,13 +63,12 @@ class Admission:
 
     @asynccontextmanager
     async def admit(self, client: str, deadline: float, size: int) -> AsyncIterator[Ticket]:
-        """Be in the server for a while.
+        """Hold a place in the server.
 
         Args:
-            client: The name of the token or else the address; requests of one are told apart
-                from those of others.
-            deadline: By the clock of the event loop; what happens inside is cancelled then.
-            size: Bytes that its body may have. Waits until there is room for them.
+            client: The name of the token, or else the address.
+            deadline: On the event loop's clock; the body of the context is cancelled then.
+            size: Largest size of the body in bytes. Waits until there is room for it.
 
         Raises:
             Overloaded: There is no place, or its turn would come after its deadline.
@@ -92,25 +91,27 @@ class Admission:
             self._leave(ticket)
 
     def _make_room(self, client: str) -> None:
-        """Raise Overloaded unless there is a place for one more, or another client loses one."""
+        """Raise Overloaded unless there is a free place, or another client loses one."""
         if len(self._tickets) < self._max_tickets:
             return
         counts = Counter(ticket.client for ticket in self._tickets)
         holder, count = counts.most_common(1)[0]
         if count <= counts[client] + 1 or not self._give_up(holder):
-            raise self._full(f"{len(self._tickets)} requests are in it")
+            raise self._full(f"it holds {len(self._tickets)} requests")
 
     def _give_up(self, holder: str) -> bool:
-        """End the latest request of a client that no worker has; returns whether there is one."""
+        """Refuse the client's latest request that no worker has; returns whether it has one."""
         for ticket in reversed(self._tickets):
             if ticket.client == holder and not ticket.at_work:
-                ticket.refuse(self._full("Others wait, and you hold most of its places"))
+                held = sum(one.client == holder for one in self._tickets)
+                why = f"this client holds {held} of {self._max_tickets} places, and others wait"
+                ticket.refuse(self._full(why))
                 self._leave(ticket)
                 return True
         return False
 
     def resize(self, ticket: Ticket, size: int) -> None:
-        """Say how many bytes a ticket really holds."""
+        """Set how many bytes a request holds now."""
         if not ticket.left:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
@@ -124,7 +125,7 @@ class Admission:
         self._waiting.clear()
 
     def hold(self, size: int) -> bool:
-        """Hold bytes of no request, or no longer (less than 0); returns whether there is room."""
+        """Reserve bytes of no request, or free them (negative); returns whether they fit."""
         if size > 0 and self.held_bytes + size > self._max_bytes:
             return False
         self.held_bytes += size
@@ -133,7 +134,7 @@ class Admission:
         return True
 
     def worked(self, seconds: float) -> None:
-        """Tell how long a worker took."""
+        """Record how long a worker took."""
         self._took.append(seconds)
 
     def refuse_all(self, reason: ServiceError) -> None:
@@ -147,9 +148,9 @@ class Admission:
 
     @property
     def _wait(self) -> float:
-        """Seconds until a new request has its turn, at the latest pace."""
+        """Estimated seconds until a worker begins a new request."""
         pace = statistics.median(self._took) if self._took else 0.0
-        ahead = sum(ticket.whole for ticket in self._tickets)  # others may be slow to arrive
+        ahead = sum(ticket.whole for ticket in self._tickets)  # bodies of others may arrive late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _check_pace(self, deadline: float) -> None:
@@ -167,7 +168,7 @@ class Admission:
 
     def _full(self, why: str) -> Overloaded:
         seconds = _whole_seconds(self._wait)
-        return Overloaded(f"The server is full: {why}. Try again in {seconds} s.", seconds)
+        return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, ticket: Ticket, size: int) -> None:
         """Wait until the bytes of all requests, and of this client, leave room for so many."""
@@ -197,5 +198,5 @@ class Admission:
 
 
 def _whole_seconds(wait: float) -> int:
-    """As in the header Retry-After: whole, and never none."""
+    """Whole seconds, at least 1, as the header Retry-After has them."""
     return max(1, math.ceil(wait))

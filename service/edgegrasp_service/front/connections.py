@@ -1,9 +1,9 @@
-"""Connections and what they may hold: how many, how long silent, how slow, and who loses one.
+"""Limits on connections: how many there are, how long they may be idle, how slow they may be.
 
-All defences against clients that send or take slowly or not at all are here: `Places` bounds
-connections, streams, pages and reads; `receive` and `send` bound the time of bodies and answers;
-`HttpProtocol` is HTTP/1.1 with the bounds that uvicorn leaves open; `grpc_bounds` and `trim_grpc`
-are those of gRPC.
+This module holds every defence against slow and silent clients. `Places` limits the number of
+connections, streams, pages and reads; `receive` and `send` limit the time of bodies and answers;
+`HttpProtocol` adds to uvicorn the limits that it lacks; `grpc_bounds` and `trim_grpc` do the same
+for gRPC.
 """
 
 import asyncio
@@ -33,28 +33,28 @@ from edgegrasp_service.observability import network_of
 from edgegrasp_service.settings import Settings
 
 # Connections of HTTP
-HEALTH_PLACES = 16  # beside max_connections, which no request but for health holds
-BACKLOG = 1024  # that wait to be accepted; what does not fit tries again a second later
-ACCEPTED = 16  # at once, between which others have their turn
+HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
+BACKLOG = 1024  # waiting to be accepted; beyond that a client retries after a second
+ACCEPTED = 16  # in one turn of the event loop
 KEEP_ALIVE_SECONDS = 75  # longer than clients do: no request meets a connection that closes
-LINGER_SECONDS = 5.0  # for a client to take what is not sent yet, though it may still send
-MANY_PIECES, SMALL_PIECE = 1024, 16  # so many chunks of so few bytes are no body of a cloud
-PAGES = 16  # answered at a time
-PAGE_GRACE_SECONDS = 10.0  # for a page to be taken, while others wait for its place
+LINGER_SECONDS = 5.0  # for a refused client to read its answer
+MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than that, smaller than that: refused
+PAGES = 16  # sent at a time
+PAGE_GRACE_SECONDS = 10.0  # after which a page gives way to another one
 
 # Calls of gRPC
-CALLS = 100  # of one connection at a time; those beyond wait at their client
+CALLS = 100  # of one connection at a time; further ones wait in the client
 SMALL_READS = 8  # messages of health checks and reflection read at a time
 SMALL_READ_SECONDS = 2.0
 WATCHERS = 64  # of health
 STREAM_IDLE_SECONDS = 300.0  # for which a stream may stay open without a message
-STREAM_GRACE_SECONDS = 10.0  # the same, while others wait for its place
+STREAM_GRACE_SECONDS = 10.0  # after which an idle stream gives way to another one
 
 # Connections of gRPC
 LOOKAHEAD_BYTES = 2**20  # of a message, while nobody reads it yet; 87,000 points
 SPARE_BYTES = 2**20  # a message so much over the limit is refused with field, value and fix
-SPARE_CONNECTIONS = 2  # times as many as may stay are accepted
-TRIM_SECONDS = 0.5  # until those that are too many are closed
+SPARE_CONNECTIONS = 2  # times max_connections are accepted before the oldest are closed
+TRIM_SECONDS = 0.5  # between two checks for too many connections
 DESCRIPTORS = Path("/proc/self/fd")
 LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
 
@@ -66,17 +66,16 @@ class Place:
 
     def __init__(self, owner: str, lose: Callable[[], None]) -> None:
         self.owner, self.lose = owner, lose
-        self.idle = True  # nothing is lost with it
+        self.idle = True  # can be evicted
         self.used = time.monotonic()
 
 
 class Places:
-    """So many connections, streams, pages or reads at a time.
+    """A limited number of connections, streams, pages or reads.
 
-    Where all are taken, a newcomer ends one that is idle: of whoever has most of those, the one
-    that was idle for longest. One that was used within `grace` seconds is lost only to a newcomer
-    who then still has less. `spare` places are never busy, so that there is always one for a
-    newcomer.
+    When all places are taken, a newcomer evicts an idle one: the longest idle of the client that
+    has most idle places. A place used within the last `grace` seconds is evicted only for a client
+    that then still has fewer. `spare` places cannot be busy, so that one is always left.
     """
 
     def __init__(self, most: int, grace: float = 0.0, spare: int = 0) -> None:
@@ -87,12 +86,10 @@ class Places:
         return len(self._taken)
 
     def take(self, owner: str, lose: Callable[[], None]) -> Place:
-        """A place, until `leave`; `lose` is called if it is lost. Raises Overloaded."""
+        """Take a place until `leave`; `lose` is called on eviction. Raises Overloaded."""
         if len(self._taken) >= self._most:
-            since, counts = (
-                time.monotonic() - self._grace,
-                Counter(one.owner for one in self._taken),
-            )
+            since = time.monotonic() - self._grace
+            counts = Counter(one.owner for one in self._taken)
             mine = counts[owner] + 1
             idle = [
                 place
@@ -110,7 +107,7 @@ class Places:
         return place
 
     def use(self, place: Place, idle: bool = True) -> None:
-        """Something happens at a place, which is idle then or not; raises Overloaded."""
+        """Mark a place as used now, and as idle or busy. Raises Overloaded."""
         if place.idle and not idle and self._spare:
             busy = sum(not other.idle for other in self._taken)
             if busy >= self._most - self._spare:
@@ -120,15 +117,15 @@ class Places:
             self._taken[place] = self._taken.pop(place)
 
     def leave(self, place: Place) -> None:
-        """Give a place back."""
+        """Return a place."""
         self._taken.pop(place, None)
 
     @asynccontextmanager
     async def hold(self, owner: str) -> AsyncIterator[Place]:
-        """Have a place for a while; what happens inside is cancelled if it is lost.
+        """Hold a place; the body of the context is cancelled on eviction.
 
         Raises:
-            Overloaded: There is no place, or it was lost.
+            Overloaded: There is no place, or it was evicted.
         """
         loop = asyncio.get_running_loop()
         try:
@@ -141,7 +138,7 @@ class Places:
         except TimeoutError:
             if not ends.expired():
                 raise
-            raise Overloaded("The server is full, and others wait. Try again in 1 s.") from None
+            raise Overloaded("Another client got this place. Try again in 1 s.") from None
 
 
 async def receive(
@@ -179,7 +176,7 @@ async def send(settings: Settings, sending: Awaitable[None], size: int) -> None:
 
 
 class HttpProtocol(HttpToolsProtocol):
-    """Ends connections whose headers do not come or whose answers nobody takes; closes gently."""
+    """Closes connections whose headers or readers are too slow; lets refused clients read why."""
 
     def __init__(self, settings: Settings, places: Places, **arguments: Any) -> None:
         super().__init__(**arguments)
@@ -194,7 +191,7 @@ class HttpProtocol(HttpToolsProtocol):
         self._place = Place("", lambda: None)
 
     def connection_made(self, transport: Any) -> None:
-        """Wait for the first header."""
+        """Take a place, and wait for the first headers."""
         super().connection_made(transport)
         self.transport = _GentleTransport(  # type: ignore[assignment]
             transport, lambda: self._receiving
@@ -207,7 +204,7 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(error)
 
     def data_received(self, data: bytes) -> None:
-        """Take a part of a request; nothing of one that was refused."""
+        """Parse received bytes, unless the connection is closing."""
         if self.transport.is_closing():
             return
         self._header_bytes += len(data)
@@ -220,7 +217,7 @@ class HttpProtocol(HttpToolsProtocol):
             self._refuse(HeadersTooLarge("headers", f"{self._header_bytes} bytes", most))
 
     def on_message_begin(self) -> None:
-        """A request begins."""
+        """Prepare for a new request."""
         super().on_message_begin()
         self.scope["state"]["abort"] = self.transport.abort
         self._receiving = True
@@ -228,11 +225,10 @@ class HttpProtocol(HttpToolsProtocol):
         self._await_headers()
 
     def on_headers_complete(self) -> None:
-        """Its headers are there."""
+        """Mark the connection as busy for requests to /v1/."""
         self._in_headers = False
         _cancel(self._header_timer)
         self._header_timer = None
-        # How many of these there are is bounded elsewhere, and somebody waits for each.
         try:
             self._places.use(self._place, idle=not self.url.startswith(b"/v1/"))
         except Overloaded as error:
@@ -241,7 +237,7 @@ class HttpProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """A piece of its body."""
+        """Refuse bodies in very small chunks."""
         self._pieces += 1
         self._body_bytes += len(body)
         if self._pieces > MANY_PIECES and self._body_bytes < self._pieces * SMALL_PIECE:
@@ -251,41 +247,41 @@ class HttpProtocol(HttpToolsProtocol):
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """It is all there."""
+        """Note that the whole request has arrived."""
         self._receiving = False
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """It is answered."""
+        """Mark the connection as idle."""
         self._places.use(self._place)
         super().on_response_complete()
 
     def pause_writing(self) -> None:
-        """The client takes its answer more slowly than it is made: for some time only."""
+        """Close the connection unless the client reads its answer in time."""
         super().pause_writing()
         seconds = self._settings.write_seconds
         seconds += self.transport.get_write_buffer_size() / self._settings.min_bytes_per_second
         self._write_timer = self.loop.call_later(seconds, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """It has taken most of it."""
+        """Stop that timer."""
         _cancel(self._write_timer)
         super().resume_writing()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The end."""
+        """Stop timers and return the place."""
         _cancel(self._header_timer)
         self.resume_writing()
         self._places.leave(self._place)
         super().connection_lost(exc)
 
     def send_400_response(self, msg: str) -> None:
-        """Say why what came is no request."""
+        """Answer a malformed request."""
         fix = "Send an HTTP/1.1 request."
         self._refuse(self._refusal or InvalidRequest("request", "malformed HTTP", fix))
 
     def _refuse(self, error: EdgeGraspError) -> None:
-        """Answer past the application, and close."""
+        """Send an error without the application, and close."""
         pending = self.cycle is not None and not self.cycle.response_complete
         if pending and self.cycle.response_started:
             self.transport.abort()  # it has half an answer
@@ -298,7 +294,7 @@ class HttpProtocol(HttpToolsProtocol):
             f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
         )
         if pending:
-            self.cycle.disconnected = True  # the application answers nothing any more
+            self.cycle.disconnected = True  # the application can send nothing more
             self.cycle.message_event.set()
         self.transport.write(head.encode() + body)
         self.transport.close()
@@ -321,9 +317,9 @@ def _cancel(timer: asyncio.TimerHandle | None) -> None:
 
 
 class _GentleTransport:
-    """A transport whose `close` lets the client read its answer, but not hold the connection.
+    """A transport whose `close` leaves the client a few seconds to read its answer.
 
-    A socket that is closed while bytes arrive is reset, and an answer on its way may be lost.
+    A socket that is closed while bytes arrive is reset, and the answer may be lost.
     """
 
     def __init__(self, transport: asyncio.Transport, receiving: Callable[[], bool]) -> None:
@@ -335,16 +331,16 @@ class _GentleTransport:
         return getattr(self._transport, name)
 
     def is_closing(self) -> bool:
-        """Whether it is closed, or soon will be."""
+        """Whether it is closed or closing."""
         return self._closing or self._transport.is_closing()
 
     def write(self, data: bytes) -> None:
-        """Send, unless nothing more can be."""
+        """Send, unless it is closing."""
         if not self._closing:
             self._transport.write(data)
 
     def close(self) -> None:
-        """Send what is written, drop what comes in, and close."""
+        """Send what is buffered, discard what is received, and close."""
         if self.is_closing():
             return
         self._closing = True
@@ -365,30 +361,28 @@ def grpc_bounds(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_receive_message_length", settings.max_body_bytes + SPARE_BYTES),
         ("grpc.max_metadata_size", settings.max_header_bytes),
         ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
-        # What is compressed is unpacked before its length is known: none of it.
+        # Compressed messages are unpacked before their size is known: none are accepted.
         ("grpc.compression_enabled_algorithms_bitset", 1),
         ("grpc.so_reuseport", 0),
-        # Python accepts one call in a turn of its event loop: few may wait before a health check.
+        # One call is accepted per turn of the event loop: few may wait before a health check.
         ("grpc.max_concurrent_streams", CALLS),
         ("grpc.max_allowed_incoming_connections", SPARE_CONNECTIONS * settings.max_connections),
         ("grpc.server_handshake_timeout_ms", int(settings.read_seconds * 1000)),
         ("grpc.max_connection_idle_ms", 300_000),
-        # A cloud comes in one go, without waiting for leave to send the rest of it.
+        # A cloud arrives without waiting for window updates.
         ("grpc.http2.lookahead_bytes", LOOKAHEAD_BYTES),
-        ("grpc.http2.bdp_probe", 0),  # it would let all of a message in that nobody reads
-        # A client that vanished without a word is found out, and its streams end.
+        ("grpc.http2.bdp_probe", 0),  # would buffer whole messages that nobody reads yet
+        # Clients that vanished are noticed, and their streams end.
         ("grpc.keepalive_time_ms", 30_000),
         ("grpc.keepalive_timeout_ms", 10_000),
-        # Clients look up the servers anew now and then, and so find those that were added.
+        # Clients resolve the name again from time to time, and find new servers.
         ("grpc.max_connection_age_ms", 300_000),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", 20_000),
     ]
 
 
 async def trim_grpc(port: int, most: int, others: Callable[[], int]) -> None:
-    """Close connections to gRPC's port that are too many; gRPC cannot tell whose they are.
-
-    Does not end.
+    """Close surplus connections to gRPC's port, for ever; gRPC itself cannot limit them by client.
 
     Args:
         port: Of gRPC.
@@ -403,7 +397,7 @@ async def trim_grpc(port: int, most: int, others: Callable[[], int]) -> None:
 
 
 def _trim(connections: list[socket.socket], most: int) -> None:
-    """Shut down, of whoever has most of them, those that have been silent for longest."""
+    """Shut down the longest silent connections of the clients that have most."""
     found: dict[str, list[tuple[int, socket.socket]]] = {}
     for connection in connections:
         with contextlib.suppress(OSError):
@@ -419,7 +413,7 @@ def _trim(connections: list[socket.socket], most: int) -> None:
 
 
 def _accepted(port: int, stack: contextlib.ExitStack) -> list[socket.socket]:
-    """Those that this process has accepted at a port, until the stack closes."""
+    """Duplicates of the accepted connections to a port, open until the stack closes."""
     found = []
     for link in DESCRIPTORS.iterdir():
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""The gRPC transport: methods on raw messages, health, reflection, and what is around each call.
+"""The gRPC transport: methods on raw messages, health, reflection, and checks around each call.
 
-Every method is served as a stream of messages in and out, which is the same on the wire: a unary
-method then reads its message once there is room for it, and knows when its answer was taken.
+Every method is served as a stream in both directions, which is the same on the wire: a unary
+method can then read its message when there is room for it, and knows when its answer was read.
 """
 
 import asyncio
@@ -115,13 +115,13 @@ class GrpcServer:
         await self._server.start()
 
     async def set_serving(self, serving: bool) -> None:
-        """Tell health checks."""
+        """Set what health checks answer."""
         status = STATES.SERVING if serving else STATES.NOT_SERVING
         for name in ("", SERVICE.full_name):
             await self._health.set(name, status)
 
     async def stop(self, grace_seconds: float) -> None:
-        """Refuse new requests, and wait for those in flight."""
+        """Refuse new requests and wait for those in flight."""
         await self._server.stop(grace_seconds)
 
 
@@ -156,7 +156,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         }
 
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
-        """The handler of a path, also of one that there is not."""
+        """The handler of a path, known or not."""
         path: str = handler_call_details.method
 
         async def handle(messages: Any, context: Any) -> None:
@@ -184,7 +184,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
                     await context.send_initial_metadata(name)
                 await behave(context)
             except Cancelled:
-                raise asyncio.CancelledError from None  # what is not taken holds up an error too
+                raise asyncio.CancelledError from None  # an error could not be sent either
             except EdgeGraspError as error:
                 await _abort(context, report(error))
             except aio.AbortError:
@@ -208,19 +208,19 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         return Job(method, "grpc", body)
 
     async def _stream(self, context: Any) -> None:
-        """Answer the requests of one stream, at work side by side, in their order.
+        """Answer the requests of one stream in their order; several are processed in parallel.
 
-        A request is read only when fewer than `max_stream_requests` are unanswered; what the client
-        sends beyond that stays with it. Where it leaves, what is under way is cancelled.
+        A request is read only when fewer than `max_stream_requests` are unanswered; flow control
+        holds the client up. When it disconnects, requests in progress are cancelled.
 
         Raises:
             NotReady: The server is stopping; what was read is answered before.
             InvalidRequest: A message is no DetectGraspsStreamRequest.
             RequestTimeout: No message came for long.
-            Overloaded: There is no place for the stream, or another client has it.
+            Overloaded: There is no place for the stream, or it was given to another client.
         """
         service, call = self._service, current_call()
-        ahead: deque[asyncio.Task[bytes]] = deque()  # what is not answered yet
+        ahead: deque[asyncio.Task[bytes]] = deque()  # unanswered requests
         stopping = asyncio.create_task(service.stopping.wait())
         reading: asyncio.Task[Any] | None = asyncio.create_task(_next_request(context))
         try:
@@ -254,8 +254,8 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         await context.write(grasp_pb2.ListModelsResponse(models=models))
 
     async def _reload_models(self, context: Any) -> None:
-        loaded = await self._reloader.reload(current_call())
-        models = [grasp_pb2.Model(**facts) for facts in loaded]
+        call = current_call()
+        models = [grasp_pb2.Model(**facts) for facts in await self._reloader.reload(call)]
         await context.write(grasp_pb2.ReloadModelsResponse(models=models))
 
     async def _check_health(self, context: Any) -> None:
@@ -284,7 +284,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             await context.write(answer)
 
     async def _read_small(self, kind: Any, context: Any) -> Any:
-        """The next message of a method whose messages are small; None: there are no more."""
+        """The next message of a method with small messages; None at the end."""
         try:
             async with self._small_reads.hold(context.peer()):
                 async with asyncio.timeout(SMALL_READ_SECONDS):
@@ -321,7 +321,7 @@ def _address(peer: str) -> str:
 
 
 async def _abort(context: Any, problem: Problem) -> NoReturn:
-    """End a gRPC call with an error: ours and those of google.rpc, and the request's id."""
+    """End a call with an error: our ErrorDetail, google.rpc's details and the request id."""
     call = current_call()
     call.problem = problem
     code = grpc.StatusCode[problem.code]
@@ -357,7 +357,7 @@ def _details(problem: Problem) -> list[AnyMessage]:
 
 
 async def _first_of(tasks: set[asyncio.Task[Any]], timeout: float | None) -> None:
-    """Return once one is done; raises RequestTimeout."""
+    """Wait until one is done; raises RequestTimeout."""
     done, _ = await asyncio.wait(tasks, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
     if not done:
         value = f"no message in {timeout:.0f} s"
@@ -365,9 +365,9 @@ async def _first_of(tasks: set[asyncio.Task[Any]], timeout: float | None) -> Non
 
 
 async def _next_request(context: Any) -> dict[str, Any] | None:
-    """The fields of the next DetectGraspsStreamRequest; None: there are no more.
+    """The fields of the next DetectGraspsStreamRequest; None at the end.
 
-    Read here: protobuf would take seconds of the front for millions of fields.
+    Not parsed by protobuf, which takes seconds for millions of fields.
     """
     data = await context.read()
     if data is EOF:
@@ -391,7 +391,7 @@ async def _next_request(context: Any) -> dict[str, Any] | None:
 
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:
-    """The number at a place, and the place behind it."""
+    """The number at a position, and the position after it."""
     value = shift = 0
     while data[place] & 128 and shift < 63:
         value |= (data[place] & 127) << shift

@@ -7,7 +7,7 @@ import logging
 import math
 import re
 from collections.abc import AsyncIterator, Coroutine
-from contextlib import asynccontextmanager, nullcontext
+from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ CHALLENGE = 'Bearer realm="edgegrasp"'
 TIMEOUT = "X-Request-Timeout"
 NUMBER = re.compile(r"\d{1,9}(\.\d*)?|\.\d+|\d{1,9}(\.\d*)?[eE][+-]?\d{1,2}", re.ASCII)
 
-WORK: dict[str, Method] = {  # what workers do
+WORK: dict[str, Method] = {  # answered by workers
     "/v1/grasps": "DetectGrasps",
     "/v1/grasps:score": "ScoreGrasps",
     "/v1/outcomes": "RecordOutcome",
@@ -71,7 +71,7 @@ METHODS = {
     "/docs": "Docs",
     "/openapi.json": "Docs",
 }
-# Without a token: whoever restarts a server need not know one, and the pages tell no secret.
+# Without a token: probes need none, and the pages hold no secrets.
 OPEN = ("Live", "Ready", "Docs")
 
 # The contract, written by hand as grasp.proto is.
@@ -113,7 +113,7 @@ class HttpMiddleware:
                         (b"content-security-policy", POLICIES.get(path, POLICY).encode()),
                         (b"x-content-type-options", b"nosniff"),
                     ]
-                    # What still comes in of a request that is answered is not waited for.
+                    # An answered request whose body is still arriving is not waited for.
                     if not whole or self._service.stopping.is_set():
                         extra.append((b"connection", b"close"))
                     message = {**message, "headers": [*message.get("headers", []), *extra]}
@@ -129,7 +129,7 @@ class HttpMiddleware:
             except Exception as error:
                 if not isinstance(error, EdgeGraspError | HTTPException):
                     logger.exception("%s failed", method)
-                if call.code:  # half an answer is none
+                if call.code:  # half an answer is sent: the client must see that it is incomplete
                     call.problem, call.code = report(error), ""
                     scope["state"]["abort"]()
                     await _gone(receive)
@@ -158,11 +158,11 @@ class HttpMiddleware:
             raise UnsupportedMediaType("Content-Encoding", repr(encoding[:40]), fix)
 
     def _check_host(self, host: str) -> None:
-        """Refuse names that a stranger's web page may have pointed here, to read the answers."""
+        """Refuse host names that a malicious web page may have pointed here (DNS rebinding)."""
         name = re.sub(r":\d*$", "", host).strip("[]").lower()
         allowed = self._service.settings.allowed_hosts
         if not allowed and (self._service.tokens.required or "." not in name or is_address(name)):
-            return  # nobody can register a name without a dot, nor an address
+            return  # such names cannot be registered
         if name not in allowed and "*" not in allowed and name != self._service.settings.host:
             fix = "Use an address of the server, or name it in the setting allowed_hosts."
             raise InvalidRequest("Host", brief(host), fix)
@@ -170,10 +170,9 @@ class HttpMiddleware:
 
 def is_address(name: str) -> bool:
     """Whether it is an IP address."""
-    try:
+    with suppress(ValueError):
         return bool(ipaddress.ip_address(name))
-    except ValueError:
-        return False
+    return False
 
 
 def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -> Router:
@@ -233,7 +232,7 @@ def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -
 
 
 class _Work:
-    """A route to the workers: receives a body once there is room, and sends what they answer."""
+    """A route to the workers: reads a body once there is room, and sends their answer."""
 
     def __init__(self, service: GraspService, method: Method) -> None:
         self._service = service
@@ -280,7 +279,7 @@ async def _send_answer(call: Call, answer: Answer, send: Send) -> None:
 
 
 async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> Answer:
-    """What the work gives; once the client closes, it is cancelled, and Cancelled raised."""
+    """Await work, but cancel it and raise Cancelled when the client disconnects."""
     working = asyncio.create_task(work)
     gone = asyncio.create_task(_gone(receive))
     try:
@@ -294,13 +293,13 @@ async def _unless_gone(receive: Receive, work: Coroutine[Any, Any, Answer]) -> A
 
 
 async def _gone(receive: Receive) -> None:
-    """Return once the client has closed the connection."""
+    """Wait until the client has disconnected."""
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
 def requested_timeout(headers: Headers) -> float:
-    """Seconds that the caller waits; infinity: it does not say."""
+    """The timeout in the header, seconds; infinity without one."""
     text = headers.get(TIMEOUT)
     if text is None:
         return math.inf
@@ -311,7 +310,7 @@ def requested_timeout(headers: Headers) -> float:
 
 
 def _problem_response(call: Call, problem: Problem) -> Response:
-    """The answer that tells of an error."""
+    """The answer for an error."""
     call.problem = problem
     headers = {}
     if problem.retry_after is not None:

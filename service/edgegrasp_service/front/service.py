@@ -1,4 +1,4 @@
-"""What both transports do with a request: name it, let it in, hand it on, and tell of it."""
+"""What both transports do with a request: check, admit, run, record and report it."""
 
 import asyncio
 import contextlib
@@ -33,21 +33,21 @@ from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, Worke
 logger = logging.getLogger(__name__)
 
 MAX_HEADERS = 64
-MOST_DEATHS = 3  # of workers for one request; a crash counts as so many
-HARMFUL_SECONDS = 600.0  # for which such a request is refused
-MOST_HARMFUL = 1000  # of which this is known
+MOST_DEATHS = 3  # of workers after which a request is refused; a crash counts as 3
+HARMFUL_SECONDS = 600.0  # how long it is refused
+MOST_HARMFUL = 1000  # requests remembered
 
 Observer = Callable[[Call], None]
 Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
-    """The front without a transport.
+    """The front process, apart from its transports.
 
     Attributes:
-        tokens: Replaced when they are read anew.
-        stopping: Set: new requests are refused.
-        in_flight: Calls that have not ended.
+        tokens: Replaced on reload.
+        stopping: When set, new requests are refused.
+        in_flight: Number of calls that have not ended.
         record: Called with each job and its answer.
     """
 
@@ -83,7 +83,7 @@ class GraspService:
 
     @contextmanager
     def observe(self, call: Call) -> Iterator[None]:
-        """Work on a call, and tell the observers when it has ended; HTTP sets its `code`."""
+        """Process a call, and notify the observers when it has ended; HTTP sets its `code`."""
         CALL.set(call)
         self.in_flight += 1
         try:
@@ -107,11 +107,11 @@ class GraspService:
 
     @asynccontextmanager
     async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
-        """Let a request in until its answer is sent; all of it ends with its deadline.
+        """Hold a place for a request until its answer is sent, at most until its deadline.
 
         Args:
             call: The request.
-            size: Bytes that the body may have; there is room for them inside.
+            size: Largest size of the body in bytes, reserved for it.
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
@@ -128,7 +128,7 @@ class GraspService:
             call.end_stage("write")
 
     async def answer(self, call: Call, ticket: Ticket, job: Job) -> Answer:
-        """Have a worker answer a request that was let in and whose body is here.
+        """Have a worker answer an admitted request whose body has arrived.
 
         Raises:
             PayloadTooLarge: The body is over the limit.
@@ -166,17 +166,17 @@ class GraspService:
         return answer
 
     async def drain(self, grace: float) -> None:
-        """Refuse new requests, and wait for those accepted; after `grace` seconds give them up."""
+        """Refuse new requests and wait for accepted ones; abandon them after `grace` seconds."""
         self.stopping.set()
         try:
             async with asyncio.timeout(grace):
                 await self.admission.empty()
         except TimeoutError:
-            logger.warning("grace is over: requests in flight are given up")
+            logger.warning("grace is over: requests in flight are abandoned")
             gone = "The server stopped before there was an answer. Try another one."
             self.admission.refuse_all(NotReady(gone))
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(1.0):  # to be told
+                async with asyncio.timeout(1.0):  # for the errors to be sent
                     await self.admission.empty()
 
     def check_size(self, size: int) -> None:
@@ -188,20 +188,20 @@ class GraspService:
 
 
 class HarmfulRequests:
-    """Requests that workers died of: by digest, until when and how many workers."""
+    """Requests that ended workers: by digest, until when they count and how many workers died."""
 
     def __init__(self) -> None:
         self._deaths: dict[bytes, tuple[float, int]] = {}
 
     async def check(self, job: Job) -> None:
-        """Raise HarmfulRequest for a request that is not to be tried again."""
+        """Raise HarmfulRequest for a request that must not run again."""
         if self._deaths:
             until, deaths = self._deaths.get(await asyncio.to_thread(_digest, job), (0.0, 0))
             if deaths >= MOST_DEATHS and time.monotonic() < until:
                 raise HarmfulRequest("request", CRASHED, CRASH_FIX)
 
     async def note(self, job: Job, deaths: int) -> None:
-        """A request ended a worker; one that was killed counts less than one that crashed."""
+        """Count workers that died of a request; a crash counts more than a kill."""
         digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
         until, before = self._deaths.pop(digest, (0.0, 0))
         self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
@@ -209,13 +209,13 @@ class HarmfulRequests:
             del self._deaths[next(iter(self._deaths))]
 
     async def forget(self, job: Job) -> None:
-        """A request was answered: what killed its worker before was something else."""
+        """Clear a request that was answered: its worker had died of something else."""
         if self._deaths:
             self._deaths.pop(await asyncio.to_thread(_digest, job), None)
 
 
 def _digest(job: Job) -> bytes:
-    """Of all that a worker would see of a request; for a thread: a body may be large."""
+    """Digest of what a worker sees of a request; run it in a thread, bodies may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
     digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
     digest.update(job.body)
@@ -223,7 +223,7 @@ def _digest(job: Job) -> bytes:
 
 
 class Reloader:
-    """Reloads weights, tokens and certificates of one server; the old ones serve meanwhile."""
+    """Reloads weights, tokens and certificates; the old ones serve meanwhile."""
 
     def __init__(
         self, service: GraspService, tls: ServerTls | None, reloaded: Callable[[bool], None]
@@ -235,7 +235,7 @@ class Reloader:
         self._tasks: set[asyncio.Task[Any]] = set()
 
     def reload_soon(self) -> None:
-        """Begin a reload in the running event loop; what comes of it is in the log."""
+        """Start a reload in the running event loop; the log has its outcome."""
         task = asyncio.get_running_loop().create_task(self.reload())
         self._tasks.add(task)
         task.add_done_callback(self._reloaded_soon)
@@ -251,7 +251,7 @@ class Reloader:
         Returns what is loaded now.
 
         Raises:
-            PermissionDenied: Who asks has no admin token.
+            PermissionDenied: The caller has no admin token.
             NotReady: The first weights are still loading, or the server is stopping.
             ReloadFailed: Something cannot be used, and all is as before; or a reload is under way.
         """

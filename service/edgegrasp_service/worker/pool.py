@@ -1,4 +1,4 @@
-"""The worker processes as the front sees them: run a job, replace what died, load anew."""
+"""The worker processes as the front sees them: run jobs, replace dead processes, reload."""
 
 import asyncio
 import contextlib
@@ -60,29 +60,29 @@ class WorkerPool:
         self.size = settings.workers or len(os.sched_getaffinity(0))
         self._nursery: _Nursery | None = None
         self._workers: set[_Worker] = set()
-        # The last one in is the first one out: its caches are warm.
+        # Last in, first out: its caches are warm.
         self._idle: asyncio.LifoQueue[_Worker] = asyncio.LifoQueue()
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._answered = 0.0  # when a worker last said anything
+        self._answered = 0.0  # when a worker last answered
 
     @property
     def alive(self) -> bool:
-        """Whether a worker has answered lately, or has a job, which ends with its deadline."""
+        """Whether a worker has answered recently, or is busy, which its deadline ends."""
         recent = time.monotonic() - self._answered < ALIVE_SECONDS
         return bool(self._workers) and (self.busy > 0 or recent)
 
     @property
     def pids(self) -> list[int]:
-        """Of the workers."""
+        """Process ids of the workers."""
         return [worker.pid for worker in self._workers]
 
     @property
     def busy(self) -> int:
-        """Workers that have a job."""
+        """Number of workers that have a request."""
         return sum(worker.at_work for worker in self._workers)
 
     async def start(self) -> None:
-        """Load, and start the workers; those of a start before end when they have answered.
+        """Load weights and start workers; workers of an earlier start end after their request.
 
         Raises:
             EdgeGraspError: Weights cannot be used.
@@ -114,14 +114,14 @@ class WorkerPool:
                 worker.close()
 
     async def take(self) -> "_Worker":
-        """The next worker that has nothing to do, to `run` a job; first come, first served."""
+        """The next idle worker, to `run` a job; first come, first served."""
         while True:
             worker = await self._idle.get()
             if worker in self._workers:  # and not dead
                 return worker
 
     def close(self) -> None:
-        """End every worker, whatever it does."""
+        """Kill every worker."""
         for task in self._tasks:
             task.cancel()
         for worker in list(self._workers):
@@ -131,16 +131,16 @@ class WorkerPool:
             self._nursery.close()
 
     async def _beat(self) -> None:
-        """Ask a worker that has nothing to do, now and then, whether it is there."""
+        """Check regularly that an idle worker answers; one that does not is killed."""
         while True:
             await asyncio.sleep(BEAT_SECONDS)
             with contextlib.suppress(TimeoutError, EdgeGraspError):
-                async with asyncio.timeout(PULSE_SECONDS):  # or it is killed
+                async with asyncio.timeout(PULSE_SECONDS):
                     worker, beat = await self.take(), Job("Beat", "http", b"", 0.0)
                     await worker.run(beat, time.monotonic() + PULSE_SECONDS)
 
     async def _tend(self, worker: "_Worker") -> None:
-        """Give a worker jobs until it dies, and start another in its place then."""
+        """Offer a worker for jobs until it dies, then replace it."""
         usable, lost = True, False
         try:
             while True:
@@ -151,7 +151,7 @@ class WorkerPool:
                 answer = await worker.receive()
                 if answer is None:
                     lost = worker in self._workers
-                    self._workers.discard(worker)  # nobody else takes it
+                    self._workers.discard(worker)  # `take` skips it
                     if await worker.nursery.crashed(worker.pid):
                         worker.finish(HarmfulRequest("request", CRASHED, CRASH_FIX))
                     break
@@ -159,7 +159,7 @@ class WorkerPool:
                 worker.finish(answer)
                 usable = answer.error is None or answer.error.kind != WORKER_LOST
                 if not usable:
-                    worker.kill()  # it ran out of memory: what is left of it cannot be trusted
+                    worker.kill()  # it ran out of memory: its state cannot be trusted
         finally:
             worker.finish(WorkerLost(LOST))
             worker.close()
@@ -185,16 +185,16 @@ class WorkerPool:
         self._spawn(self._tend(worker))
 
     async def _until_done(self, nursery: "_Nursery", start: Callable[[], Awaitable[None]]) -> None:
-        """Start again what died of a nursery, until that succeeds or there is a newer nursery."""
+        """Retry a start until it succeeds or there is a newer nursery."""
         while nursery is self._nursery:
             try:
                 return await start()
             except (EdgeGraspError, OSError) as error:
-                logger.error("what died cannot be replaced yet: %s", error)
+                logger.error("a dead process cannot be replaced yet: %s", error)
                 await asyncio.sleep(RETRY_SECONDS)
 
     def _nursery_lost(self, nursery: "_Nursery") -> None:
-        """Load again, while the workers that it left go on."""
+        """Load again; the workers go on meanwhile."""
         logger.error("the process that workers fork from died; weights are loaded again")
         self._spawn(self._until_done(nursery, self.start))
 
@@ -205,7 +205,7 @@ class WorkerPool:
 
 
 class _Nursery:
-    """The process that has loaded everything, and forks workers."""
+    """The process that has loaded the weights and forks workers."""
 
     def __init__(self, process: subprocess.Popen[bytes], control: socket.socket) -> None:
         self._process = process
@@ -217,7 +217,7 @@ class _Nursery:
 
     @classmethod
     async def start(cls, command: Sequence[str], settings: Settings) -> "_Nursery":
-        """Start it, and wait until it has loaded; raises InvalidSettings where it cannot."""
+        """Start it and wait until it has loaded; raises InvalidSettings on failure."""
         control, theirs = socket.socketpair()
         with theirs:
             environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
@@ -256,7 +256,7 @@ class _Nursery:
         loop.add_reader(self._control, readable)
 
     async def crashed(self, pid: int) -> bool:
-        """Whether a worker that has ended did so by itself, and was not killed."""
+        """Whether a dead worker crashed or exited, and was not killed."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATUS_SECONDS):
                 return await self._crashed[pid]
@@ -274,12 +274,12 @@ class _Nursery:
         return ours
 
     def kill(self) -> None:
-        """End it, also where it is stopped; `watch` tells."""
+        """Kill it, even if it is stopped; `watch` notices."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """End it; the workers that it forked go on."""
+        """Kill it; the workers that it forked go on."""
         with contextlib.suppress(RuntimeError, ValueError):
             asyncio.get_running_loop().remove_reader(self._control)
         self._process.kill()
@@ -301,7 +301,7 @@ class _Worker:
         self.at_work = False  # on a request
 
     async def start(self) -> None:
-        """Fork it, and wait until it is ready; raises InvalidSettings where it cannot load."""
+        """Fork it and wait until it is ready; raises InvalidSettings if it cannot load."""
         ours = self.nursery.fork()
         self._reader, self._writer = await asyncio.open_unix_connection(sock=ours)
         ready = await self.receive()
@@ -310,7 +310,7 @@ class _Worker:
         self.pid, self.models, self.robots = ready.pid, ready.models, ready.robots
 
     async def receive(self) -> Any:
-        """Its next message; None: it has ended."""
+        """Its next message; None when it has ended."""
         try:
             length, body_length = HEADER.unpack(await self._reader.readexactly(HEADER.size))
             text = await self._reader.readexactly(length)
@@ -319,11 +319,11 @@ class _Worker:
             return None
 
     async def run(self, job: Job, deadline: float) -> Answer:
-        """Do a job. Where this is cancelled, the process is killed unless it is done soon.
+        """Run a job. On cancellation the process is killed unless it finishes soon.
 
         Args:
             job: What to do.
-            deadline: By the clock of the event loop; the process gives up after it.
+            deadline: On the event loop's clock; the process stops working after it.
 
         Raises:
             HarmfulRequest: The process died of the job.
@@ -345,7 +345,7 @@ class _Worker:
             raise
 
     def finish(self, answer: Answer | EdgeGraspError) -> None:
-        """Hand on the answer of its job, or why there is none, if it has a job."""
+        """Set the answer of its job, or the error instead, if it has a job."""
         self.at_work = False
         if self._killing is not None:
             self._killing.cancel()
@@ -359,12 +359,12 @@ class _Worker:
             waiting.set_result(answer)
 
     def kill(self) -> None:
-        """End it at once."""
+        """Kill it."""
         if self.pid:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Let it end, which it does when it has nothing to do."""
+        """Close the connection; the process ends when it is idle."""
         if self._writer is not None:
             self._writer.close()
