@@ -1,8 +1,11 @@
 """Nothing is computed in vain for long: deadlines, callers who leave, and the server's limit."""
 
 import asyncio
+import itertools
+import time
 
 import httpx
+import numpy as np
 import pytest
 
 
@@ -116,3 +119,19 @@ async def test_a_body_that_never_ends_is_given_up_at_the_deadline(serve) -> None
     assert b" 504 " in await asyncio.wait_for(reader.readline(), 20)
     writer.close()
     await running.until(lambda: running.ended == ["deadline-exceeded"])
+
+
+async def test_clocks_that_jump(serve, cloud: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The wall clock goes back a day, and on by thirty years, each time it is read."""
+    running = await serve()
+    real, jumps = time.time, itertools.cycle([-86400.0, 3600.0, 1e9, -1e9])
+    monkeypatch.setattr(time, "time", lambda: real() + next(jumps))
+    monkeypatch.setattr(time, "time_ns", lambda: int(time.time() * 1e9))
+    for transport in ("grpc", "rest"):
+        client = running.connect(transport)
+        for _ in range(5):
+            # Without a deadline: gRPC works one out from two clocks, of which one jumps here.
+            assert (await client.detect(cloud)).fine
+    await running.until(lambda: len(running.calls) == 10)
+    for call in running.calls:
+        assert all(0.0 <= seconds < 20.0 for seconds in (call.seconds, *call.stages.values()))

@@ -5,6 +5,8 @@ Each attack here froze, filled or shut a server that had no bounds.
 
 import asyncio
 import contextlib
+import json
+import os
 import struct
 import subprocess
 import sys
@@ -26,6 +28,7 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
 
+ROOT = Path(__file__).parents[2]
 PATIENCE = 30
 MIB = 2**20
 HEAD = "POST /v1/grasps HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-npy\r\n"
@@ -478,3 +481,24 @@ def test_compressed_messages_are_refused(dummy_server) -> None:
                 grasp_pb2.DetectGraspsRequest(points=request), compression=grpc.Compression.Gzip
             )
         assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED
+
+
+def test_a_short_soak(tmp_path: Path) -> None:
+    """Beside attacks each request comes to something, none to another's; health is answered."""
+    command = [sys.executable, "-m", "benchmarks.soak", "--minutes", "0.2", "--clients", "3"]
+    done = subprocess.run(
+        [*command, "--output", tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"SOAK_PATIENCE": "10"},  # on a busy machine
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "soak.json").read_text())
+    assert found["faults"] == []
+    assert {"grpc good: answered", "stream good: answered", "rest good: answered"} <= {
+        *found["alone"]["outcomes"],
+        *found["attacked"]["outcomes"],
+    }
+    assert found["attacked"]["attacks"][0].keys() == {"json: 400", "x-npy: 400", "x-npz: 400"}
