@@ -19,7 +19,7 @@ from edgegrasp_model.networks.layers import (
     BallMaximum,
     PackedLinear,
     PackedMlp,
-    SharedLinear,
+    SharedProduct,
     ball_chunks,
     by_chunks,
     float32_inference,
@@ -27,7 +27,6 @@ from edgegrasp_model.networks.layers import (
     in_chunks,
     maximum,
     mlp,
-    row_linear,
 )
 
 Float32 = NDArray[np.float32]
@@ -49,9 +48,7 @@ class EdgeGraspNet(nn.Module):
             config.local_width, config.global_widths_1, config.global_widths_2
         )
         own_width = GRASP_WIDTH + width_3
-        self.join = SharedLinear(
-            own_width + config.global_widths_2[-1], config.classifier_widths[0]
-        )
+        self.join = nn.Linear(own_width + config.global_widths_2[-1], config.classifier_widths[0])
         self.classifier = mlp((*config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
@@ -61,7 +58,8 @@ class EdgeGraspNet(nn.Module):
         f3 = F.relu(self.conv3(f2, batch))  # (P, 128)
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=1), batch)  # (B, 1024)
         grasp = torch.cat((self._grasp_features(batch), f3[batch.contact]), dim=1)  # (E, 138)
-        join, classifier, logits = self.join.on(ball), PackedMlp(self.classifier), []
+        join = SharedProduct(self.join.weight, self.join.bias, ball)
+        classifier, logits = PackedMlp(self.classifier), []
         for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
             logits.append(classifier(join(own, ball_of_edge).relu_()))  # (e, 1)
         return torch.cat(logits).squeeze(1)[: len(grasp)]
@@ -88,19 +86,17 @@ class PointNetConv(nn.Module):
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, inputs) to (P, width)."""
-        if float32_inference(features):
-            return fused_convolution(self, features, batch)
-        # W [f_j, p_j - p_i] + b = u_j - v_i: the first layer runs per point, not per neighbour.
-        widths = [features.shape[1], 3]
-        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = row_linear(batch.points, point_weight)  # (P, width)
-        u = row_linear(features, feature_weight, self.hidden.bias) + v  # (P, width)
-        output, pooled = PackedLinear(self.output.weight), []
-        for neighbors, v_here in in_chunks(CONVOLVED, batch.neighbors, v):
-            hidden = gather_rows(u, neighbors).sub_(v_here.unsqueeze(1)).relu_()  # (p, k, width)
-            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
+        # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
+        weight, output = self.hidden.weight, PackedLinear(self.output.weight)
+        u = torch.cat((features, batch.points), dim=1)
+        u = by_chunks(PackedLinear(weight, self.hidden.bias), u)  # (P, width)
+        pooled = []
+        for points, neighbors in in_chunks(CONVOLVED, batch.points, batch.neighbors):
+            hidden = gathered_relu(u, points, weight[:, -3:].t(), neighbors)  # (p k, width)
+            messages = output(hidden).unflatten(0, neighbors.shape)  # (p, k, width)
+            pooled.append(maximum(messages, dim=1))
         # The bias is the same for all neighbours: added once, after the maximum.
-        return torch.cat(pooled)[: len(v)] + self.output.bias
+        return torch.cat(pooled)[: len(features)] + self.output.bias
 
 
 class GlobalFeature(nn.Module):
@@ -109,7 +105,7 @@ class GlobalFeature(nn.Module):
     def __init__(self, inputs: int, widths_1: tuple[int, ...], widths_2: tuple[int, ...]) -> None:
         super().__init__()
         self.mlp_1 = mlp((inputs, *widths_1))
-        self.join = SharedLinear(inputs + widths_1[-1], widths_2[0])
+        self.join = nn.Linear(inputs + widths_1[-1], widths_2[0])
         self.mlp_2 = mlp(widths_2)
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
@@ -118,7 +114,8 @@ class GlobalFeature(nn.Module):
         mlp_1, maximum_1 = PackedMlp(self.mlp_1), BallMaximum(batch.num_balls)
         for chunk in chunks:
             maximum_1.add(mlp_1(chunk.values), chunk)
-        join = self.join.on(maximum_1.result())  # of (B, 512)
+        pooled = maximum_1.result()  # (B, 512)
+        join = SharedProduct(self.join.weight, self.join.bias, pooled)
         mlp_2, maximum_2 = PackedMlp(self.mlp_2), BallMaximum(batch.num_balls)
         for chunk in chunks:
             joined = join(chunk.values, chunk.ball_of_point).relu_()  # (p, 1024)
@@ -126,25 +123,15 @@ class GlobalFeature(nn.Module):
         return maximum_2.result()
 
 
-def fused_convolution(layer: PointNetConv, features: Tensor, batch: BallBatch) -> Tensor:
-    """`PointNetConv.forward`: maps point features (P, inputs) to (P, width)."""
-    # W [f_j, p_j - p_i] + b = W [f_j, p_j] + b - V p_i: the product runs per point.
-    weight, output = layer.hidden.weight, PackedLinear(layer.output.weight)
-    u = by_chunks(
-        PackedLinear(weight, layer.hidden.bias), torch.cat((features, batch.points), dim=1)
-    )
-    offset = weight[:, -3:].t().contiguous().numpy()  # V, (3, width)
-    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
-    (count, k), width = neighbors.shape, len(weight)
-    hidden = torch.zeros(CONVOLVED * k, width)
-    pooled = torch.empty(count, width)
-    for first in range(0, count, CONVOLVED):
-        part = slice(first, min(first + CONVOLVED, count))
-        _gathered_relu(u.numpy(), points[part], offset, neighbors[part], hidden.numpy())
-        messages = output(hidden).view(CONVOLVED, k, width)[: part.stop - part.start]
-        torch.amax(messages, dim=1, out=pooled[part])
-    # The bias is the same for all neighbours: added once, after the maximum.
-    return pooled.add_(layer.output.bias)
+def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) -> Tensor:
+    """ReLU of u_j - V p_i for the neighbours (p, k) of each of p points: (p k, width)."""
+    if float32_inference(u):
+        result = torch.empty(neighbors.numel(), u.shape[1])
+        arrays = (u, points, offset.contiguous(), neighbors, result)
+        _gathered_relu(*(array.numpy() for array in arrays))
+        return result
+    here = points @ offset  # (p, width)
+    return (gather_rows(u, neighbors) - here.unsqueeze(1)).relu_().flatten(0, 1)
 
 
 @compiled("contract", "nsz")

@@ -25,31 +25,11 @@ EDGE_ROWS = 256  # edge grasps at a time
 _PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
-class RowLinear(nn.Linear):
-    """A linear layer as `row_linear` computes it."""
-
-    def forward(self, values: Tensor) -> Tensor:
-        """Maps (M, ..., inputs) to (M, ..., outputs)."""
-        return row_linear(values, self.weight, self.bias)
-
-
-class SharedLinear(nn.Linear):
+class SharedProduct:
     """A linear layer on rows [own, shared[row]] that multiplies each shared part only once.
 
     Many ball points (or edge grasps) share one ball feature: W [a, b] = W_a a + W_b b.
     """
-
-    def forward(self, own: Tensor, shared: Tensor, shared_of_row: Tensor) -> Tensor:  # type: ignore[override]
-        """Applies the layer to own (M, ..., C1) and shared (B, ..., C2)[shared_of_row (M,)]."""
-        return self.on(shared)(own, shared_of_row)
-
-    def on(self, shared: Tensor) -> "SharedProduct":
-        """The layer on shared parts (B, ..., C2), for the rows of many chunks."""
-        return SharedProduct(self.weight, self.bias, shared)
-
-
-class SharedProduct:
-    """What each row's own part gives, added to what its shared part gives."""
 
     def __init__(self, weight: Tensor, bias: Tensor | None, shared: Tensor) -> None:
         """Multiplies the shared parts (B, ..., C2).
@@ -72,10 +52,10 @@ class SharedProduct:
 
 
 def mlp(widths: Sequence[int]) -> nn.Sequential:
-    """Linear layers from widths[0] to widths[-1] with a ReLU between each two."""
+    """Linear layers from widths[0] to widths[-1] with a ReLU between each two, for `PackedMlp`."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
-        layers += [RowLinear(inputs, outputs), nn.ReLU(inplace=True)]
+        layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers[:-1])
 
 
@@ -205,10 +185,10 @@ class BallChunk(NamedTuple):
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
     """Splits values (P, ...) of a batch's points into chunks of `rows`, the last one filled up.
 
-    To record gradients, which keeps all of them anyway, and off the processor: one chunk.
+    One chunk unless for float32 inference on the processor.
     """
     ball_of_point, sizes = batch.ball_of_point, batch.ball_sizes
-    if torch.is_grad_enabled() or values.device.type != "cpu":
+    if not float32_inference(values):
         return [BallChunk(values, ball_of_point, list(range(len(sizes))), sizes)]
     ends = torch.tensor(sizes).cumsum(0).tolist()
     chunks = []

@@ -1,9 +1,9 @@
 """VNEdgeGraspNet: EdgeGraspNet on vector neurons; its scores do not change when the cloud turns.
 
 Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. Features are
-(M, 3, C): C vectors each; P points in B balls, E grasps. On a processor inference runs in loops
-that Numba compiles: there each ReLU's and each maximum's direction map is composed with the linear
-layer before it, so that one product gives vectors and directions side by side, (M, 3, 2C).
+(M, 3, C): C vectors each; P points in B balls, E grasps. The map to the directions of a ReLU or of
+a maximum is composed with the linear layer before it, so that one product gives `both`: vectors
+and directions side by side, (M, 3, 2C).
 """
 
 import numpy as np
@@ -15,13 +15,9 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
-    CONVOLVED,
     EDGE_ROWS,
-    BallChunk,
     PackedLinear,
     PackedMlp,
-    RowLinear,
-    SharedLinear,
     SharedProduct,
     ball_chunks,
     by_chunks,
@@ -29,14 +25,13 @@ from edgegrasp_model.networks.layers import (
     gather_rows,
     in_chunks,
     mlp,
-    row_linear,
 )
 
 Float32 = NDArray[np.float32]
 
 _TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
-FUSED_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
-FUSED_ROWS = 256  # points at a time in the global layers
+VN_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
+VN_ROWS = 256  # points at a time in the global layers
 
 # Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
 _compiled = compiled("contract", "nsz", "arcp", "reassoc")
@@ -56,9 +51,9 @@ class VNEdgeGraspNet(nn.Module):
             config.local_width, config.global_widths_1, config.global_widths_2
         )
         channels = 3 + width_3 + config.global_widths_2[-1]  # 3: approach, contact and normal
-        self.frame_1 = VNSharedLinearReLU(channels, channels // 2)
+        self.frame_1 = VNLinearReLU(channels, channels // 2)
         self.frame_2 = VNLinearReLU(channels // 2, channels // 4)
-        self.frame_3 = RowLinear(channels // 4, 3, bias=False)
+        self.frame_3 = nn.Linear(channels // 4, 3, bias=False)
         self.classifier = mlp((3 * channels, *config.classifier_widths, 1))
 
     def forward(self, batch: BallBatch) -> Tensor:
@@ -70,14 +65,16 @@ class VNEdgeGraspNet(nn.Module):
         ball = self.ball_feature(torch.cat((f1, f2, f3), dim=2), batch)  # (B, 3, 381)
         named = (batch.approach, batch.points[contact], batch.normals[contact])
         grasp = torch.cat((torch.stack(named, dim=2), f3[contact]), dim=2)  # (E, 3, 131)
-        if float32_inference(ball):
-            return fused_logits(self, grasp, ball, batch.ball_of_edge)
-        # Three vectors learned from the grasp turn with it: coordinates along them are invariant.
-        frame = self.frame_3(self.frame_2(self.frame_1(grasp, ball, batch.ball_of_edge)))
-        vectors = torch.cat((grasp, ball[batch.ball_of_edge]), dim=2)  # (E, 3, 512)
-        invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (E, 512, 3) -> (E, 1536)
-        logits: Tensor = self.classifier(invariant).squeeze(1)  # (E, 1) -> (E,)
-        return logits
+        join = SharedProduct(self.frame_1.weights, None, ball)
+        frame_2, frame_3 = PackedLinear(self.frame_2.weights), PackedLinear(self.frame_3.weight)
+        classifier, logits = PackedMlp(self.classifier), []
+        for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
+            # Three vectors learned from the grasp turn with it: coordinates along them do not.
+            frame = frame_3(relu(frame_2(relu(join(own, ball_of_edge)))))  # (e, 3, 3)
+            vectors = torch.cat((own, ball.index_select(0, ball_of_edge)), dim=2)  # (e, 3, 512)
+            invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (e, 512, 3) -> (e, 1536)
+            logits.append(classifier(invariant))  # (e, 1)
+        return torch.cat(logits).squeeze(1)[: len(grasp)]
 
 
 class VNPointNetConv(nn.Module):
@@ -85,31 +82,24 @@ class VNPointNetConv(nn.Module):
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
-        self.hidden = RowLinear(inputs + 1, width, bias=False)
+        self.hidden = nn.Linear(inputs + 1, width, bias=False)
         self.hidden_relu = VNReLU(width)
-        self.output = RowLinear(width, width, bias=False)
-        self.reach = RowLinear(width, width, bias=False)
+        self.output = nn.Linear(width, width, bias=False)
+        self.reach = nn.Linear(width, width, bias=False)
         self.output_relu = VNReLU(width)
 
     def forward(self, features: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, inputs) to (P, 3, width)."""
-        if float32_inference(features):
-            return fused_convolution(self, features, batch)
-        # W [f_j, p_j - p_i] = u_j - v_i, and the ReLU's direction likewise: both run per point.
-        widths = [features.shape[2], 1]
-        feature_weight, point_weight = torch.split(self.hidden.weight, widths, dim=1)
-        v = row_linear(batch.points.unsqueeze(2), point_weight)  # (P, 3, width)
-        u = row_linear(features, feature_weight) + v  # (P, 3, width)
-        u_direction, v_direction = self.hidden_relu.direction(u), self.hidden_relu.direction(v)
-        pooled = []
-        for neighbors, v_here, v_direction_here in in_chunks(
-            CONVOLVED, batch.neighbors, v, v_direction
-        ):
-            hidden = gather_rows(u, neighbors) - v_here.unsqueeze(1)  # (p, k, 3, width)
-            direction = gather_rows(u_direction, neighbors) - v_direction_here.unsqueeze(1)
-            messages = self.output(vector_relu(hidden, direction))  # (p, k, 3, width)
-            pooled.append(vector_maximum(messages, self.reach, dim=1))
-        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(v)])
+        # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
+        weight = _beside(self.hidden.weight, self.hidden_relu.direction.weight)
+        output = PackedLinear(_with_reach(self.output, self.reach))
+        u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
+        u = by_chunks(PackedLinear(weight), u, VN_ROWS)  # (P, 3, 2 width)
+        k, pooled = batch.neighbors.shape[1], []
+        for points, neighbors in in_chunks(VN_CONVOLVED, batch.points, batch.neighbors):
+            both = output(gathered_relu(u, points, weight[:, -1], neighbors))  # (p k, 3, 2 width)
+            pooled.append(furthest_of_each(both, k))  # (p, 3, width)
+        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(features)])
         return vectors
 
 
@@ -120,37 +110,38 @@ class VNGlobalFeature(nn.Module):
         super().__init__()
         self.vn_1 = VNLinearReLU(inputs, widths_1[0])
         self.vn_2 = VNLinearReLU(widths_1[0], widths_1[1])
-        self.vn_3 = RowLinear(widths_1[1], widths_1[2], bias=False)
+        self.vn_3 = nn.Linear(widths_1[1], widths_1[2], bias=False)
         self.maximum_1 = VNBallMaximum(widths_1[2])
-        self.join = VNSharedLinearReLU(inputs + widths_1[2], widths_2[0])
-        self.vn_5 = RowLinear(widths_2[0], widths_2[1], bias=False)
+        self.join = VNLinearReLU(inputs + widths_1[2], widths_2[0])
+        self.vn_5 = nn.Linear(widths_2[0], widths_2[1], bias=False)
         self.maximum_2 = VNBallMaximum(widths_2[1])
 
     def forward(self, local: Tensor, batch: BallBatch) -> Tensor:
         """Maps point features (P, 3, 224) to ball features (B, 3, 381)."""
-        if float32_inference(local):
-            return fused_ball_feature(self, local, batch)
-        hidden = self.vn_3(self.vn_2(self.vn_1(local)))  # (P, 3, 128)
-        pooled = self.maximum_1(hidden, batch)  # (B, 3, 128)
-        joined = self.join(local, pooled, batch.ball_of_point)  # (P, 3, 381)
-        ball: Tensor = self.maximum_2(self.vn_5(joined), batch)
+        vn_1, vn_2 = PackedLinear(self.vn_1.weights), PackedLinear(self.vn_2.weights)
+        vn_3 = PackedLinear(_with_reach(self.vn_3, self.maximum_1.reach))
+        vn_5 = PackedLinear(_with_reach(self.vn_5, self.maximum_2.reach))
+        chunks = ball_chunks(local, batch, VN_ROWS)
+        furthest_1 = Furthest(batch.num_balls, self.vn_3.out_features)
+        for chunk in chunks:
+            both = vn_3(relu(vn_2(relu(vn_1(chunk.values)))))  # (p, 3, 2 x 128)
+            furthest_1.add(both, chunk.balls, chunk.sizes)
+        join = SharedProduct(self.join.weights, None, self.maximum_1.relu(furthest_1.result()))
+        furthest_2 = Furthest(batch.num_balls, self.vn_5.out_features)
+        for chunk in chunks:
+            both = vn_5(relu(join(chunk.values, chunk.ball_of_point)))  # (p, 3, 2 x 381)
+            furthest_2.add(both, chunk.balls, chunk.sizes)
+        ball: Tensor = self.maximum_2.relu(furthest_2.result())
         return ball
 
 
 class VNBallMaximum(nn.Module):
-    """Per channel the vector of each ball that reaches furthest along its learned direction."""
+    """The maximum over the points of a ball, and the ReLU after it."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.reach = RowLinear(width, width, bias=False)
+        self.reach = nn.Linear(width, width, bias=False)
         self.relu = VNReLU(width)
-
-    def forward(self, vectors: Tensor, batch: BallBatch) -> Tensor:
-        """Maps point features (P, 3, width) to ball features (B, 3, width)."""
-        balls = torch.split(vectors, batch.ball_sizes)
-        furthest = [vector_maximum(ball, self.reach, dim=0) for ball in balls]
-        pooled: Tensor = self.relu(torch.stack(furthest))
-        return pooled
 
 
 class VNLinearReLU(nn.Module):
@@ -158,27 +149,13 @@ class VNLinearReLU(nn.Module):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.feature = RowLinear(inputs, outputs, bias=False)
-        self.direction = RowLinear(inputs, outputs, bias=False)
+        self.feature = nn.Linear(inputs, outputs, bias=False)
+        self.direction = nn.Linear(inputs, outputs, bias=False)
 
-    def forward(self, vectors: Tensor) -> Tensor:
-        """Maps (M, 3, inputs) to (M, 3, outputs)."""
-        return vector_relu(self.feature(vectors), self.direction(vectors))
-
-
-class VNSharedLinearReLU(nn.Module):
-    """`VNLinearReLU` on rows [own, shared[row]], multiplying each shared part only once."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.feature = SharedLinear(inputs, outputs, bias=False)
-        self.direction = SharedLinear(inputs, outputs, bias=False)
-
-    def forward(self, own: Tensor, shared: Tensor, shared_of_row: Tensor) -> Tensor:
-        """Maps own (M, 3, C1), shared (B, 3, C2), shared_of_row (M,) int64 to (M, 3, outputs)."""
-        return vector_relu(
-            self.feature(own, shared, shared_of_row), self.direction(own, shared, shared_of_row)
-        )
+    @property
+    def weights(self) -> Tensor:
+        """What gives vectors and directions: (2 outputs, inputs)."""
+        return torch.cat((self.feature.weight, self.direction.weight))
 
 
 class VNReLU(nn.Module):
@@ -186,88 +163,12 @@ class VNReLU(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.direction = RowLinear(width, width, bias=False)
+        self.direction = nn.Linear(width, width, bias=False)
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Maps (M, 3, width) to the same shape."""
-        return vector_relu(vectors, self.direction(vectors))
-
-
-def vector_relu(vectors: Tensor, directions: Tensor) -> Tensor:
-    """Removes from each vector (M, 3, C) its part against its direction (M, 3, C), if any."""
-    along = (vectors * directions).sum(dim=-2, keepdim=True).clamp(max=0.0)  # (M, 1, C)
-    length_squared = directions.square().sum(dim=-2, keepdim=True)  # (M, 1, C)
-    return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
-
-
-def vector_maximum(vectors: Tensor, direction: nn.Linear, dim: int) -> Tensor:
-    """For each channel the vector that reaches furthest along its own direction.
-
-    Args:
-        vectors: (..., 3, C).
-        direction: Maps the vectors to their directions. It gets no gradient, as a choice has none:
-            training leaves it as it was drawn, in the reference too.
-        dim: The dimension to reduce, one of those before the last two.
-    """
-    with torch.no_grad():
-        reach = (vectors * direction(vectors)).sum(dim=-2, keepdim=True)  # (..., 1, C)
-        furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
-    return vectors.take_along_dim(furthest, dim).squeeze(dim)
-
-
-def fused_convolution(layer: VNPointNetConv, features: Tensor, batch: BallBatch) -> Tensor:
-    """`VNPointNetConv.forward`: maps point features (P, 3, inputs) to (P, 3, width)."""
-    # W [f_j, p_j - p_i] = W [f_j, p_j] - w p_i, w the last column: the product runs per point.
-    weight = _beside(layer.hidden.weight, layer.hidden_relu.direction.weight)
-    output = PackedLinear(_beside(layer.output.weight, layer.reach.weight))
-    u = by_chunks(
-        PackedLinear(weight), torch.cat((features, batch.points.unsqueeze(2)), dim=2), FUSED_ROWS
-    )
-    (count, k), width = batch.neighbors.shape, len(layer.output.weight)
-    offset = weight[:, -1].contiguous().numpy()
-    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
-    hidden = torch.zeros(FUSED_CONVOLVED * k, 3, width)
-    best = np.empty((FUSED_CONVOLVED, width), np.float32)
-    pooled = torch.zeros(count, 3, width)
-    for first in range(0, count, FUSED_CONVOLVED):
-        part = slice(first, min(first + FUSED_CONVOLVED, count))
-        _gathered_relu(u.numpy(), points[part], offset, neighbors[part], hidden.numpy())
-        messages = output(hidden)  # (FUSED_CONVOLVED k, 3, 2 width)
-        best.fill(-np.inf)
-        bounds = np.arange(0, (part.stop - part.start) * k + 1, k)
-        _furthest(messages.numpy(), bounds, best, pooled[part].numpy())
-    return _own_relu(pooled, layer.output_relu.direction)
-
-
-def fused_ball_feature(layer: VNGlobalFeature, local: Tensor, batch: BallBatch) -> Tensor:
-    """`VNGlobalFeature.forward`: maps point features (P, 3, C) to ball features (B, 3, width)."""
-    first, second = PackedLinear(_weights(layer.vn_1)), PackedLinear(_weights(layer.vn_2))
-    third = PackedLinear(_beside(layer.vn_3.weight, layer.maximum_1.reach.weight))
-    last = PackedLinear(_beside(layer.vn_5.weight, layer.maximum_2.reach.weight))
-    chunks = ball_chunks(local, batch, FUSED_ROWS)
-    maximum = _BallMaximum(batch.num_balls, len(layer.vn_3.weight))
-    for chunk in chunks:
-        maximum.add(third(_relu(second(_relu(first(chunk.values))))), chunk)
-    ball = maximum.activated(layer.maximum_1)  # (B, 3, width)
-    join = SharedProduct(_weights(layer.join), None, ball)
-    maximum = _BallMaximum(batch.num_balls, len(layer.vn_5.weight))
-    for chunk in chunks:
-        maximum.add(last(_relu(join(chunk.values, chunk.ball_of_point))), chunk)
-    return maximum.activated(layer.maximum_2)
-
-
-def fused_logits(
-    network: VNEdgeGraspNet, grasp: Tensor, ball: Tensor, ball_of_edge: Tensor
-) -> Tensor:
-    """The end of `VNEdgeGraspNet.forward`: logits (E,) of grasps (E, 3, C) in balls (B, 3, D)."""
-    join = SharedProduct(_weights(network.frame_1), None, ball)
-    frame_2, frame_3 = PackedLinear(_weights(network.frame_2)), PackedLinear(network.frame_3.weight)
-    classifier, result = PackedMlp(network.classifier), []
-    for own, of_ball in in_chunks(EDGE_ROWS, grasp, ball_of_edge):
-        frame = frame_3(_relu(frame_2(_relu(join(own, of_ball)))))  # (e, 3, 3)
-        vectors = torch.cat((own, ball[of_ball]), dim=2)
-        result.append(classifier((vectors.transpose(1, 2) @ frame).flatten(1)))  # (e, 1)
-    return torch.cat(result).squeeze(1)[: len(grasp)]
+        directions = PackedLinear(self.direction.weight)
+        return by_chunks(lambda v: relu(torch.cat((v, directions(v)), dim=2)), vectors, VN_ROWS)
 
 
 def _beside(weight: Tensor, direction: Tensor) -> Tensor:
@@ -275,46 +176,87 @@ def _beside(weight: Tensor, direction: Tensor) -> Tensor:
     return torch.cat((weight, direction @ weight))
 
 
-def _own_relu(vectors: Tensor, direction: nn.Linear) -> Tensor:
-    directions = PackedLinear(direction.weight)
-    return by_chunks(lambda v: _relu(torch.cat((v, directions(v)), dim=2)), vectors, FUSED_ROWS)
+def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
+    """Weights of vectors among which a maximum chooses, and of the directions it goes by.
+
+    A choice has no gradient: training leaves the direction map as it was drawn, as the reference's.
+    """
+    return torch.cat((layer.weight, (reach.weight @ layer.weight).detach()))
 
 
-def _weights(layer: VNLinearReLU | VNSharedLinearReLU) -> Tensor:
-    """The weights of a layer and of its directions, one above the other."""
-    return torch.cat((layer.feature.weight, layer.direction.weight))
+def relu(both: Tensor) -> Tensor:
+    """Removes from each vector its part against its direction, if any: (M, 3, 2C) to (M, 3, C)."""
+    if float32_inference(both):
+        result = torch.empty(len(both), 3, both.shape[2] // 2)
+        _relu_rows(both.numpy(), result.numpy())
+        return result
+    vectors, directions = both.chunk(2, dim=-1)
+    along = (vectors * directions).sum(dim=-2, keepdim=True).clamp(max=0.0)  # (M, 1, C)
+    length_squared = directions.square().sum(dim=-2, keepdim=True)  # (M, 1, C)
+    return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
 
 
-class _BallMaximum:
-    """`VNBallMaximum` chunk by chunk."""
-
-    def __init__(self, num_balls: int, width: int) -> None:
-        self._best = torch.full((num_balls, width), -torch.inf)
-        self._vectors = torch.zeros(num_balls, 3, width)
-
-    def add(self, both: Tensor, chunk: BallChunk) -> None:
-        """Take in the vectors and directions (p, 3, 2 width) of a chunk's points."""
-        bounds = np.cumsum([0, *chunk.sizes[: len(chunk.balls)]])
-        balls = slice(chunk.balls[0], chunk.balls[-1] + 1)
-        _furthest(both.numpy(), bounds, self._best[balls].numpy(), self._vectors[balls].numpy())
-
-    def activated(self, layer: VNBallMaximum) -> Tensor:
-        """The furthest vectors (B, 3, width) after the layer's ReLU."""
-        return _own_relu(self._vectors, layer.relu.direction)
+def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) -> Tensor:
+    """`relu` of u_j - offset p_i for the neighbours (p, k) of each of p points: (p k, 3, C)."""
+    if float32_inference(u):
+        result = torch.empty(neighbors.numel(), 3, u.shape[2] // 2)
+        arrays = (u, points, offset.contiguous(), neighbors, result)
+        _gathered_relu_rows(*(array.numpy() for array in arrays))
+        return result
+    here = points.unsqueeze(2) * offset  # (p, 3, 2C)
+    return relu((gather_rows(u, neighbors) - here.unsqueeze(1)).flatten(0, 1))
 
 
-def _relu(both: Tensor) -> Tensor:
-    """`vector_relu` of vectors and directions side by side: (M, 3, 2C) to (M, 3, C)."""
-    result = torch.empty(len(both), 3, both.shape[2] // 2)
-    _own_relu_rows(both.numpy(), result.numpy())
-    return result
+def furthest_of_each(both: Tensor, k: int) -> Tensor:
+    """Of each k vectors in a row that which reaches furthest: (M k, 3, 2C) to (M, 3, C)."""
+    if not float32_inference(both):
+        return _furthest(both.unflatten(0, (-1, k)), dim=1)
+    groups = len(both) // k
+    furthest = Furthest(groups, both.shape[2] // 2)
+    furthest.add(both, list(range(groups)), [k] * groups)
+    return furthest.result()
+
+
+class Furthest:
+    """Per channel the vector of each group that reaches furthest along its direction."""
+
+    def __init__(self, groups: int, width: int) -> None:
+        self._best = torch.full((groups, width), -torch.inf)
+        self._vectors = torch.zeros(groups, 3, width)
+
+    def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
+        """Take in vectors and directions (p, 3, 2 width), so many of each of the groups.
+
+        All at once, unless for float32 inference.
+        """
+        if float32_inference(both):
+            bounds = np.cumsum([0, *sizes[: len(groups)]])
+            these = slice(groups[0], groups[-1] + 1)
+            best, vectors = self._best[these], self._vectors[these]
+            _furthest_rows(both.numpy(), bounds, best.numpy(), vectors.numpy())
+        else:
+            parts = torch.split(both, sizes)[: len(groups)]
+            self._vectors = torch.stack([_furthest(part, dim=0) for part in parts])
+
+    def result(self) -> Tensor:
+        """The vectors (groups, 3, width)."""
+        return self._vectors
+
+
+def _furthest(both: Tensor, dim: int) -> Tensor:
+    """The furthest along one of the dimensions before the last two; the first of a tie."""
+    vectors, directions = both.chunk(2, dim=-1)
+    with torch.no_grad():
+        reach = (vectors * directions).sum(dim=-2, keepdim=True)  # (..., 1, C)
+        furthest = reach.max(dim, keepdim=True).indices  # several times faster than argmax
+    return vectors.take_along_dim(furthest, dim).squeeze(dim)
 
 
 @_compiled
-def _gathered_relu(
+def _gathered_relu_rows(
     u: Float32, points: Float32, offset: Float32, neighbors: NDArray[np.int64], result: Float32
 ) -> None:
-    """`vector_relu` of u_j - offset p_i for the neighbours (p, k) of each of p points."""
+    """`relu` of u_j - offset p_i for the neighbours (p, k) of each of p points."""
     width, k = result.shape[2], neighbors.shape[1]
     zero, tiny = np.float32(0.0), np.float32(1e-7)
     for i in range(len(neighbors)):
@@ -331,8 +273,8 @@ def _gathered_relu(
 
 
 @_compiled
-def _own_relu_rows(both: Float32, result: Float32) -> None:
-    """`vector_relu` of each row of `both` (M, 3, 2C) into `result` (M, 3, C)."""
+def _relu_rows(both: Float32, result: Float32) -> None:
+    """`relu` of each row of `both` (M, 3, 2C) into `result` (M, 3, C)."""
     width = result.shape[2]
     zero, tiny = np.float32(0.0), np.float32(1e-7)
     for i in range(len(result)):
@@ -346,8 +288,10 @@ def _own_relu_rows(both: Float32, result: Float32) -> None:
 
 
 @_compiled
-def _furthest(both: Float32, bounds: NDArray[np.int64], best: Float32, result: Float32) -> None:
-    """`vector_maximum` over the rows of `both` between each two of `bounds`; the first of a tie.
+def _furthest_rows(
+    both: Float32, bounds: NDArray[np.int64], best: Float32, result: Float32
+) -> None:
+    """The furthest vectors of the rows of `both` between each two of `bounds`; the first of a tie.
 
     Goes on from the vectors in `result` and how far they reach, `best`.
     """
