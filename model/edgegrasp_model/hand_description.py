@@ -6,6 +6,7 @@ stands to gravity and support, how much of the space around it the camera did no
 it is, and how far the object is seen to extend around it.
 """
 
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,19 +14,10 @@ from numpy.typing import NDArray
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_view import (
-    APPROACH_LENGTH,
-    NEAR,
-    HandView,
-    hand_views,
-    mirror_sides,
-    only_viewpoint,
-    reach_of,
-    seen_part,
-)
+from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView, hand_views, reach_of
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import Cloud
+from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.unseen import DepthMap, unseen_space, visible_extents
 
 Float32 = NDArray[np.float32]
@@ -34,6 +26,10 @@ Int64 = NDArray[np.int64]
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
+ABOVE = 0.001  # metres over the camera
+SEEN_LENGTH = 0.0465  # metres of the fingers, from their tips: the Panda's are no longer
+# Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
+BESIDE, OUTSIDE, BEHIND, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
 UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
 GAP = 0.007  # metres without a point in which what is between the fingers ends
 HAND_DESCRIPTION_SIZE = 87
@@ -41,58 +37,77 @@ HEIGHTS = slice(58, 61)  # of them: heights over the support plane
 BEYOND = slice(65, 67)  # of them: unseen metres from what each finger meets first outward
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What hands look at, in one frame, metres: N points, and what is known of where they lie."""
+
+    cloud: Cloud  # with normals
+    up: Float32  # (3,) away from gravity
+    support: SupportPlane | None = None  # heights are measured from it
+    viewpoints: Float32 | None = None  # (W, 3) the cameras
+    # (N,) where a side of the workspace cuts objects off: what is between the fingers there may be
+    # wider than it seems. None: nowhere.
+    at_side: NDArray[np.bool_] | None = None
+    object_of_point: Int64 | None = None  # (N,) None: all points are of one
+
+    @property
+    def viewpoint(self) -> Float32 | None:
+        """The camera (3,), where there is exactly one."""
+        one = self.viewpoints is not None and len(self.viewpoints) == 1
+        return self.viewpoints[0] if self.viewpoints is not None and one else None
+
+    def mirror_sides(self, T_cloud_hand: Float32) -> Float32:
+        """1 or -1 (E,): what a hand's x is multiplied by to have the camera on its positive side.
+
+        A hand and what it would grasp may be mirrored without changing the outcome. 1 for all where
+        there is not exactly one camera.
+        """
+        if self.viewpoint is None:
+            return np.ones(len(T_cloud_hand), dtype=np.float32)
+        # Straight ahead of a hand that comes from the camera, up decides, not rounding.
+        toward = self.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
+        along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
+        return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
+
+
 def describe_hands(
-    cloud: Cloud,
+    around: Surroundings,
     candidates: Candidates,
     gripper: Gripper,
-    up: Float32,
-    support: SupportPlane | None,
-    viewpoints: Float32 | None = None,
-    at_side: NDArray[np.bool_] | None = None,
     view: HandView | None = None,
-    object_of_point: Int64 | None = None,
     size: int = HAND_DESCRIPTION_SIZE,
 ) -> Float32:
     """The hand-frame description of each candidate.
 
-    A hand and what it would grasp may be mirrored in the hand's x without changing the outcome:
-    where there is one camera, each is described with it on the side of positive x.
+    Of several cameras, nothing but what none of them saw is described.
 
     Args:
-        cloud: N points with normals.
+        around: What they look at.
         candidates: E candidates.
         gripper: Fingers open to its maximum.
-        up: (3,) away from gravity.
-        support: Plane that heights are measured from; None where it is unknown.
-        viewpoints: (W, 3) the cameras; None where they are unknown. Of several, nothing but what
-            none of them saw is described.
-        at_side: (N,) points where a side of the workspace cuts objects off: what is between the
-            fingers there may be wider than it seems. None: nowhere.
-        view: `hand_views` of the same candidates, where the caller has it already.
-        object_of_point: (N,) the object that each point belongs to; None: all to one.
+        view: `hand_views` of the same candidates, within `reach_of` the gripper, where the caller
+            has it already.
         size: How many numbers are read. The extents, the last ones, are left out if none is.
 
     Returns:
         (E, HAND_DESCRIPTION_SIZE), or without the extents: counts (logarithm of 1 + n), metres
         and cosines.
     """
-    reach = reach_of(gripper)
-    view = (view or hand_views(cloud, candidates.T_cloud_hand, reach)).within(reach)
-    viewpoint = only_viewpoint(viewpoints)
-    side = mirror_sides(candidates.T_cloud_hand, viewpoint)
-    mirrored = candidates.T_cloud_hand[:, :3, :3].copy()
+    cloud, up, hands = around.cloud, around.up, candidates.T_cloud_hand
+    view = view or hand_views(cloud, hands, reach_of(gripper))
+    side, ends = around.mirror_sides(hands), seen_part(gripper)
+    mirrored = hands[:, :3, :3].copy()
     mirrored[:, :, 0] *= side[:, None]
-    ends = seen_part(gripper)
-    seen = _look(view, cloud.normals, mirrored, side, at_side, ends)
-    depths = DepthMap.of_each(cloud.points, viewpoints, up)
-    unseen = unseen_space(depths, candidates.T_cloud_hand, seen.first_met, ends)
+    seen = _look(view, cloud.normals, mirrored, side, around.at_side, ends)
+    depths = DepthMap.of_each(cloud.points, around.viewpoints, up)
+    unseen = unseen_space(depths, hands, seen.first_met, ends)
     columns = [
         *seen.hits.T,
         *seen.between.T,
         seen.cut_off,
-        *_directions(candidates.T_cloud_hand, mirrored, viewpoint, up),
+        *_directions(hands, mirrored, around.viewpoint, up),
         *unseen.parts,
-        *_stance(cloud, candidates, gripper, up, support),
+        *_stance(around, candidates, gripper),
         # Older networks read no further: what is new goes here, at the end.
         *unseen.ways,
         *unseen.depths,
@@ -102,10 +117,52 @@ def describe_hands(
         *np.tile(_measures(gripper), (len(candidates), 1)).T,
     ]
     if size > len(columns):
-        hands = candidates.T_cloud_hand, side
-        of_object = cloud.points, object_of_point, candidates.contact_index
-        columns += [*visible_extents(*of_object, *hands, ends, up).T]
+        of_object = cloud.points, around.object_of_point, candidates.contact_index
+        columns += [*visible_extents(*of_object, hands, side, ends, up).T]
     return np.stack(columns, axis=1).astype(np.float32)
+
+
+def points_around_fingers(
+    around: Surroundings, T_cloud_hand: Float32, gripper: Gripper, view: HandView, limit: int
+) -> tuple[Float32, Int64]:
+    """The points that each hand sees around its fingers, x toward the only camera's side.
+
+    Args:
+        around: What they look at.
+        T_cloud_hand: (E, 4, 4).
+        gripper: Fingers open to its maximum.
+        view: `hand_views` of the same hands, within `reach_of` the gripper.
+        limit: Points kept of each hand, spread evenly over the cloud's order.
+
+    Returns:
+        (E, limit, 6) positions from between the fingertips in metres and normals, in hand frames,
+        zeros behind the last; and their number (E,).
+    """
+    x, y = gripper.pad_half_width + BESIDE, gripper.max_opening / 2 + OUTSIDE
+    palm_z = seen_part(gripper).palm_z
+    low, high = (-x, -y, palm_z - BEHIND), (x, y, gripper.tip_z + BEYOND_TIPS)
+    points = np.zeros((view.num_candidates, limit, 6), dtype=np.float32)
+    count = np.zeros(view.num_candidates, dtype=np.int64)
+    _around_fingers(
+        view.bounds,
+        view.row,
+        view.columns,
+        around.cloud.normals,
+        T_cloud_hand,
+        around.mirror_sides(T_cloud_hand),
+        np.array([low, high, (0.0, 0.0, gripper.tip_z)], dtype=np.float32),
+        points,
+        count,
+    )
+    return points, count
+
+
+def seen_part(gripper: Gripper) -> Gripper:
+    """The same hand with its palm at most so far behind its fingertips.
+
+    The ends of the fingers hold an object: relative to them, hands of any length look alike.
+    """
+    return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 
 def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -179,15 +236,9 @@ def _directions(
     return [*np.einsum("ed,edk->ke", toward, mirrored), *np.einsum("ed,edk->ke", ups, mirrored)]
 
 
-def _stance(
-    cloud: Cloud,
-    candidates: Candidates,
-    gripper: Gripper,
-    up: Float32,
-    support: SupportPlane | None,
-) -> list[Float32]:
+def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
     """The edge itself, and how the hand stands to gravity and to the support plane."""
-    up = up / np.linalg.norm(up)
+    cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
     pose = candidates.T_cloud_hand
     contact = cloud.points[candidates.contact_index]  # (E, 3)
     edge = contact - cloud.points[candidates.approach_index]
@@ -342,3 +393,33 @@ def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
             if whole:
                 runs[2] = along[i - 1] - low
             whole = False
+
+
+@compiled("contract")
+def _around_fingers(
+    bounds: Int64,
+    row: Int64,
+    columns: Float32,
+    normals: Float32,
+    T_cloud_hand: Float32,
+    side: Float32,
+    box: Float32,
+    points: Float32,
+    count: Int64,
+) -> None:
+    limit = points.shape[1]
+    low, high, origin = box
+    for e in range(len(side)):
+        x, y, z = columns[:, bounds[e] : bounds[e + 1]]
+        inside = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        near = bounds[e] + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
+        count[e] = min(len(near), limit)
+        for slot in range(count[e]):
+            # Where there are too many, those at even distances in the cloud's order.
+            p = near[((slot + 1) * len(near) - 1) // limit if len(near) > limit else slot]
+            for d in range(3):
+                points[e, slot, d] = columns[d, p] - origin[d]
+                for k in range(3):
+                    points[e, slot, 3 + d] += normals[row[p], k] * T_cloud_hand[e, k, d]
+            points[e, slot, 0] *= side[e]
+            points[e, slot, 3] *= side[e]

@@ -13,8 +13,9 @@ from edgegrasp_model.candidates.collision import clearances, met_first, required
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
 from edgegrasp_model.gripper import Gripper
+from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.hand_kernels import non_max_suppression
-from edgegrasp_model.hand_view import hand_views, reach_of, seen_part
+from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
     DebugInfo,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
-from edgegrasp_model.hand_description import without_support
+from edgegrasp_model.hand_description import Surroundings, without_support
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
@@ -123,16 +123,10 @@ def hand_batch(
         viewpoints: (W, 3) camera positions, metres; None: not known.
         max_points: Points of each hand at most.
     """
-    return HandBatch.from_cloud(
-        Cloud(view.points, view.normals),
-        candidates,
-        view.hand,
-        view.up,
-        view.support_plane,
-        viewpoints,
-        view.cut_off(),
-        max_points,
-        object_of_point=view.numbered_objects(),
+    cloud = Cloud(view.points, view.normals)
+    known = view.support_plane, viewpoints, view.cut_off(), view.numbered_objects()
+    return HandBatch.of_hands(
+        Surroundings(cloud, view.up, *known), candidates, view.hand, max_points
     )
 
 

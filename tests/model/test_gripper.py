@@ -20,7 +20,7 @@ from edgegrasp_model.gripper import (
     gripper_names,
     load_gripper,
 )
-from edgegrasp_model.hand_description import describe_hands
+from edgegrasp_model.hand_description import Surroundings, describe_hands
 from edgegrasp_model.options import Collision, DetectOptions, GripperGeometry, SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
 
@@ -93,7 +93,7 @@ def test_points_inside_any_box_collide_and_are_described(gripper: Gripper) -> No
     points = centres @ pose.T_cloud_hand[0, :3, :3].T + pose.T_cloud_hand[0, :3, 3]
     seen = Cloud(np.vstack([cloud.points, points]), np.ones((2 + len(points), 3), np.float32))
     up = np.array([0.0, 0.0, 1.0], np.float32)
-    described = describe_hands(seen, pose, gripper, up, None)[0]
+    described = describe_hands(Surroundings(seen, up), pose, gripper)[0]
     fingers, hands = len(gripper.finger_boxes), len(gripper.hand_boxes)
     # Centres of overlapping boxes lie in one region or the other, never in none.
     assert np.expm1(described[:2]).round().tolist() == [fingers, fingers]

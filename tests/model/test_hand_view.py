@@ -13,6 +13,7 @@ from edgegrasp_model.candidates.edge_grasps import Candidates, edge_grasps
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
     HAND_DESCRIPTION_SIZE,
+    Surroundings,
     describe_hands,
     without_support,
 )
@@ -54,7 +55,8 @@ def look(
     support = support or plane(UP, -0.05)
     up = np.array(support.normal, dtype=np.float32)
     cameras = None if camera is None else camera[None]
-    return HandBatch.from_cloud(cloud, candidates, gripper, up, support, cameras, None, limit)
+    around = Surroundings(cloud, up, support, cameras)
+    return HandBatch.of_hands(around, candidates, gripper, limit)
 
 
 def scores(batch: HandBatch, config: NetworkConfig = TINY["hand"]) -> torch.Tensor:
@@ -105,9 +107,10 @@ def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(mirrored, 
 
 def test_without_a_support_plane_heights_are_the_same_stand_in() -> None:
     cloud, candidates = scene(0)
-    described = describe_hands(cloud, candidates, PANDA, UP, None)
+    described = describe_hands(Surroundings(cloud, UP), candidates, PANDA)
     assert (described[:, 58:61] == np.float32(0.10)).all()
-    known = describe_hands(cloud, candidates, PANDA, UP, plane(UP, -0.03))
+    around = Surroundings(cloud, UP, plane(UP, -0.03))
+    known = describe_hands(around, candidates, PANDA)
     assert not np.array_equal(known, described)
     np.testing.assert_array_equal(without_support(known), described)
 
@@ -243,7 +246,8 @@ def test_two_objects_with_a_gap_between_them_are_not_one() -> None:
         cloud = Cloud(points, np.broadcast_to(UP, points.shape).astype(np.float32))
         still = np.zeros(1, dtype=np.float32)
         grasp = Candidates(index, index, index, UP[None], still, hand[None])
-        described[gap] = describe_hands(cloud, grasp, PANDA, UP, None, ABOVE[None])[0]
+        around = Surroundings(cloud, UP, viewpoints=ABOVE[None])
+        described[gap] = describe_hands(around, grasp, PANDA)[0]
     free, longest, first, second = described[0.002][67:71]
     assert free == 0.0
     np.testing.assert_allclose([longest, first, second], [0.002, 0.042, 0.042], atol=1e-5)
@@ -264,7 +268,8 @@ def test_the_description_ends_with_how_far_the_object_goes_on_around_the_hand() 
     rows = np.array([0, len(plate)])
     hands = Candidates(rows, rows, rows, np.tile(UP, (2, 1)), 0.0 * rows, np.tile(down, (2, 1, 1)))
     cloud = Cloud(points, np.zeros_like(points))
-    known = describe_hands(cloud, hands, PANDA, UP, None, object_of_point=numbers)[:, -11:]
+    around = Surroundings(cloud, UP, object_of_point=numbers)
+    known = describe_hands(around, hands, PANDA)[:, -11:]
     inner = PANDA.max_opening / 2
     beyond = 0.05 - inner, 0.15 - inner
     np.testing.assert_allclose(known[0, :4], [*beyond, *beyond], atol=1e-3)
@@ -272,7 +277,7 @@ def test_the_description_ends_with_how_far_the_object_goes_on_around_the_hand() 
     np.testing.assert_allclose(known[0, 6], 0.04, atol=1e-3)  # the plate reaches below the tips
     np.testing.assert_allclose(known[0, 8:], [0.2, 0.0, 0.06], atol=0.02)
     assert (known[1, 8:] < 0.05).all()  # the other object's own size
-    together = describe_hands(cloud, hands, PANDA, UP, None)[:, -11:]
+    together = describe_hands(Surroundings(cloud, UP), hands, PANDA)[:, -11:]
     assert (together[:, 8] > 0.2).all()
-    short = describe_hands(cloud, hands, PANDA, UP, None, size=HAND_DESCRIPTION_SIZE - 11)
+    short = describe_hands(around, hands, PANDA, size=HAND_DESCRIPTION_SIZE - 11)
     assert short.shape == (2, HAND_DESCRIPTION_SIZE - 11)  # what an older network reads

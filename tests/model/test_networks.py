@@ -96,7 +96,7 @@ def test_gradients_reach_every_parameter(architecture):
     network = build_network(TINY[architecture]).double()
     network(RandomScene.of_seed(1).batch()).square().sum().backward()
     for name, parameter in network.named_parameters():
-        if ".reach." in name:  # chooses a vector: see vector_maximum
+        if ".reach." in name:  # chooses a vector: see Furthest
             continue
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from edgegrasp_model.gripper import load_gripper
+from edgegrasp_model.hand_description import Surroundings
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.scene.scene import near_workspace_side
@@ -69,17 +70,11 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
     batch, label, _ = pack_hands(grasps, grasps.balls()[:2], hands)
     rows = np.flatnonzero(np.isin(grasps.candidates.approach_index, grasps.balls()[:2]))
     np.testing.assert_array_equal(label.numpy(), grasps.label[rows])
-    exact = HandBatch.from_cloud(
-        grasps.cloud,
-        grasps.candidates.take(rows),
-        load_gripper(),
-        UP,
-        TABLE,
-        view.camera_position[None],
-        near_workspace_side(view.points, WORKSPACE, UP, view.points),
-        hands.hand_points,
-        object_of_point=view.numbered_objects(),
-    )
+    side = near_workspace_side(view.points, WORKSPACE, UP, view.points)
+    known = TABLE, view.camera_position[None], side, view.numbered_objects()
+    around = Surroundings(grasps.cloud, UP, *known)
+    candidates = grasps.candidates.take(rows)
+    exact = HandBatch.of_hands(around, candidates, load_gripper(), hands.hand_points)
     torch.testing.assert_close(batch.description, exact.description, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(batch.point_count, exact.point_count)
     varied = pack_hands(grasps, grasps.balls()[:2], hands, np.random.default_rng(0)).batch

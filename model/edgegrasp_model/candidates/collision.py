@@ -10,7 +10,7 @@ from edgegrasp_model.hand_kernels import (
     points_in_hand_boxes,
     signed_distance_to_boxes,
 )
-from edgegrasp_model.hand_view import HandView, Reach, hand_views, reach_of
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.scene.grouping import FIXED
@@ -66,7 +66,7 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
     return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
-def reach_of_motion(gripper: Gripper, request: Collision) -> Reach:
+def reach_of_motion(gripper: Gripper, request: Collision) -> Float32:
     """The part of the hand frame that the hand sweeps on its way in and out."""
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0
     return reach_of(gripper, around=request.margin, back=approach_sweep_length(request), lift=lift)

@@ -17,14 +17,13 @@ from torch import Tensor, nn
 
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.hand_description import HAND_DESCRIPTION_SIZE, describe_hands
-from edgegrasp_model.hand_view import (
-    HandView,
-    hand_views,
-    only_viewpoint,
+from edgegrasp_model.hand_description import (
+    HAND_DESCRIPTION_SIZE,
+    Surroundings,
+    describe_hands,
     points_around_fingers,
-    reach_of,
 )
+from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.layers import (
@@ -36,8 +35,7 @@ from edgegrasp_model.networks.layers import (
     maximum,
     mlp,
 )
-from edgegrasp_model.options import SupportPlane
-from edgegrasp_model.scene.cloud import UP, Cloud
+from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -57,34 +55,20 @@ class HandBatch:
     point_count: Tensor  # (E,) int64, how many of the P there are; zeros follow
 
     @classmethod
-    def from_cloud(
+    def of_hands(
         cls,
-        cloud: Cloud,
+        around: Surroundings,
         candidates: Candidates,
-        gripper: Gripper,
-        up: Float32,  # (3,) away from gravity
-        support: SupportPlane | None,
-        viewpoints: Float32 | None,  # (W, 3) the cameras, where they are known
-        at_side: NDArray[np.bool_] | None,  # (N,) cut off by a side of the workspace
+        gripper: Gripper,  # open to its maximum
         num_points: int,
         view: HandView | None = None,
-        object_of_point: NDArray[np.int64] | None = None,  # (N,) None: all points are of one
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
-        """Look at a cloud from the hands of some candidates.
-
-        The gripper is open to its maximum; heights are measured from the support.
-        """
+        """What the hands of some candidates see, at most `num_points` points of each."""
         T_cloud_hand = candidates.T_cloud_hand
-        view = view or hand_views(cloud, T_cloud_hand, reach_of(gripper))
-        of_points = at_side, view, object_of_point, description_size
-        description = describe_hands(
-            cloud, candidates, gripper, up, support, viewpoints, *of_points
-        )
-        camera = only_viewpoint(viewpoints)
-        points, count = points_around_fingers(
-            cloud.normals, T_cloud_hand, gripper, camera, view, num_points
-        )
+        view = view or hand_views(around.cloud, T_cloud_hand, reach_of(gripper))
+        description = describe_hands(around, candidates, gripper, view, description_size)
+        points, count = points_around_fingers(around, T_cloud_hand, gripper, view, num_points)
         return cls(torch.from_numpy(description), torch.from_numpy(points), torch.from_numpy(count))
 
     @staticmethod
@@ -115,19 +99,10 @@ def hand_batch(
     scene: Scene, candidates: Candidates, gripper: Gripper, network: NetworkConfig, view: HandView
 ) -> HandBatch:
     """The input of the hand network for some candidates of a scene."""
-    return HandBatch.from_cloud(
-        scene.cloud,
-        candidates,
-        gripper,
-        UP,
-        scene.support,
-        scene.viewpoints,
-        scene.at_side,
-        network.hand_points,
-        view,
-        scene.object_of_point,
-        network.description_size,
-    )
+    known = scene.support, scene.viewpoints, scene.at_side, scene.object_of_point
+    around = Surroundings(scene.cloud, UP, *known)
+    sizes = network.hand_points, view, network.description_size
+    return HandBatch.of_hands(around, candidates, gripper, *sizes)
 
 
 class HandNet(nn.Module):
