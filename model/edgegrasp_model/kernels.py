@@ -20,7 +20,6 @@ ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many tim
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
 JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
 DIAGONAL = 1e-12  # share of a matrix's trace that its other elements together may be
-BLOCK = 512  # points at a time, so that their positions stay in the first cache
 
 
 def heights_and_distances(

@@ -6,8 +6,8 @@ these models; the gRPC messages and the client's types have the same fields, whi
 
 import base64
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,10 @@ from pydantic import (
     model_validator,
 )
 
-from edgegrasp_model.errors import invalid_fields
+from edgegrasp_model.errors import InvalidRequest, invalid_fields
+
+Pose = TypeVar("Pose", bound=tuple[Any, ...])
+Schema = TypeVar("Schema", bound=BaseModel)
 
 FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
 
@@ -49,12 +52,9 @@ MAX_ROWS = 5_000_000
 Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
 HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
 SAME = 1e-6  # metres below which two lengths of a gripper are the same
+NearHand = Annotated[float, Field(ge=-1.0, le=1.0), numeric]  # metres
 Corner = Annotated[
-    tuple[
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-        Annotated[float, Field(ge=-1.0, le=1.0), numeric],
-    ],
+    tuple[NearHand, NearHand, NearHand],
     Field(description="x, y, z in the hand frame, metres"),
 ]
 Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
@@ -320,9 +320,7 @@ class Linkage(Strict):
     """A linkage that carries each finger along an arc: its tips come forward as it closes."""
 
     radius: HandLength = Field(description="length of the link that carries a finger, metres")
-    reach: Number = Field(
-        ge=-1.0, le=1.0, description="outward part (y) of that link in the open gripper, metres"
-    )
+    reach: NearHand = Field(description="outward part (y) of that link in the open gripper, metres")
 
 
 class GripperGeometry(Strict):
@@ -334,7 +332,7 @@ class GripperGeometry(Strict):
     contact_z: HandLength = Field(
         description="where contacts are put, metres along z; between palm and fingertips"
     )
-    tcp_z: Number = Field(ge=-1.0, le=1.0, description="origin of the TCP frame, metres along z")
+    tcp_z: NearHand = Field(description="origin of the TCP frame, metres along z")
     hand: HandPart = Field(description="the hand without its fingers")
     finger: HandPart = Field(description="one finger, its inner face at y = 0; mirrored")
     swing: Linkage | None = Field(
@@ -462,7 +460,8 @@ def _row_by_row(value: object) -> object:
     return [number for row in value for number in row] if nested else value  # type: ignore[attr-defined]
 
 
-def _rigid(value: tuple[float, ...]) -> tuple[float, ...]:
+def rigid(value: Pose) -> Pose:
+    """A pose T (4, 4), row by row; raises ValueError unless it is a rotation and a translation."""
     pose = np.reshape(value, (4, 4))
     turn = pose[:3, :3]
     if (
@@ -470,7 +469,7 @@ def _rigid(value: tuple[float, ...]) -> tuple[float, ...]:
         or np.linalg.det(turn) < 0
         or np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6
     ):
-        raise ValueError("must be a rotation and a translation, with last row 0, 0, 0, 1")
+        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
     return value
 
 
@@ -479,7 +478,7 @@ class RobotArm(Strict):
 
     name: str = Field(max_length=100, description="one of the server's robots")
     T_base_cloud: Annotated[
-        Matrix, AfterValidator(_rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
+        Matrix, AfterValidator(rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
     ] = Field(
         description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
     )
@@ -661,7 +660,18 @@ def parse_options(fields: object) -> DetectOptions:
     Raises:
         InvalidRequest: A field is unknown, of the wrong type or out of range.
     """
+    return parse(DetectOptions, fields, "options", DetectOptions.model_fields)
+
+
+def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
+    """Check plain values against a schema; raises InvalidRequest that names the field.
+
+    `known`: fields to name where one at the top is not known.
+    """
     try:
-        return DetectOptions.model_validate(fields)
+        return schema.model_validate(fields)
     except ValidationError as error:
-        raise invalid_fields(error, fields, "options", DetectOptions.model_fields) from None
+        problem = invalid_fields(error, fields, name, known)
+        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
+            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
+        raise problem from None

@@ -8,24 +8,22 @@ arrays suit is for the detector to say.
 import base64
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     Field,
     SkipValidation,
     StrictBool,
-    ValidationError,
 )
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput, read_point_cloud2, too_many
 from edgegrasp_camera.depth import Position, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.files import read_file, read_npy, read_png
-from edgegrasp_model.errors import InvalidRequest, brief, invalid_fields
+from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import (
     FARTHEST,
     MAX_VIEWS,
@@ -34,10 +32,9 @@ from edgegrasp_model.options import (
     Integer,
     Strict,
     numeric,
+    parse,
+    rigid,
 )
-
-Array = NDArray[Any]
-Schema = TypeVar("Schema", bound=BaseModel)
 
 # Points and arrays beside them, where they come packed: numbers a row, and their type.
 PACKED = {
@@ -231,15 +228,6 @@ def _by_name(value: object) -> object:
     return intrinsics_of(value)._asdict() if isinstance(value, list) else value
 
 
-def _rigid(pose: tuple[PoseRow, ...]) -> tuple[PoseRow, ...]:
-    matrix = np.array(pose)
-    rotation = matrix[:3, :3]
-    turned = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    if not turned or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise ValueError("must be a rotation and a translation, row-major, with last row 0 0 0 1")
-    return pose
-
-
 class Intrinsics(Strict):
     """A pinhole camera without distortion; the centre of the top left pixel is (0, 0)."""
 
@@ -258,7 +246,7 @@ class CameraView(Strict):
             _by_name, json_schema_input_type=Intrinsics | list[float] | list[list[float]]
         ),
     ] = Field(description="by name, or fx, fy, cx, cy, or the 3 x 3 matrix")
-    T_cloud_camera: Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(_rigid)] = (
+    T_cloud_camera: Annotated[tuple[PoseRow, PoseRow, PoseRow, PoseRow], AfterValidator(rigid)] = (
         Field(
             default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
             description="maps camera coordinates to cloud coordinates, metres",
@@ -290,17 +278,6 @@ class DepthImage(CameraView):
 
 
 CAMERA = tuple(DepthImage.model_fields)  # what a form may have as parts, of one image
-
-
-def parse(schema: type[Schema], fields: object, name: str) -> Schema:
-    """Check plain values against a schema; raises InvalidRequest that names the field."""
-    try:
-        return schema.model_validate(fields)
-    except ValidationError as error:
-        problem = invalid_fields(error, fields, name)
-        if problem.value.startswith(("'", "b'")) and problem.field.endswith(".data"):
-            problem = InvalidRequest(problem.field, "no base64", "Send base64 in JSON.")
-        raise problem from None
 
 
 # Depth images

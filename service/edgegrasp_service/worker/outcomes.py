@@ -6,7 +6,7 @@ from typing import Any
 import orjson
 from pydantic import BaseModel, ConfigDict, Field
 
-from edgegrasp_model.request_cloud import parse
+from edgegrasp_model.options import parse
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.recording import append_line
 from edgegrasp_service.worker.http_bodies import JSON, read_json
