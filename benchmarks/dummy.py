@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array, Float32, Int64
 from edgegrasp_model.errors import UnknownModel
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
@@ -20,7 +20,6 @@ from edgegrasp_model.results import (
     DebugInfo,
     Detection,
     Evaluation,
-    Float32,
     Grasp,
     GripperOutline,
     NoGrasp,
@@ -46,7 +45,7 @@ class DummyPrepared:
 
     options: DetectOptions
     points: Float32  # (N, 3)
-    drawn: NDArray[np.int64]  # (A,) approach points, rows of `points`
+    drawn: Int64  # (A,) approach points, rows of `points`
     batch: Float32  # (A,) scores, descending, which the network gives back
     counts: dict[str, int]
     seconds: dict[str, float] = field(default_factory=dict)
@@ -108,8 +107,8 @@ class DummyDetector:
         cloud: CloudInput,
         options: DetectOptions,
         *,
-        edges: NDArray[Any] | None = None,
-        hand_poses: NDArray[Any] | None = None,
+        edges: Array | None = None,
+        hand_poses: Array | None = None,
     ) -> Scoring:
         """Make up scores; an edge from a row to itself defines no grasp."""
         checked = check_cloud(cloud)

@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 from edgegrasp_sim.objects import ObjectSet, SceneKind
 from edgegrasp_sim.scene import SceneObject, load_object, wait_for_rest
 from edgegrasp_sim.sensor import random_sensor
-
-Array = NDArray[np.float64]
 
 KINDS = ("table", "heap", "tray", "bin", "shelf")
 FIRST, SUPPORT = 2, 0.01  # the first object's label; least share of the support in an image
@@ -178,7 +177,7 @@ class Maker:
             self.box(size, foot + lean.apply((0, 0, length / 2)), lean)
 
 
-def picture(maker: Maker, made: Made) -> dict[str, Array]:
+def picture(maker: Maker, made: Made) -> dict[str, Float64]:
     """The image of a random depth camera, and its labels."""
     rng = maker.rng
     width, height = SIZES[int(rng.integers(len(SIZES)))]
@@ -215,7 +214,7 @@ def picture(maker: Maker, made: Made) -> dict[str, Array]:
     }
 
 
-def on_the_surface(label: NDArray[np.uint8], true: Array, depth: Array) -> NDArray[np.uint8]:
+def on_the_surface(label: NDArray[np.uint8], true: Float64, depth: Float64) -> NDArray[np.uint8]:
     """Labels (H, W) of readings: of the surface nearby that each lies on; 0: it lies on none."""
     off = np.abs(depth - true)
     best, found = off.copy(), label.copy()

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 from benchmarks.measuring import RESULTS, machine, served, write_results
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import DetectOptions, GraspClient, GraspClientError
 
 POINTS = 20_000
@@ -118,7 +118,7 @@ def run_clients(task: Task) -> list[Sample]:
         return [sample for one in work_of_each for sample in one.result()]
 
 
-def request(client: GraspClient, points: NDArray[np.float32]) -> Sample:
+def request(client: GraspClient, points: Float32) -> Sample:
     """Send one request."""
     begun = time.monotonic()
     try:
@@ -147,7 +147,7 @@ def percentiles(seconds: Sequence[float]) -> dict[str, float] | None:
     return dict(zip(("p50", "p90", "p99", "max"), values.tolist(), strict=True))
 
 
-def cloud(points: int, seed: int) -> NDArray[np.float32]:
+def cloud(points: int, seed: int) -> Float32:
     """(N, 3) metres: a table of 0.3 m with five boxes on it, seen from all sides."""
     random = np.random.default_rng([seed, points])
     parts = [random.uniform((0.0, 0.0, 0.0), (0.3, 0.3, 0.001), (points // 3, 3))]

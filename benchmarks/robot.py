@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import Detection
@@ -25,7 +25,7 @@ SAMPLE = "service/edgegrasp_service/playground/samples/seven_depth.png"
 FOCAL, SEEDS, FAR = 540.0, 20, 0.5  # pixels; seeds; metres from the arm's base to the objects
 
 
-def cloud_of_sample() -> NDArray[np.float32]:
+def cloud_of_sample() -> Float32:
     """The image's points (480, 640, 3), camera frame, metres."""
     depth = np.asarray(Image.open(Path(__file__).parents[1] / SAMPLE), dtype=np.float32) / 1000
     depth[depth == 0.0] = np.nan
@@ -34,7 +34,7 @@ def cloud_of_sample() -> NDArray[np.float32]:
     return (np.stack(rays, axis=-1) * depth[..., None]).astype(np.float32)
 
 
-def beside(detection: Detection) -> NDArray[np.float64]:
+def beside(detection: Detection) -> Float64:
     """T_base_cloud (4, 4) of a base on the support; its x points at the objects."""
     support = detection.support
     assert support is not None
@@ -46,7 +46,7 @@ def beside(detection: Detection) -> NDArray[np.float64]:
     T_cloud_base = np.eye(4)
     T_cloud_base[:3, :3] = np.stack([-ahead, np.cross(up, -ahead), up], axis=1)
     T_cloud_base[:3, 3] = middle + FAR * ahead
-    found: NDArray[np.float64] = np.linalg.inv(T_cloud_base)
+    found: Float64 = np.linalg.inv(T_cloud_base)
     return found
 
 

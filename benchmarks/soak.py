@@ -38,8 +38,8 @@ import numpy as np
 from benchmarks import dummy
 from benchmarks.measuring import RESULTS, Served, served, write_results
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float32
 from edgegrasp_client import (
     AsyncGraspClient,
     Detection,
@@ -134,7 +134,7 @@ class Plan:
     wait: float  # seconds until its client leaves
     seed: int
 
-    def points(self) -> NDArray[np.float32]:
+    def points(self) -> Float32:
         """(N, 3) a cloud that no other plan has."""
         random = np.random.default_rng([self.seed, self.number])
         return random.uniform(-0.2, 0.2, (self.size, 3)).astype(np.float32)

@@ -8,9 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.errors import InvalidRequest, PayloadTooLarge
 
-Array = NDArray[Any]
 Records = NDArray[np.void]
 
 

@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import CloudInput
 from edgegrasp_camera.errors import InvalidRequest
 
-Float64 = NDArray[np.float64]
 Position = tuple[float, float, float]  # metres
 
 MILLIMETRE = 0.001  # metres for one unit of whole numbers
@@ -58,7 +57,7 @@ def intrinsics_of(value: Any) -> Intrinsics:
     raise ValueError("must be fx, fy, cx, cy or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
 
 
-def metres(depth: NDArray[Any], scale: float | None = None, field: str = "depth") -> Float64:
+def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Float64:
     """Depths in metres.
 
     Args:
@@ -97,7 +96,7 @@ def unproject(depth: Float64, camera: Intrinsics) -> Float64:
 
 
 def fuse_depth_images(
-    depths: Sequence[NDArray[Any]], views: Sequence[Any]
+    depths: Sequence[Array], views: Sequence[Any]
 ) -> tuple[CloudInput, list[Position]]:
     """Turn depth images into one cloud.
 
@@ -115,7 +114,7 @@ def fuse_depth_images(
         InvalidRequest: An array is no image of depths, or cannot be that of its camera; names
             `depth_images.N`.
     """
-    clouds: list[NDArray[np.float32]] = []
+    clouds: list[Float32] = []
     cameras: list[Position] = []
     doubts: list[str] = []
     for row, (depth, view) in enumerate(zip(depths, views, strict=True)):

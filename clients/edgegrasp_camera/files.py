@@ -17,16 +17,9 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
-from numpy.typing import NDArray
 
-from edgegrasp_camera.clouds import (
-    PCL_FIELDS,
-    Array,
-    CloudInput,
-    Records,
-    cloud_of_records,
-    too_many,
-)
+from edgegrasp_camera.arrays import Array, Float64
+from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_records, too_many
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.errors import (
     EdgeGraspError,
@@ -245,7 +238,7 @@ def _read_records(
         return unstructured_to_structured(table, record, casting="unsafe")
 
 
-def _read_text(data: bytes, **options: Any) -> NDArray[np.float64]:
+def _read_text(data: bytes, **options: Any) -> Float64:
     for start in range(0, len(data) - MAX_LINE, MAX_LINE):
         if data.find(b"\n", start, start + MAX_LINE) < 0:
             raise ValueError(f"a line of more than {MAX_LINE} characters")

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-Points = NDArray[np.float64]
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+
+Points = Float64
 
 PANDA = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface and the fingertips
 STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
@@ -41,7 +43,7 @@ class Drawable(Protocol):
     @property
     def score(self) -> float: ...  # noqa: D102
     @property
-    def T_cloud_hand(self) -> NDArray[np.float32]: ...  # noqa: D102, N802  # (4, 4)
+    def T_cloud_hand(self) -> Float32: ...  # noqa: D102, N802  # (4, 4)
     @property
     def width(self) -> float: ...  # noqa: D102  # metres
 
@@ -56,7 +58,7 @@ class View:
     cx: float
     cy: float
     # (4, 4); by default the cloud is in the camera's frame
-    T_cloud_camera: NDArray[np.floating] = field(default_factory=lambda: np.eye(4))
+    T_cloud_camera: Floats = field(default_factory=lambda: np.eye(4))
 
     @classmethod
     def of(cls, points: ArrayLike, eye: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Self:
@@ -78,7 +80,7 @@ class View:
         return cls(SIZE, focal, focal, *middle, T)
 
     @classmethod
-    def of_image(cls, points: NDArray[np.floating]) -> Self | None:
+    def of_image(cls, points: Floats) -> Self | None:
         """The camera at the origin that saw an organised cloud (H, W, 3); None: none did."""
         rows, columns = np.nonzero(np.isfinite(points).all(axis=2) & (points[..., 2] != 0))
         if len(np.unique(rows)) < 2 or len(np.unique(columns)) < 2:
@@ -101,7 +103,7 @@ class View:
             pixels = np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
         return pixels, z if self.fx > 0 else -z
 
-    def rows_of_pixels(self, points: ArrayLike) -> NDArray[np.int64]:
+    def rows_of_pixels(self, points: ArrayLike) -> Int64:
         """(H, W) the row of the cloud that is seen at each pixel, the nearest; -1: none."""
         pixels, depth = self.project(points)
         seen = np.flatnonzero(np.isfinite(pixels).all(axis=1) & (depth > 0.0))
@@ -178,7 +180,7 @@ class Picture:
         pixels, _ = self.view.project(points)
         self._axes.plot(*pixels.T, color=color, linewidth=width)
 
-    def outline(self, mask: NDArray[np.bool_], color: str = "white") -> None:
+    def outline(self, mask: Bools, color: str = "white") -> None:
         """Draw the border of what is marked in the image: (H, W)."""
         if mask.any():
             self._axes.contour(mask, [0.5], colors=color, linewidths=1.0)
@@ -276,7 +278,7 @@ def draw_grasps(
     picture.save(path)
 
 
-def lit(depth: NDArray[np.floating], fx: float, fy: float) -> Points:
+def lit(depth: Floats, fx: float, fy: float) -> Points:
     """Brightness of a depth image lit by a lamp over the camera, from 0 to 1: (H, W).
 
     Args:

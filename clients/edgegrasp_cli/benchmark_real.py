@@ -22,8 +22,9 @@ from edgegrasp_cli.flags import (
 from edgegrasp_model.results import SUPPORT, UNLABELLED
 
 if TYPE_CHECKING:
+    from edgegrasp_camera.arrays import Int64
     from edgegrasp_camera.picture import Picture
-    from edgegrasp_cli.real_scenes import Int64, RealScene, SceneFigures
+    from edgegrasp_cli.real_scenes import RealScene, SceneFigures
     from edgegrasp_model.gripper import Gripper
 
 Option = typer.Option

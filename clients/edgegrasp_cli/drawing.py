@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_camera.clouds import CloudInput
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 from edgegrasp_camera.files import read_file, read_npy, read_png
@@ -19,7 +19,7 @@ DRAWN = 10  # grasps in a picture
 AROUND = 0.4  # metres from the grasps: what a picture of a cloud shows
 
 
-def pixels(file: Path) -> NDArray[Any]:
+def pixels(file: Path) -> Array:
     """The values of an image file, .png or .npy: (H, W), or (H, W, C) of several channels."""
     read = read_png if file.suffix.lower() == ".png" else read_npy
     return read(file.read_bytes(), sys.maxsize, file.name)
@@ -47,7 +47,7 @@ def draw(
     detection: "Detection",
     sent: CloudInput,
     options: Mapping[str, Any],
-    colors: NDArray[Any] | None = None,
+    colors: Array | None = None,
     from_above: bool = False,
 ) -> None:
     """Write a picture of a request and the best of its grasps.

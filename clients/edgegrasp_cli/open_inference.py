@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ NOT_OPTIONS |= {"sequence_id", "sequence_start", "sequence_end"}
 PARALLEL_CALLS = 32
 MAX_SHORT_LISTS = 20_000  # in JSON; most lists hold numbers
 
-Tensors = dict[str, NDArray[Any]]
+Tensors = dict[str, Array]
 Option = typer.Option
 
 
@@ -196,7 +196,7 @@ def _option(value: Any) -> Any:
         return value
 
 
-def tensor(name: str, datatype: str, shape: Any, data: Any) -> NDArray[Any]:
+def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:
     """A tensor of bytes, little-endian, or of nested or flat lists; raises RefusedError."""
     try:
         dtype = DTYPES[datatype]

@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
 from edgegrasp_camera.picture import View
 from edgegrasp_sim.segmentation import Segmentation, compare
 
 if TYPE_CHECKING:  # Numba is loaded where grasps are judged
     from edgegrasp_model.gripper import Gripper
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Array = NDArray[Any]
 
 BEST = 10  # grasps of each scene that are judged
 GOOD_SCORE = 0.5
@@ -202,7 +199,7 @@ def judge(
     )
 
 
-def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> NDArray[np.bool_]:
+def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> Bools:
     """Which open hands (E,) hold a measured point deeper than NOISE: of all, none cleaned away."""
     from edgegrasp_model.hand_kernels import any_point_in_boxes
 
@@ -214,7 +211,7 @@ def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") ->
     return any_point_in_boxes(seen, hands, boxes)
 
 
-def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> NDArray[np.int64]:
+def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
     """The label (E,) of the object that both points of a grasp are on; 0: of none."""
     seen = np.isfinite(scene.points).all(axis=1)
     ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]

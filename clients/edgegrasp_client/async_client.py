@@ -16,10 +16,10 @@ from typing import Any, TypeVar
 
 import grpc.aio
 import httpx
-from numpy.typing import NDArray
 from typing_extensions import Self, Unpack
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_camera.arrays import Array
 from edgegrasp_client import grpc_wire, rest_wire
 from edgegrasp_client.clouds import Cloud, DepthImage
 from edgegrasp_client.connection import (
@@ -106,10 +106,10 @@ class AsyncGraspClient:
         cloud: Cloud | None = None,
         *,
         depth_images: Sequence[DepthImage] | None = None,
-        normals: NDArray[Any] | None = None,
-        colors: NDArray[Any] | None = None,
-        segment_ids: NDArray[Any] | None = None,
-        view_ids: NDArray[Any] | None = None,
+        normals: Array | None = None,
+        colors: Array | None = None,
+        segment_ids: Array | None = None,
+        view_ids: Array | None = None,
         timeout: float | None = None,
         **options: Unpack[DetectOptions],
     ) -> Detection:
@@ -139,13 +139,13 @@ class AsyncGraspClient:
         self,
         cloud: Cloud | None = None,
         *,
-        edges: NDArray[Any] | None = None,
-        hand_poses: NDArray[Any] | None = None,
+        edges: Array | None = None,
+        hand_poses: Array | None = None,
         depth_images: Sequence[DepthImage] | None = None,
-        normals: NDArray[Any] | None = None,
-        colors: NDArray[Any] | None = None,
-        segment_ids: NDArray[Any] | None = None,
-        view_ids: NDArray[Any] | None = None,
+        normals: Array | None = None,
+        colors: Array | None = None,
+        segment_ids: Array | None = None,
+        view_ids: Array | None = None,
         timeout: float | None = None,
         **options: Unpack[DetectOptions],
     ) -> Scoring:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import NotRequired, TypedDict
 
+from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_camera.clouds import PointCloud2
 from edgegrasp_camera.depth import intrinsics_of
 from edgegrasp_camera.files import FILE_FORMATS
@@ -33,16 +33,16 @@ class DepthImage(TypedDict):
 
     # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
     # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.
-    depth: NDArray[Any] | str | PathLike[str]
+    depth: Array | str | PathLike[str]
     # Or fx, fy, cx, cy; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
-    intrinsics: Intrinsics | Sequence[float] | NDArray[Any]
+    intrinsics: Intrinsics | Sequence[float] | Array
     # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
-    T_cloud_camera: NotRequired[NDArray[Any] | Sequence[Sequence[float]]]
+    T_cloud_camera: NotRequired[Array | Sequence[Sequence[float]]]
     # Metres that one unit of the depth is worth; left out: 0.001 of whole numbers, 1 of floats.
     depth_scale: NotRequired[float]
 
 
-Cloud = NDArray[Any] | str | PathLike[str] | PointCloud2
+Cloud = Array | str | PathLike[str] | PointCloud2
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class CloudFile:
     data: bytes
 
 
-def float32_points(cloud: Cloud) -> NDArray[np.float32] | None:
+def float32_points(cloud: Cloud) -> Float32 | None:
     """The cloud as (N, 3) float32 if it is an array of N points; None if it is not."""
     if not isinstance(cloud, np.ndarray) or cloud.dtype not in (np.float32, np.float64):
         return None
@@ -91,7 +91,7 @@ def cloud_file(cloud: Cloud) -> CloudFile:
         raise invalid("cloud", f"{path} ({error.strerror})", "Give a readable file.") from None
 
 
-def npy_bytes(array: NDArray[Any]) -> bytes:
+def npy_bytes(array: Array) -> bytes:
     """An array as an .npy file; raises ValueError for one of objects."""
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=False)

@@ -15,11 +15,11 @@ from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_client.results import Grasp
 
-Float64 = NDArray[np.float64]
 Message = dict[str, Any]
 
 _AXES = {

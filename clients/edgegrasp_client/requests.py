@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Unpack
 
+from edgegrasp_camera.arrays import Array, Float32
 from edgegrasp_client.clouds import Cloud, DepthImage
 from edgegrasp_client.errors import invalid
 from edgegrasp_client.options import DetectOptions
-
-Array = NDArray[Any]
 
 SAME_POINT = 0.005  # metres: the side of a cell in which the scene repeats the object
 
@@ -129,7 +128,7 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def on_mask(mask: NDArray[Any], options: Mapping[str, Any] | None = None) -> DetectOptions:
+def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOptions:
     """Options that allow approach and contact points only where a mask is not 0.
 
     Args:
@@ -151,7 +150,7 @@ def on_mask(mask: NDArray[Any], options: Mapping[str, Any] | None = None) -> Det
 
 def object_in_scene(
     object_points: ArrayLike, scene_points: ArrayLike
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[Float32, NDArray[np.int32]]:
     """One cloud of an object and of the scene around it, which are sent apart.
 
     Args:

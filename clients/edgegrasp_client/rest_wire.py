@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import httpx
 import numpy as np
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_client.clouds import (
     cloud_file,
     depth_image_fields,
@@ -26,7 +27,7 @@ from edgegrasp_client.errors import (
     error_of_kind,
     invalid,
 )
-from edgegrasp_client.requests import Array, Request, ScoreRequest
+from edgegrasp_client.requests import Request, ScoreRequest
 from edgegrasp_client.results import Read
 
 READY = "/health/ready"

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import clearances, collides
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
@@ -28,9 +28,6 @@ from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import Evaluation, NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
 
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
-
 BALLS_AT_A_TIME = 64
 FIRST_TOUCH = 0.004  # metres from the outermost point, within which points are touched first
 FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
@@ -40,7 +37,7 @@ FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same h
 class Scorer:
     """A network as the evaluation sees it."""
 
-    probability: Callable[[BallBatch | HandBatch], NDArray[np.floating]]
+    probability: Callable[[BallBatch | HandBatch], Floats]
     crop_radius: float  # metres
     network: NetworkConfig
 
@@ -90,7 +87,7 @@ def evaluate(
     return evaluations
 
 
-def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> NDArray[np.floating]:
+def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats:
     """Scores (E,), ball by ball: there are as many balls as the caller has approach points."""
     score = np.empty(len(candidates))
     points, normals = scene.cloud.points, scene.cloud.normals
@@ -109,9 +106,7 @@ def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> NDArra
     return score
 
 
-def _contact_rows(
-    candidates: Candidates, balls: NDArray[np.int64], crop: BallCrop, size: int
-) -> NDArray[np.int64]:
+def _contact_rows(candidates: Candidates, balls: Int64, crop: BallCrop, size: int) -> Int64:
     """Rows (E,) of the crop that hold the candidates' contacts, each in its own ball."""
     keys = crop.ball_of_point * size + crop.ball_rows  # ascending
     ball = np.searchsorted(balls, candidates.approach_index)
@@ -224,7 +219,7 @@ def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int6
     return result
 
 
-def _least(group: Int64, key: NDArray[np.floating]) -> tuple[Int64, Int64]:
+def _least(group: Int64, key: Floats) -> tuple[Int64, Int64]:
     """The groups that occur, ascending, and where in them the key is least."""
     order = np.lexsort((key, group))
     groups, first = np.unique(group[order], return_index=True)

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
+from edgegrasp_camera.arrays import Float32, Float64, Floats
 from edgegrasp_model.errors import InvalidGripper, InvalidRequest
 from edgegrasp_model.options import Boxes, DetectOptions, GripperGeometry, Linkage
 
@@ -33,7 +34,7 @@ class Gripper:
     linkage: Linkage | None = None
 
     @cached_property
-    def T_hand_tcp(self) -> NDArray[np.float32]:  # noqa: N802
+    def T_hand_tcp(self) -> Float32:  # noqa: N802
         """Maps TCP coordinates to hand coordinates.  # (4, 4)."""
         transform = np.eye(4, dtype=np.float32)
         transform[2, 3] = self.tcp_z
@@ -52,7 +53,7 @@ class Gripper:
         upright = self.max_opening - 2 * self.linkage.reach  # links point straight ahead there
         return self.tip_z + float(self.tip_advance(upright))
 
-    def tip_advance(self, opening: ArrayLike) -> NDArray[np.floating]:
+    def tip_advance(self, opening: ArrayLike) -> Floats:
         """How far the fingertips are ahead of where they are in the open gripper, metres.
 
         Args:
@@ -66,12 +67,10 @@ class Gripper:
             return np.zeros_like(opening, dtype=np.float64)
         radius, reach = self.linkage.radius, self.linkage.reach
         outward = reach - (self.max_opening - np.clip(opening, 0.0, self.max_opening)) / 2
-        advance: NDArray[np.floating] = np.sqrt(radius**2 - outward**2) - np.sqrt(
-            radius**2 - reach**2
-        )
+        advance: Floats = np.sqrt(radius**2 - outward**2) - np.sqrt(radius**2 - reach**2)
         return advance
 
-    def contact_z_at(self, opening: ArrayLike) -> NDArray[np.float32]:
+    def contact_z_at(self, opening: ArrayLike) -> Float32:
         """Where a contact lies along z once the fingers have closed to an opening.
 
         Always the same distance inside the fingertips, which a swinging finger brings forward.
@@ -84,7 +83,7 @@ class Gripper:
         """
         return (self.contact_z + self.tip_advance(opening)).astype(np.float32)
 
-    def boxes(self, opening: ArrayLike, advance: ArrayLike | None = None) -> NDArray[np.float64]:
+    def boxes(self, opening: ArrayLike, advance: ArrayLike | None = None) -> Float64:
         """All boxes with the fingers `opening` metres apart: hand, then both fingers.
 
         Args:

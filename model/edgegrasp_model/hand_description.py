@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates, support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import APPROACH_LENGTH, NEAR, HandView, hand_views, reach_of
@@ -19,9 +19,6 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
 from edgegrasp_model.unseen import DepthMap, unseen_space, visible_extents
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 AXIS = 0.001  # metres from the approach axis, on which the approach point itself lies
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
@@ -47,7 +44,7 @@ class Surroundings:
     viewpoints: Float32 | None = None  # (W, 3) the cameras
     # (N,) where a side of the workspace cuts objects off: what is between the fingers there may be
     # wider than it seems. None: nowhere.
-    at_side: NDArray[np.bool_] | None = None
+    at_side: Bools | None = None
     object_of_point: Int64 | None = None  # (N,) None: all points are of one
 
     @property
@@ -165,7 +162,7 @@ def seen_part(gripper: Gripper) -> Gripper:
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 
-def without_support(description: NDArray[np.floating]) -> NDArray[np.floating]:
+def without_support(description: Floats) -> Floats:
     """The description (E, F) that the same hands have where the support plane is not known."""
     unknown = description.copy()
     unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
@@ -206,7 +203,7 @@ def _look(
     normals: Float32,
     mirrored: Float32,
     side: Float32,
-    at_side: NDArray[np.bool_] | None,
+    at_side: Bools | None,
     gripper: Gripper,
 ) -> _Seen:
     """Look from hands with axes (E, 3, 3), the x of which is mirrored where `side` (E,) is -1."""
@@ -269,7 +266,7 @@ def _look_from_each(
     normals: Float32,
     axes: Float32,
     side: Float32,
-    cut: NDArray[np.bool_],
+    cut: Bools,
     hand: _Hand,
     seen: _Seen,
 ) -> None:
@@ -309,7 +306,7 @@ def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) 
 @compiled("contract")
 def _in_any(
     boxes: Float32, x: Float32, y: Float32, z: Float32, around: float, behind: float
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Which points lie in one of some boxes, grown around (not behind) and lengthened behind."""
     inside = np.zeros(len(x), dtype=np.bool_)
     grown, longer = np.float32(around), np.float32(behind)

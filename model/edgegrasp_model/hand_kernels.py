@@ -1,9 +1,9 @@
 """Loops over the points that each hand may meet or see, compiled to machine code by Numba."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from edgegrasp_model.kernels import Bools, Float32, Float64, Int64, columns_of, compiled
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_model.kernels import columns_of, compiled
 
 BLOCK = 64  # points at a time that are passed over where none can be near
 SLACK = 1e-5  # metres that float32 may be off, many times over
@@ -93,8 +93,8 @@ def extents_between(
 
 def distance_behind(
     surface: Float32,
-    turn: NDArray[np.floating],
-    shift: NDArray[np.floating],
+    turn: Floats,
+    shift: Floats,
     places: Float32,
     cell: float,
 ) -> Float32:

@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import points_in_hand_boxes
 from edgegrasp_model.scene.cloud import Cloud
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 NEAR = 0.006  # metres around a finger that count as near it
 APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description looks at
@@ -43,8 +40,8 @@ def reach_of(
 class HandView:
     """Cloud points in the hand frames of some hands, those out of reach left out."""
 
-    candidate: NDArray[np.int64]  # (P,) ascending
-    row: NDArray[np.int64]  # (P,) row of the cloud
+    candidate: Int64  # (P,) ascending
+    row: Int64  # (P,) row of the cloud
     position: Float32  # (P, 3) in the hand frame
     num_candidates: int
 

@@ -11,10 +11,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 
 ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it

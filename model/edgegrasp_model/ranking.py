@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.candidates.collision import clearances, met_first, required_openings
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import CODE, Sample
@@ -30,9 +31,6 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
 from edgegrasp_model.unseen import DepthMap, unseen_space
 
-Int64 = NDArray[np.int64]
-Float32 = NDArray[np.float32]
-
 COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
 GOOD_SCORE = 0.5  # from which an object has a grasp to offer
 SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
@@ -44,8 +42,8 @@ OUTCOMES = list(Outcome)
 def select(
     scene: Scene,
     sample: Sample,
-    score: NDArray[np.floating],
-    rating: NDArray[np.floating],
+    score: Floats,
+    rating: Floats,
     gripper: Gripper,
     options: DetectOptions,
     counts: dict[str, int],
@@ -89,7 +87,7 @@ def select(
     return order, outcome
 
 
-def objects_first(order: Int64, score: NDArray[np.floating], number: Int64) -> Int64:
+def objects_first(order: Int64, score: Floats, number: Int64) -> Int64:
     """The rows `order`, the first good one of each object brought to the front.
 
     Args:
@@ -103,12 +101,12 @@ def objects_first(order: Int64, score: NDArray[np.floating], number: Int64) -> I
 
 
 def ranked(
-    score: NDArray[np.floating],
-    collision_free: NDArray[np.bool_],
+    score: Floats,
+    collision_free: Bools,
     order: Literal["score", "highest", "clearance"] = "score",
-    height: NDArray[np.floating] | None = None,
-    clearance: NDArray[np.floating] | None = None,
-) -> NDArray[np.int64]:
+    height: Floats | None = None,
+    clearance: Floats | None = None,
+) -> Int64:
     """Rows best first.
 
     Args:
@@ -120,7 +118,7 @@ def ranked(
         clearance: (E,) for `clearance`.
     """
     worth = np.where(collision_free, score, COLLIDING * score)
-    keys: tuple[NDArray[Any], ...] = (-worth,)
+    keys: tuple[Array, ...] = (-worth,)
     if order == "highest" and height is not None:
         sure = worth >= SURE_SCORE
         keys = (-worth, np.where(sure, -height, -worth), ~sure)
@@ -133,8 +131,8 @@ def grasps_in_cloud(
     scene: Scene,
     candidates: Candidates,
     gripper: Gripper,
-    score: NDArray[np.floating],
-    collision_free: NDArray[np.bool_],
+    score: Floats,
+    collision_free: Bools,
     clearance: Float32,
 ) -> list[Grasp]:
     """Candidates E, all arrays (E,), as grasps in the frame of the cloud."""
@@ -170,9 +168,7 @@ def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
     return np.where(hidden, np.float32(gripper.max_opening), width)
 
 
-def _far_side_hidden(
-    scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper
-) -> NDArray[np.bool_]:
+def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
     """Between which hands (E,) the object may go on unseen; `met` is what they meet first."""
     depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
     beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
@@ -192,7 +188,7 @@ def detected_objects(
     scene: Scene,
     grasps: Sequence[Grasp],
     sample: Sample | None,
-    score: NDArray[np.floating],
+    score: Floats,
     gripper: Gripper,
 ) -> list[DetectedObject]:
     """The scene's objects, the largest first: the best grasp on each, or why there is no good one.
@@ -230,7 +226,7 @@ def _why_ungraspable(
     number: int,
     size: Float32,
     sample: Sample | None,
-    score: NDArray[np.floating],
+    score: Floats,
     gripper: Gripper,
 ) -> Ungraspable | None:
     """Why an object with a box of this size (3,), the last upward, has no good grasp."""
@@ -255,7 +251,7 @@ def _why_ungraspable(
     return Ungraspable.HIDDEN if hidden.mean() > 0.5 else None
 
 
-def _upright_box(scene: Scene, held: NDArray[np.bool_]) -> tuple[Float32, Float32]:
+def _upright_box(scene: Scene, held: Bools) -> tuple[Float32, Float32]:
     """Pose T_cloud_box (4, 4) and half extents (3,) of the smallest upright box around points."""
     points = scene.cloud.points[held].astype(np.float64)
     axes, low, size = _smallest_rectangle(points[:, :2])
@@ -267,7 +263,7 @@ def _upright_box(scene: Scene, held: NDArray[np.bool_]) -> tuple[Float32, Float3
     return scene.frame.poses_in_cloud(T_canonical_box), half
 
 
-def _smallest_rectangle(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def _smallest_rectangle(plan: Float64) -> tuple[Float64, ...]:
     """The smallest rectangle around points (M, 2): unit axes (2, 2), lowest corner, size (2,)."""
     try:
         corners = plan[ConvexHull(plan).vertices]
@@ -287,7 +283,7 @@ def _smallest_rectangle(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64],
 def debug_info(
     scene: Scene,
     sample: Sample | None,
-    score: NDArray[np.floating],
+    score: Floats,
     outcome: NDArray[np.int8],
     labels: Int64,
 ) -> DebugInfo:

@@ -6,16 +6,13 @@ from functools import lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import distance_behind
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import Corner
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers: as far as the next point of the cloud
@@ -81,9 +78,7 @@ def unseen_space(
     )
 
 
-def enters_unseen(
-    depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper
-) -> NDArray[np.bool_]:
+def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper) -> Bools:
     """Which hands (E,) would have their palm, or a finger on its way in, in unseen space.
 
     Behind a surface, only the ends of the fingers may reach where nobody looked.

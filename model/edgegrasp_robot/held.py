@@ -1,9 +1,9 @@
 """What a closed hand holds, and whether it can be taken away."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Bools, Float64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision
 from edgegrasp_model.results import Grasp
@@ -21,7 +21,7 @@ def can_leave(
     grasp: Grasp,
     scene: Scene,
     gripper: Gripper,
-    way: NDArray[np.float64],
+    way: Float64,
     collision: Collision,
 ) -> bool:
     """Whether what a grasp holds can go along a straight way without meeting anything seen.
@@ -56,7 +56,7 @@ def can_leave(
     return True
 
 
-def _held(grasp: Grasp, scene: Scene, gripper: Gripper) -> NDArray[np.bool_]:
+def _held(grasp: Grasp, scene: Scene, gripper: Gripper) -> Bools:
     """The points (V,) of the object that a grasp is on, and those between the fingers."""
     T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
     x, y, z = np.abs(moved(T_hand_cloud, scene.points_in_cloud)).T
@@ -64,11 +64,11 @@ def _held(grasp: Grasp, scene: Scene, gripper: Gripper) -> NDArray[np.bool_]:
     between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
     if grasp.object is None:
         return np.asarray(between)
-    held: NDArray[np.bool_] = between | (scene.object_of_point == grasp.object)
+    held: Bools = between | (scene.object_of_point == grasp.object)
     return held
 
 
-def _lowest(scene: Scene, points: NDArray[np.float64]) -> float:
+def _lowest(scene: Scene, points: Float64) -> float:
     """How high the lowest of points (N, 3), cloud frame, is over the support; 0 without one."""
     if scene.support is None:
         return 0.0

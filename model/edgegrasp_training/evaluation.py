@@ -19,6 +19,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 from scipy.stats import rankdata
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.hand_description import BEYOND
 from edgegrasp_model.networks.checkpoint import load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -27,7 +28,6 @@ from edgegrasp_model.ranking import HIDDEN
 from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene, table
 
-FloatArray = NDArray[np.floating]
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
 EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # of the ranges of scores in a comparison
 CURVE_ROWS = 20  # of the learning curve in the card, about
@@ -41,23 +41,23 @@ class Evaluation:
     accuracy: float
     auroc: float
     temperature: float  # that calibrates the logits
-    logit: NDArray[np.float32]  # (E,)
-    label: NDArray[np.float32]  # (E,)
+    logit: Float32  # (E,)
+    label: Float32  # (E,)
 
 
-def evaluate_scores(logit: NDArray[np.float32], label: NDArray[np.float32]) -> Evaluation:
+def evaluate_scores(logit: Float32, label: Float32) -> Evaluation:
     """All figures of some scores.  # (E,), (E,)."""
     accuracy = float(np.mean((logit > 0) == (label > 0.5)))
     loss, rank = cross_entropy(logit, label), auroc(logit, label)
     return Evaluation(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
 
 
-def cross_entropy(logit: FloatArray, label: FloatArray) -> float:
+def cross_entropy(logit: Floats, label: Floats) -> float:
     """Mean binary cross entropy, nats.  # (E,), (E,)."""
     return float(np.mean(np.logaddexp(0.0, logit) - label * logit))
 
 
-def auroc(logit: FloatArray, label: FloatArray) -> float:
+def auroc(logit: Floats, label: Floats) -> float:
     """Chance that a success outscores a failure, ties counting half; nan with one class."""
     positive = label > 0.5
     successes, failures = int(positive.sum()), int((~positive).sum())
@@ -68,7 +68,7 @@ def auroc(logit: FloatArray, label: FloatArray) -> float:
     return float(excess / (successes * failures))
 
 
-def fit_temperature(logit: FloatArray, label: FloatArray) -> float:
+def fit_temperature(logit: Floats, label: Floats) -> float:
     """The t for which sigmoid(logit / t) has the least cross entropy."""
     logit, label = logit.astype(np.float64), label.astype(np.float64)
     best = minimize_scalar(
@@ -88,7 +88,7 @@ class Range(NamedTuple):
 
 
 def reliability(
-    score: FloatArray, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
+    score: Floats, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
 ) -> dict[float, Range]:
     """What held in each range of scores that has any, by its lower edge.  # (E,), (E,)."""
     place = np.digitize(score, edges[1:-1])
@@ -100,7 +100,7 @@ def reliability(
     }
 
 
-def calibration_error(score: FloatArray, held: NDArray[np.generic]) -> float:
+def calibration_error(score: Floats, held: NDArray[np.generic]) -> float:
     """Mean distance of score and share that held, over ten ranges of equal width."""
     ranges = reliability(score, held).values()
     return sum(each.number * abs(each.score - each.held) for each in ranges) / len(score)
@@ -146,9 +146,9 @@ class Scored(NamedTuple):
     """Labelled grasps of some views, and the scores of several networks."""
 
     kind: NDArray[np.str_]  # (E,) of scene
-    far_side_hidden: NDArray[np.bool_]  # (E,)
-    held: NDArray[np.bool_]  # (E,)
-    logit: NDArray[np.float64]  # (W, E) calibrated, of each network
+    far_side_hidden: Bools  # (E,)
+    held: Bools  # (E,)
+    logit: Float64  # (W, E) calibrated, of each network
 
 
 def score_views(paths: list[Path], weights: list[Path]) -> Scored:

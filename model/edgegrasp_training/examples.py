@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates, crop_balls, edge_grasps
 from edgegrasp_model.hand_description import Surroundings, without_support
 from edgegrasp_model.networks.balls import BallBatch
@@ -33,7 +34,7 @@ class HandInputs:
 
     description: NDArray[np.float16]  # (E, F)
     points: NDArray[np.float16]  # (E, P, 6)
-    point_count: NDArray[np.int64]  # (E,)
+    point_count: Int64  # (E,)
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,8 @@ class TriedGrasps:
     cloud: Cloud
     candidates: Candidates  # E of them
     seen: HandInputs | None  # of the hand network; None for networks of balls
-    label: NDArray[np.float32]  # (E,) 0: not held; 1: held, less if it did not survive shaking
-    turn: NDArray[np.float32]  # (3, 3) rotation of the cloud's axes to the detector's frame
+    label: Float32  # (E,) 0: not held; 1: held, less if it did not survive shaking
+    turn: Float32  # (3, 3) rotation of the cloud's axes to the detector's frame
 
     def without_support(self) -> "TriedGrasps":
         """The same grasps, described as for a request without a support plane."""
@@ -53,7 +54,7 @@ class TriedGrasps:
         unknown = without_support(self.seen.description).astype(np.float16)
         return replace(self, seen=replace(self.seen, description=unknown))
 
-    def balls(self) -> NDArray[np.int64]:
+    def balls(self) -> Int64:
         """Approach points of the labelled candidates: ascending rows of the cloud."""
         return np.unique(self.candidates.approach_index)
 
@@ -112,7 +113,7 @@ def tried_grasps(
 def hand_batch(
     view: LabelledView,
     candidates: Candidates,
-    viewpoints: NDArray[np.float32] | None,
+    viewpoints: Float32 | None,
     max_points: int,
 ) -> HandBatch:
     """The hand network's inputs for candidates in a simulated scene.
@@ -132,7 +133,7 @@ def hand_batch(
 
 def pack_balls(
     grasps: TriedGrasps,
-    balls: NDArray[np.int64],
+    balls: Int64,
     config: NetworkConfig,
     soft_labels: SoftLabels | None = None,
 ) -> Packed:
@@ -178,7 +179,7 @@ def pack_balls(
 
 def pack_hands(
     grasps: TriedGrasps,
-    balls: NDArray[np.int64],
+    balls: Int64,
     config: NetworkConfig,
     rng: np.random.Generator | None = None,
 ) -> Packed:
@@ -205,7 +206,7 @@ def pack_hands(
     return Packed(batch, torch.from_numpy(grasps.label[rows]), torch.ones(len(rows)))
 
 
-def turned(batch: BallBatch, turn: NDArray[np.float32]) -> BallBatch:
+def turned(batch: BallBatch, turn: Float32) -> BallBatch:
     """Rotate all balls of a batch by one rotation (3, 3)."""
     transposed = torch.from_numpy(turn.T.copy())
     return replace(
@@ -216,7 +217,7 @@ def turned(batch: BallBatch, turn: NDArray[np.float32]) -> BallBatch:
     )
 
 
-def random_turn(rotations: Rotations, rng: np.random.Generator) -> NDArray[np.float32]:
+def random_turn(rotations: Rotations, rng: np.random.Generator) -> Float32:
     """A random rotation (3, 3) of balls: any (paper, section IV-D), about up, or none."""
     match rotations:
         case "any":
@@ -228,7 +229,7 @@ def random_turn(rotations: Rotations, rng: np.random.Generator) -> NDArray[np.fl
     return turn.as_matrix().astype(np.float32)
 
 
-def _labels(view: LabelledView) -> NDArray[np.float32]:
+def _labels(view: LabelledView) -> Float32:
     """Targets (E,): whether each grasp holds, and a little more where it survives shaking.
 
     Most of the best candidates hold; the one to execute is one that also survives shaking.
@@ -237,11 +238,11 @@ def _labels(view: LabelledView) -> NDArray[np.float32]:
     firm = np.full(len(held), FIRM_SHARE)
     if view.firm is not None:
         firm = np.where(view.firm == UNTRIED, FIRM_SHARE, view.firm == 1)
-    label: NDArray[np.float32] = (held * (1.0 - SHAKEN_SHARE * (1.0 - firm))).astype(np.float32)
+    label: Float32 = (held * (1.0 - SHAKEN_SHARE * (1.0 - firm))).astype(np.float32)
     return label
 
 
-def _turn_of(view: LabelledView) -> NDArray[np.float32]:
+def _turn_of(view: LabelledView) -> Float32:
     """The rotation (3, 3) of a view's axes to those of the detector's frame."""
     if len(view.points) == 0:
         return np.eye(3, dtype=np.float32)
@@ -249,7 +250,7 @@ def _turn_of(view: LabelledView) -> NDArray[np.float32]:
     return frame.directions(np.eye(3)).T.astype(np.float32)
 
 
-def _candidates(view: LabelledView, cloud: Cloud, rows: NDArray[np.int64]) -> Candidates:
+def _candidates(view: LabelledView, cloud: Cloud, rows: Int64) -> Candidates:
     """The tried candidates; `pair` counts in `rows`."""
     approach_index, contact_index = view.approach_index[rows], view.contact_index[rows]
     if view.T_world_hand is None:

@@ -9,9 +9,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector
@@ -117,7 +117,7 @@ class Chosen(NamedTuple):
     selected: SelectedPoints
     scene: Scene
     candidates: Candidates
-    T_world_hand: NDArray[np.float32]  # (E, 4, 4)
+    T_world_hand: Float32  # (E, 4, 4)
 
 
 def generate(
@@ -454,11 +454,11 @@ def detector(weights: Path) -> GraspDetector:
 
 def _chosen(
     sample: Sample,
-    logit: NDArray[np.floating] | None,
+    logit: Floats | None,
     total: int,
     rng: np.random.Generator,
     hard: bool,
-) -> NDArray[np.int64]:
+) -> Int64:
     """Ascending rows of the candidates to try, `total` at most.
 
     Some that a network would execute, as many whose outcome it leaves open, and the rest at

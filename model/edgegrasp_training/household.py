@@ -9,11 +9,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Numbers = Array | list[float]
-Part = tuple[Array, NDArray[np.int64]]  # vertices (V, 3) metres, triangles (F, 3) facing outwards
+from edgegrasp_camera.arrays import Float64, Int64
+
+Numbers = Float64 | list[float]
+Part = tuple[Float64, Int64]  # vertices (V, 3) metres, triangles (F, 3) facing outwards
 Random = np.random.Generator
 
 FINE, COARSE = 28, 16  # corners of a circle: of a solid part, and of a wall of as many parts
@@ -299,19 +299,19 @@ FAMILIES: dict[str, Callable[[Random], list[Part]]] = {
 NAMES = tuple(FAMILIES)
 
 
-def _oval(sharp: float = 1.0, corners: int = FINE) -> Array:
+def _oval(sharp: float = 1.0, corners: int = FINE) -> Float64:
     """(corners, 2) a circle of radius one; below one, `sharp` squares it off."""
     angle = 2 * np.pi * (np.arange(corners) + 0.5) / corners
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    squared: Array = np.sign(ring) * np.abs(ring) ** sharp
+    squared: Float64 = np.sign(ring) * np.abs(ring) ** sharp
     return squared
 
 
-def _rectangle(x: float, y: float) -> Array:
+def _rectangle(x: float, y: float) -> Float64:
     return np.array([[-x, -y], [x, -y], [x, y], [-x, y]]) / 2
 
 
-def _loft(outline: Array, widths: Numbers, heights: Numbers) -> Part:
+def _loft(outline: Float64, widths: Numbers, heights: Numbers) -> Part:
     """A convex outline (S, 2), counter-clockwise, scaled by a width at each ascending height."""
     rings = np.empty((len(widths), len(outline), 3))
     rings[..., :2] = outline * np.asarray(widths)[:, None, None]
@@ -324,7 +324,7 @@ def _solid(radii: Numbers, heights: Numbers) -> Part:
     return _loft(_oval(), radii, heights)
 
 
-def _box(size: Array | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Part:
+def _box(size: Float64 | tuple[float, ...], centre: tuple[float, ...], cut: float = 0.0) -> Part:
     """A box; `cut` of its size is taken off its upright edges."""
     x, y, z = np.asarray(size) / 2
     outline = _rectangle(2 * x, 2 * y)
@@ -342,7 +342,7 @@ def _walls(x: float, y: float, z: float, thick: float) -> list[Part]:
     return parts + [_box((thick, y, z), (side * (x - thick) / 2, 0.0, z / 2)) for side in sides]
 
 
-def _rod(start: Array, end: Array, first: float, last: float) -> Part:
+def _rod(start: Float64, end: Float64, first: float, last: float) -> Part:
     """A round rod from one point to another, with the radius at each."""
     along = end - start
     length = float(np.linalg.norm(along))
@@ -354,7 +354,7 @@ def _rod(start: Array, end: Array, first: float, last: float) -> Part:
     return vertices @ frame.T + start, faces
 
 
-def _wedges(section: Array, angles: Array) -> list[Part]:
+def _wedges(section: Float64, angles: Float64) -> list[Part]:
     """A convex section (P, 2) of radius and height, swept about z: a part between two angles."""
     rings = np.empty((len(angles), len(section), 3))
     rings[..., 0] = np.cos(angles)[:, None] * section[:, 0]
@@ -380,7 +380,7 @@ def _shell(radii: Numbers, heights: Numbers, wall: float, floor: float) -> list[
     return parts
 
 
-def _placed(parts: list[Part], *moves: Array | tuple[float, ...]) -> list[Part]:
+def _placed(parts: list[Part], *moves: Float64 | tuple[float, ...]) -> list[Part]:
     """Parts after linear maps (3, 3) and shifts (3,), one after the other."""
     for move in map(np.asarray, moves):
         if move.ndim == 2:
@@ -390,14 +390,14 @@ def _placed(parts: list[Part], *moves: Array | tuple[float, ...]) -> list[Part]:
     return parts
 
 
-def _turn(angle: float) -> Array:
+def _turn(angle: float) -> Float64:
     """A rotation about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @lru_cache(maxsize=64)
-def _faces(rings: int, corners: int) -> NDArray[np.int64]:
+def _faces(rings: int, corners: int) -> Int64:
     """Triangles that join neighbouring rings of corners and close both ends."""
     low = (np.arange(rings - 1)[:, None] * corners + np.arange(corners)).ravel()
     beside = (np.arange(rings - 1)[:, None] * corners + np.roll(np.arange(corners), -1)).ravel()

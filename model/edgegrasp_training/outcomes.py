@@ -11,10 +11,10 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logit as logit_of
 
+from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_model.networks.checkpoint import load_checkpoint, save_checkpoint
 from edgegrasp_training.evaluation import cross_entropy
 
@@ -28,10 +28,10 @@ FEW = 25
 class Outcomes:
     """Grasps that were tried."""
 
-    logit: NDArray[np.float64]  # (N,) of the score
-    held: NDArray[np.float64]  # (N,) 1 or 0
+    logit: Float64  # (N,) of the score
+    held: Float64  # (N,) 1 or 0
 
-    def of(self, rows: NDArray[np.int64]) -> Self:
+    def of(self, rows: Int64) -> Self:
         """Some of them."""
         return replace(self, logit=self.logit[rows], held=self.held[rows])
 
@@ -64,7 +64,7 @@ def read_outcomes(path: Path, digest: str = "") -> Outcomes:
 def fit(outcomes: Outcomes) -> tuple[float, float]:
     """Scale and shift of the logits that are most probable after the outcomes."""
 
-    def cost(parameters: NDArray[np.float64]) -> float:
+    def cost(parameters: Float64) -> float:
         log_scale, shift = parameters
         prior = (log_scale / PRIOR_SCALE) ** 2 / 2 + (shift / PRIOR_SHIFT) ** 2 / 2
         logit = np.exp(log_scale) * outcomes.logit + shift

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim import swa_utils
 
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.scene.grouping import group, instance_traits
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
 from edgegrasp_model.scene.segment import look
@@ -74,7 +75,7 @@ class SceneImages:
         return SceneImage(*(self.arrays[file][name][row] for name in SceneImage._fields))
 
 
-def image_points(image: SceneImage) -> NDArray[np.float32]:
+def image_points(image: SceneImage) -> Float32:
     """(H, W, 3) camera frame, metres; NaN without a reading."""
     fx, fy, cx, cy = image.camera
     z = np.where(image.depth > 0, image.depth * np.float32(DEPTH_UNIT), np.float32(np.nan))
@@ -143,11 +144,11 @@ _MIRROR, _HALF_TURN = np.array([[-1, 1, 1], [-1, -1, 1]], dtype=np.float32)
 
 
 def _cropped(
-    points: NDArray[np.float32],
-    label: NDArray[np.int64],
-    plane: NDArray[np.float32],
+    points: Float32,
+    label: Int64,
+    plane: Float32,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> Float32:
     """The points above the support and near the objects alone, as callers cut clouds off."""
     objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
     if len(objects) < 50:
@@ -224,7 +225,7 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
         right.append(held >= 0.5 * np.maximum(size, 1))
     sign, values = np.where(np.concatenate(right), 1.0, -1.0), np.concatenate(traits)
 
-    def loss(weights: NDArray[np.float64]) -> float:
+    def loss(weights: Float64) -> float:
         return float(np.logaddexp(0.0, -sign * (values @ weights)).mean())
 
     fitted: list[float] = minimize(loss, np.zeros(values.shape[1])).x.round(3).tolist()
@@ -237,7 +238,7 @@ def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterat
     Files that come into the folder meanwhile are read too.
     """
 
-    def one(rows: NDArray[np.int64]) -> SceneBatch:
+    def one(rows: Int64) -> SceneBatch:
         return make_batch([images[int(k)] for k in rows], rng)
 
     with ThreadPoolExecutor(1) as pool:

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float64, Int64
 from edgegrasp_sim.objects import (
     OBJECT_MASS,
     ObjectModel,
@@ -38,7 +38,7 @@ LONGEST = 0.045, 0.12  # metres, range of the greatest extent
 THINNEST = 0.009  # metres, least extent
 PLAIN_WIDTH, PLAIN_HEIGHT = (0.03, 0.115), (0.03, 0.17)  # metres: some wider than a hand opens
 
-Rings = NDArray[np.float64]  # (R, S, 3) corners of each ring along a part, any unit
+Rings = Float64  # (R, S, 3) corners of each ring along a part, any unit
 
 
 def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -> ObjectSet:
@@ -155,7 +155,7 @@ def drawn_shape(index: int) -> str:
     return as_obj(_surface(part * np.maximum(scale, THINNEST / extents)) for part in parts)
 
 
-def _surface(rings: Rings) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _surface(rings: Rings) -> tuple[Float64, Int64]:
     """Join neighbouring rings and close the ends by fans: points (P, 3), triangles (F, 3)."""
     count, corners, _ = rings.shape
     ends = np.array([rings[0].mean(axis=0), rings[-1].mean(axis=0)])
@@ -269,13 +269,13 @@ def _pot(rng: np.random.Generator) -> list[Rings]:
 _KINDS = (_bodies, _hoop, _bottle, _plate, _bodies, _pot, _bow, _hoop)
 
 
-def _ring(corners: int, radii: NDArray[np.float64] | float = 1.0) -> NDArray[np.float64]:
+def _ring(corners: int, radii: Float64 | float = 1.0) -> Float64:
     """(S, 3) a polygon about the z axis."""
     angle = 2.0 * np.pi * (np.arange(corners) + 0.5) / corners
     return np.stack([radii * np.cos(angle), radii * np.sin(angle), np.zeros(corners)], axis=1)
 
 
-def _straight(ring: NDArray[np.float64], widths: list[float], heights: list[float]) -> Rings:
+def _straight(ring: Float64, widths: list[float], heights: list[float]) -> Rings:
     """A ring moved along z to each height and scaled to the width there."""
     return np.stack(
         [
@@ -285,9 +285,7 @@ def _straight(ring: NDArray[np.float64], widths: list[float], heights: list[floa
     )
 
 
-def _bent(
-    ring: NDArray[np.float64], turn: NDArray[np.float64], thick: NDArray[np.float64]
-) -> Rings:
+def _bent(ring: Float64, turn: Float64, thick: Float64) -> Rings:
     """A ring swept about the z axis at a distance of one unit, scaled by `thick` along the way."""
     radius = 1.0 + thick[:, None] * ring[:, 0]
     across = np.cos(turn)[:, None] * radius, np.sin(turn)[:, None] * radius

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Int64
 from edgegrasp_model.candidates.edge_grasps import (
     Candidates,
     crop_balls,
@@ -77,9 +77,7 @@ class Teacher:
             chance.astype(np.float16),
         )
 
-    def _candidates(
-        self, view: LabelledView, balls: NDArray[np.int64], rng: np.random.Generator
-    ) -> Candidates:
+    def _candidates(self, view: LabelledView, balls: Int64, rng: np.random.Generator) -> Candidates:
         """At most GRASPS_PER_BALL candidates in each ball (A,), made as the detector makes them."""
         cloud, support = Cloud(view.points, view.normals), view.support_plane
         crop = crop_balls(cloud.points, balls, self.crop_radius)

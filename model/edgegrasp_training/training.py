@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from numpy.typing import NDArray
 from torch import nn
 
+from edgegrasp_camera.arrays import Int64
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
@@ -251,7 +251,7 @@ class Trainer:
     def _pack(
         self,
         grasps: TriedGrasps,
-        balls: NDArray[np.int64],
+        balls: Int64,
         rng: np.random.Generator | None = None,
         soft_labels: SoftLabels | None = None,
     ) -> Packed:

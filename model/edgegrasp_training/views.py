@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Array, Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper, gripper_from_fields, load_gripper
 from edgegrasp_model.options import SupportPlane, Workspace
 from edgegrasp_model.scene.scene import near_workspace_side
 from edgegrasp_model.scene.support import Support
 
-Float32 = NDArray[np.float32]
 UNTRIED = -1  # label of a candidate that was not tried
 TOGETHER = 0.009  # metres between points of one object: twice the edge of a voxel
 CARD_FILE = "card.md"
@@ -38,13 +37,13 @@ class LabelledView:
     points: Float32  # (N, 3) voxelised
     normals: Float32  # (N, 3) unit, turned to the camera
     camera_position: Float32  # (3,)
-    approach_index: NDArray[np.int64]  # (E,) rows of `points`
-    contact_index: NDArray[np.int64]  # (E,) rows of `points`
+    approach_index: Int64  # (E,) rows of `points`
+    contact_index: Int64  # (E,) rows of `points`
     T_world_hand: Float32 | None  # (E, 4, 4) hands tried; None: edge grasps as in the paper
     success: NDArray[np.int8]  # (E,) 1 held after the lift, 0 not, UNTRIED
     firm: NDArray[np.int8] | None = None  # (E,) 1 held after shaking too, 0 not, UNTRIED
     support: Float32 | None = None  # (4,) unit normal and offset; zeros: unknown; None: TABLE
-    at_side: NDArray[np.bool_] | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
+    at_side: Bools | None = None  # (N,) cut off there; None: as WORKSPACE cuts it
     object_of_point: NDArray[np.int16] | None = None  # (N,) -1: of none; None: not known
     engine: str = "pybullet"  # that simulated the labels
     gripper: str = ""  # fields of the hand that tried them, JSON; empty: the Panda's own hand
@@ -53,7 +52,7 @@ class LabelledView:
 
     def save(self, path: Path) -> None:
         """Write the view; a reader sees the whole file or none."""
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, Array] = {
             "points": self.points,
             "normals": self.normals.astype(np.float16),
             "camera_position": self.camera_position,
@@ -93,7 +92,7 @@ class LabelledView:
         plane = self.support_plane
         return UP if plane is None else np.asarray(plane.normal, dtype=np.float32)
 
-    def cut_off(self) -> NDArray[np.bool_]:
+    def cut_off(self) -> Bools:
         """Which points (N,) lie where a side of the workspace cuts things off."""
         if self.at_side is not None:
             return self.at_side
@@ -101,7 +100,7 @@ class LabelledView:
             return np.zeros(0, dtype=bool)
         return near_workspace_side(self.points, WORKSPACE, UP, self.points)
 
-    def numbered_objects(self) -> NDArray[np.int64]:
+    def numbered_objects(self) -> Int64:
         """The object (N,) that each point belongs to; where unknown, what hangs together."""
         if self.object_of_point is not None:
             return self.object_of_point.astype(np.int64)
@@ -110,7 +109,7 @@ class LabelledView:
         graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
         return connected_components(graph, directed=False)[1].astype(np.int64)
 
-    def tried(self) -> NDArray[np.int64]:
+    def tried(self) -> Int64:
         """Rows of the candidates that have a label."""
         return np.flatnonzero(self.success != UNTRIED)
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_camera.clouds import read_point_cloud2
 from edgegrasp_camera.depth import intrinsics_of, metres, unproject
 from edgegrasp_camera.picture import fork
@@ -21,7 +21,6 @@ from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_i
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
-    Float64,
     matrix_from_quaternion,
     moveit_grasp,
     quaternion_from_matrix,
@@ -331,7 +330,7 @@ def _object_result(
     }
 
 
-def depth_array(image: Any) -> NDArray[Any]:
+def depth_array(image: Any) -> Array:
     """The depths (H, W) of a sensor_msgs/Image: uint16 millimetres, or float32 metres.
 
     Raises:
@@ -342,7 +341,7 @@ def depth_array(image: Any) -> NDArray[Any]:
     return image_array(image)
 
 
-def image_array(image: Any) -> NDArray[Any]:
+def image_array(image: Any) -> Array:
     """The values of a sensor_msgs/Image: (H, W), or (H, W, C) of several channels.
 
     Raises:
@@ -421,7 +420,7 @@ def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
     )
 
 
-def _pose(T: NDArray[Any]) -> Message:
+def _pose(T: Array) -> Message:
     """geometry_msgs/Pose; the orientation's fields are x, y, z, w."""
     orientation = quaternion_from_matrix(T[:3, :3]).tolist()
     return {
@@ -434,7 +433,7 @@ def _seconds(stamp: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def _xyz(vector: NDArray[Any]) -> Message:
+def _xyz(vector: Array) -> Message:
     return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
 
 

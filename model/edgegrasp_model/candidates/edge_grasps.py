@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import extents_between
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 MIN_EDGE = 0.003  # metres between approach and contact point
 EDGE_MARGIN = 0.002  # metres an edge stays below half the opening
@@ -30,7 +28,7 @@ def sample_approach_points(
     method: Literal["farthest", "uniform"],
     rng: np.random.Generator,
     before: Sequence[int] | Int64 = (),
-) -> NDArray[np.int64]:
+) -> Int64:
     """Rows of `count` different points, or of all where there are fewer.
 
     Args:
@@ -63,8 +61,8 @@ def sample_approach_points(
 class BallCrop(NamedTuple):
     """Balls as rows of their cloud. P ball points in all, ball after ball."""
 
-    ball_rows: NDArray[np.int64]  # (P,) rows of the cloud, ascending within each ball
-    ball_of_point: NDArray[np.int64]  # (P,) ascending, 0..A-1
+    ball_rows: Int64  # (P,) rows of the cloud, ascending within each ball
+    ball_of_point: Int64  # (P,) ascending, 0..A-1
     radius: float  # metres
 
     def bounds(self, ball: Int64) -> tuple[Int64, Int64]:
@@ -74,7 +72,7 @@ class BallCrop(NamedTuple):
 
 
 def crop_balls(
-    points: NDArray[np.float32],  # (N, 3)
+    points: Float32,  # (N, 3)
     approach_index: NDArray[np.integer],  # (A,)
     radius: float,
 ) -> BallCrop:
@@ -125,7 +123,7 @@ class Candidates:
         ]
         return Candidates(*arrays)
 
-    def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Candidates":
+    def take(self, rows: NDArray[np.integer] | Bools) -> "Candidates":
         """The candidates of the given rows, in their order."""
         return Candidates(
             self.pair[rows],
@@ -218,7 +216,7 @@ def edge_grasp_poses(
 
 def retract(
     candidates: Candidates, support: SupportPlane, gripper: Gripper, margin: float = 0.0
-) -> tuple[Candidates, NDArray[np.bool_]]:
+) -> tuple[Candidates, Bools]:
     """Retract hands that would cut into the support plane along their approach, where that helps.
 
     The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: flat

@@ -7,8 +7,8 @@ there. Here only the run of the outline counts, and what lies between, beside an
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Bools, Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_EDGE,
@@ -23,10 +23,6 @@ from edgegrasp_model.hand_view import APPROACH_LENGTH
 from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 OUTLINE_RADIUS = 0.016  # metres of surface that say where an outline runs
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline

@@ -8,6 +8,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import (
     BallCrop,
@@ -25,10 +26,6 @@ from edgegrasp_model.options import ApproachDirection, DetectOptions
 from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 FURTHER_ATTEMPTS = 3  # with other approach points, where few hands are free
 FEW = 16  # hands free of collision, of a scene
@@ -310,11 +307,11 @@ def add_count(counts: dict[str, int], name: str, number: int) -> None:
 
 
 def allowed_directions(
-    direction: NDArray[np.floating],
+    direction: Floats,
     constraint: ApproachDirection | None,
     up: ArrayLike,
-    in_frame: Callable[[ArrayLike], NDArray[np.floating]] = np.asarray,
-) -> NDArray[np.bool_]:
+    in_frame: Callable[[ArrayLike], Floats] = np.asarray,
+) -> Bools:
     """Which directions the hand may move in.
 
     Args:

@@ -9,17 +9,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from edgegrasp_camera.arrays import Float32, Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import BallCrop, crop_balls
 from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.config import NetworkConfig
 
 
 def nearest_in_ball(
-    points: NDArray[np.float32],  # (N, 3)
+    points: Float32,  # (N, 3)
     approach_index: NDArray[np.integer],  # (A,)
     crop: BallCrop,
     k: int = 16,
-) -> NDArray[np.int64]:
+) -> Int64:
     """Joins the points of balls to their k nearest in the same ball.
 
     The point itself is one of its k neighbours; where a ball holds fewer than k points, the own
@@ -55,13 +56,13 @@ class BallBatch:
     @classmethod
     def from_cloud(
         cls,
-        points: NDArray[np.float32],  # (N, 3)
-        normals: NDArray[np.float32],  # (N, 3)
+        points: Float32,  # (N, 3)
+        normals: Float32,  # (N, 3)
         approach_index: NDArray[np.integer],  # (A,)
         crop: BallCrop,
         contact: NDArray[np.integer],  # (E,)
-        approach: NDArray[np.float32],  # (E, 3)
-        depth: NDArray[np.float32],  # (E,)
+        approach: Float32,  # (E, 3)
+        depth: Float32,  # (E,)
         k: int = 16,
     ) -> Self:
         """Packs a cloud and its balls.
@@ -137,5 +138,5 @@ class BallBatch:
         return replace(self, **{name: part.to(device) for name, part in tensors.items()})
 
 
-def _float_tensor(array: NDArray[np.floating]) -> Tensor:
+def _float_tensor(array: Floats) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

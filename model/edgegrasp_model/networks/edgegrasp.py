@@ -7,9 +7,9 @@ Grasp Detection", ICRA 2023, section IV. Widths below are the paper's; P points,
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
@@ -28,8 +28,6 @@ from edgegrasp_model.networks.layers import (
     maximum,
     mlp,
 )
-
-Float32 = NDArray[np.float32]
 
 GRASP_WIDTH = 3 + 3 + 1 + 3  # contact point, its normal, depth, approach direction
 
@@ -93,7 +91,7 @@ class PointNetConv(nn.Module):
         pooled = []
         for points, neighbors in in_chunks(CONVOLVED, batch.points, batch.neighbors):
             hidden = gathered_relu(u, points, weight[:, -3:].t(), neighbors)  # (p k, width)
-            messages = output(hidden).unflatten(0, neighbors.shape)  # (p, k, width)
+            messages = output(hidden).view(*neighbors.shape, -1)  # (p, k, width)
             pooled.append(maximum(messages, dim=1))
         # The bias is the same for all neighbours: added once, after the maximum.
         return torch.cat(pooled)[: len(features)] + self.output.bias
@@ -136,7 +134,7 @@ def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) 
 
 @compiled("contract", "nsz")
 def _gathered_relu(
-    u: Float32, points: Float32, offset: Float32, neighbors: NDArray[np.int64], result: Float32
+    u: Float32, points: Float32, offset: Float32, neighbors: Int64, result: Float32
 ) -> None:
     """ReLU of u_j - V p_i for the neighbours (p, k) of each of p points."""
     width, k = result.shape[1], neighbors.shape[1]

@@ -12,9 +12,9 @@ from typing import Self
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
@@ -37,8 +37,6 @@ from edgegrasp_model.networks.layers import (
 )
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
-
-Float32 = NDArray[np.float32]
 
 POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
 DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
@@ -166,7 +164,7 @@ def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
 
 
 @compiled("contract", "nsz")
-def _pool(features: Float32, count: NDArray[np.int64], pooled: Float32) -> None:
+def _pool(features: Float32, count: Int64, pooled: Float32) -> None:
     """Maximum and mean of the ReLU of the first `count` (E,) of features (E, P, C)."""
     channels = features.shape[2]
     zero = np.float32(0.0)

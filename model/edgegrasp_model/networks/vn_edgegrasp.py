@@ -8,9 +8,9 @@ and directions side by side, (M, 3, 2C).
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from edgegrasp_camera.arrays import Float32, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
@@ -26,8 +26,6 @@ from edgegrasp_model.networks.layers import (
     in_chunks,
     mlp,
 )
-
-Float32 = NDArray[np.float32]
 
 _TINY = 1e-7  # keeps the division finite where a direction vanishes; the reference's value
 VN_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
@@ -210,7 +208,7 @@ def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) 
 def furthest_of_each(both: Tensor, k: int) -> Tensor:
     """Of each k vectors in a row that which reaches furthest: (M k, 3, 2C) to (M, 3, C)."""
     if not float32_inference(both):
-        return _furthest(both.unflatten(0, (-1, k)), dim=1)
+        return _furthest(both.view(-1, k, *both.shape[1:]), dim=1)
     groups = len(both) // k
     furthest = Furthest(groups, both.shape[2] // 2)
     furthest.add(both, list(range(groups)), [k] * groups)
@@ -254,7 +252,7 @@ def _furthest(both: Tensor, dim: int) -> Tensor:
 
 @_compiled
 def _gathered_relu_rows(
-    u: Float32, points: Float32, offset: Float32, neighbors: NDArray[np.int64], result: Float32
+    u: Float32, points: Float32, offset: Float32, neighbors: Int64, result: Float32
 ) -> None:
     """`relu` of u_j - offset p_i for the neighbours (p, k) of each of p points."""
     width, k = result.shape[2], neighbors.shape[1]
@@ -288,9 +286,7 @@ def _relu_rows(both: Float32, result: Float32) -> None:
 
 
 @_compiled
-def _furthest_rows(
-    both: Float32, bounds: NDArray[np.int64], best: Float32, result: Float32
-) -> None:
+def _furthest_rows(both: Float32, bounds: Int64, best: Float32, result: Float32) -> None:
     """The furthest vectors of the rows of `both` between each two of `bounds`; the first of a tie.
 
     Goes on from the vectors in `result` and how far they reach, `best`.

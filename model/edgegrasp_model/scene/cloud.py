@@ -8,14 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import least_spread
 from edgegrasp_model.options import MAX_CANDIDATES
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 MAX_EXTENT = 20.0  # metres; where most of a cloud is wider, it is in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
@@ -34,15 +31,15 @@ class CheckedCloud:
     """The finite points of a cloud, and what comes with them."""
 
     points: Float32  # (N, 3) metres
-    row: NDArray[np.int64]  # (N,) each point's row in the cloud as sent
+    row: Int64  # (N,) each point's row in the cloud as sent
     rows_sent: int
     normals: Float32 | None = None  # (N, 3)
-    segment_ids: NDArray[np.int64] | None = None  # (N,)
-    view_ids: NDArray[np.int64] | None = None  # (N,)
+    segment_ids: Int64 | None = None  # (N,)
+    view_ids: Int64 | None = None  # (N,)
     image_size: tuple[int, int] | None = None  # (H, W) where it is organised
     warnings: tuple[str, ...] = ()
 
-    def take(self, kept: NDArray[np.bool_] | Int64) -> "CheckedCloud":
+    def take(self, kept: Bools | Int64) -> "CheckedCloud":
         """Some of the points, by truth values (N,) or places; rows are counted as before."""
         place = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         return CheckedCloud(
@@ -153,7 +150,7 @@ def check_hand_poses(poses: object) -> Float32:
     finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
     off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid: NDArray[np.bool_] = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
+    rigid: Bools = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
     rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
     if not rigid.all():
         fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
@@ -167,9 +164,7 @@ def _check_number(field: str, number: int) -> None:
         raise InvalidRequest(field, f"{number} of them", f"Send 1 to {MAX_CANDIDATES}.")
 
 
-def _floats(
-    field: str, array: object | None, size: int, row: NDArray[np.int64] | None
-) -> Float32 | None:
+def _floats(field: str, array: object | None, size: int, row: Int64 | None) -> Float32 | None:
     """The given rows of an (N, 3) or (H, W, 3) array beside the cloud; None: only check it."""
     if array is None:
         return None
@@ -187,9 +182,7 @@ def _floats(
     return values
 
 
-def _integers(
-    field: str, array: object | None, size: int, row: NDArray[np.int64]
-) -> NDArray[np.int64] | None:
+def _integers(field: str, array: object | None, size: int, row: Int64) -> Int64 | None:
     """The given rows of an (N,) or (H, W) array beside the cloud."""
     if array is None:
         return None
@@ -215,7 +208,7 @@ class Cloud:
 
 def _valid_points(
     cloud: object,
-) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+) -> tuple[Floats, Floats, Floats]:
     """A caller's array (N, 3) float32 or float64, metres, and its low and high corner (3,).
 
     Raises:
@@ -243,7 +236,7 @@ def _valid_points(
     return cloud, low, high
 
 
-def _near_points(points: NDArray[np.floating]) -> Int64:
+def _near_points(points: Floats) -> Int64:
     """Places of the points (N, 3) that are no stray readings far away.
 
     Raises:
@@ -277,7 +270,7 @@ def _check_place(count: int, furthest: float, num_approach_points: int) -> None:
         )
 
 
-def _finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+def _finite(points: Floats) -> Bools:
     """Which points (N, 3) have three finite coordinates."""
     x, y, z = points.T
     return np.asarray(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
@@ -287,19 +280,19 @@ def _finite(points: NDArray[np.floating]) -> NDArray[np.bool_]:
 class Voxels:
     """The occupied voxels of a cloud, ordered by place: the order of the points does not matter."""
 
-    voxel: NDArray[np.int64]  # (N,) voxel of each point
-    size: NDArray[np.int64]  # (V,) points in each
+    voxel: Int64  # (N,) voxel of each point
+    size: Int64  # (V,) points in each
 
-    def mean(self, values: NDArray[np.floating]) -> Float32:
+    def mean(self, values: Floats) -> Float32:
         """Mean (V, 3) of a vector of each point (N, 3)."""
         sums = [np.bincount(self.voxel, values[:, axis], len(self.size)) for axis in range(3)]
         return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
 
-    def share(self, holds: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def share(self, holds: Bools) -> Float64:
         """Share (V,) of each voxel's points for which something holds (N,)."""
         return np.bincount(self.voxel, holds, len(self.size)) / self.size
 
-    def commonest(self, labels: NDArray[np.integer]) -> NDArray[np.int64]:
+    def commonest(self, labels: NDArray[np.integer]) -> Int64:
         """Commonest label (V,) in each voxel, of any labels (N,); the lowest of those as common."""
         low, one = labels.min(), np.ones(len(labels), dtype=np.int64)
         tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels), few of them
@@ -308,7 +301,7 @@ class Voxels:
         return np.asarray(tally.indices[order[tally.indptr[1:] - 1]] + low, dtype=np.int64)
 
 
-def voxelise(points: NDArray[np.floating], voxel_size: float) -> Voxels:
+def voxelise(points: Floats, voxel_size: float) -> Voxels:
     """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
     # Axis by axis: three times as fast as all at once.
     cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
@@ -336,12 +329,12 @@ class Neighbors(NamedTuple):
         return cls(np.asarray(distance), np.asarray(row))
 
 
-def statistical_outlier_removal(near: Neighbors) -> NDArray[np.bool_]:
+def statistical_outlier_removal(near: Neighbors) -> Bools:
     """Which points (N,) are not far from their neighbours by the measure of the whole cloud."""
     if len(near.row) <= OUTLIER_NEIGHBORS:
         return np.ones(len(near.row), dtype=bool)
     mean = near.distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
-    kept: NDArray[np.bool_] = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
+    kept: Bools = mean <= mean.mean() + OUTLIER_DEVIATIONS * mean.std()
     return kept
 
 

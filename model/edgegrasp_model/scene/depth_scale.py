@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import CheckedCloud
-
-Float64 = NDArray[np.float64]
 
 NEAR = 0.01  # metres from the plane within which points belong to it
 HIGHEST = 10.0  # metres over the plane, the highest camera
@@ -57,9 +55,7 @@ def correct_depth_scale(
     return replace(sent, points=points)
 
 
-def depth_scale(
-    points: NDArray[np.floating], viewpoint: Float64, plane: SupportPlane
-) -> float | None:
+def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> float | None:
     """The factor on all depths of a view that brings its points of the plane into the plane.
 
     Where several factors fit (the table, or the flat top of an object), the smallest counts:

@@ -8,15 +8,12 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 HEIGHT, WIDTH = 240, 320  # pixels of the input
 MULTIPLE = 16  # its sides are multiples of

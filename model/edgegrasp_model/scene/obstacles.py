@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.options import Box, OrientedBox
 from edgegrasp_model.scene.cloud import CanonicalFrame
-
-Float64 = NDArray[np.float64]
 
 CHUNK = 20_000  # pairs of boxes at a time
 _SIGNS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
@@ -39,7 +38,7 @@ class SolidBoxes:
         return cls(frame.points(centers), frame.directions(halves))
 
     @classmethod
-    def of_hands(cls, T_cloud_hand: NDArray[np.float32], boxes: Float64) -> Self:
+    def of_hands(cls, T_cloud_hand: Float32, boxes: Float64) -> Self:
         """Boxes (B, 2, 3) of the hand frame at hands (E, 4, 4): E * B boxes, hand by hand."""
         pose = T_cloud_hand.astype(np.float64)
         turn = pose[:, :3, :3]

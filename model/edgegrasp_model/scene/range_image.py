@@ -3,13 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 SAMPLE = 6000  # points that decide what part of the view the image covers
 WIDEST = 1.2  # tangent of half of the widest view, 100 degrees

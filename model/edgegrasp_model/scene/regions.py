@@ -1,9 +1,9 @@
 """Which points of a cloud lie in the regions of a request, or on the objects it asks for."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
     Box,
@@ -19,10 +19,8 @@ from edgegrasp_model.options import (
     Shape,
     Sphere,
 )
-from edgegrasp_model.scene.cloud import CheckedCloud, Float32, Int64, Voxels
+from edgegrasp_model.scene.cloud import CheckedCloud, Voxels
 from edgegrasp_model.scene.grouping import FIXED
-
-Bools = NDArray[np.bool_]
 
 HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
 NEAR_POINT = 0.1  # metres from a position to the object that it asks for, at most
@@ -97,7 +95,7 @@ def chosen_objects(
     for name, target in (("at", options.at), ("near", options.near)):
         if target is None:
             continue
-        place: NDArray[np.floating] = cloud.points
+        place: Floats = cloud.points
         most = NEAR_POINT
         if name == "at" and cloud.image_size is not None:
             width = cloud.image_size[1]

@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import load_file
 from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
 from edgegrasp_model.scene.grouping import (
     FIXED,
@@ -27,11 +27,6 @@ from edgegrasp_model.scene.grouping import (
 )
 from edgegrasp_model.scene.network import SceneNet, scene_features
 from edgegrasp_model.scene.range_image import NEAREST, range_image
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 

@@ -5,14 +5,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from edgegrasp_camera.arrays import Float32, Float64, Floats
 from edgegrasp_model.kernels import heights_and_distances
 from edgegrasp_model.options import SupportPlane
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ class Support:
         """(3,) unit."""
         return np.asarray(self.axes[2])
 
-    def plan(self, points: NDArray[np.floating]) -> Float64:
+    def plan(self, points: Floats) -> Float64:
         """Places (N, 2) along the plane of points (N, 3), metres."""
         return np.asarray((points - self.axes[3]) @ self.axes[:2].T)
 
@@ -107,7 +104,7 @@ class Seen(NamedTuple):
 
 def fit_plane(
     seen: Seen,
-    weight: NDArray[np.floating],
+    weight: Floats,
     rng: np.random.Generator,
     up: Float64 | None = None,
     max_tilt: float = LIMITS.tilt,
@@ -227,7 +224,7 @@ def measured(seen: Seen, plane: SupportPlane, least: float = LIMITS.given_margin
     return Support(plane, float(np.median(off)), share, spread, middle, least, bow, axes)
 
 
-def plan_axes(normal: Float64, viewpoint: Float64 | None, points: NDArray[np.floating]) -> Float64:
+def plan_axes(normal: Float64, viewpoint: Float64 | None, points: Floats) -> Float64:
     """Two unit axes (2, 3) along a plane, the first toward the camera, else the furthest point."""
     middle = (
         np.array([axis.mean(dtype=np.float64) for axis in points.T]) if len(points) else np.zeros(3)

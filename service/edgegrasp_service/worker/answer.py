@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Array
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
@@ -159,7 +159,7 @@ class _Work:
         self.facts.grasps = len(scoring.evaluations)
         return scoring
 
-    def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, NDArray[Any]]]:
+    def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
         """What a request is about, within the limits: detector, cloud, options, given grasps."""
         size, most = len(self._job.body), self._settings.max_points
         in_time = most
@@ -200,7 +200,7 @@ class _Work:
             self.facts.seconds[name] = time.monotonic() - start
 
 
-def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, NDArray[Any]]:
+def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
     """The edges or hand poses to score; raises InvalidRequest unless there is one of the two."""
     names = [name for name in GIVEN if fields.get(name) is not None]
     if not names:
