@@ -28,9 +28,9 @@ TIMEOUT = 120.0  # seconds; a slow machine is no reason to fail
 def main(seed: int, output: Path, engine: str | None = None) -> None:
     """Run the demo; exits with a message if the server does not start or finds too little."""
     chosen = choose_engine(engine)
-    print(chosen)
+    print(f"engine: {chosen}")
     scene, camera, noise = (np.random.default_rng([seed, 0, stream]) for stream in range(3))
-    with ClutterSimulation(engine=chosen.name) as simulation:
+    with ClutterSimulation(engine=chosen) as simulation:
         placed = simulation.reset("pile", scene, num_objects=6)
         pose = EVALUATION_VIEWS.sample(camera)[0]
         seen = simulation.observe_from([pose], noise, table="auto")

@@ -108,6 +108,7 @@ def benchmark(
     asked = given_flags(BenchmarkFlags, flags)
     with interruptible("benchmark", resumes=asked.output is not None):
         config, choice = _plan(asked, connection, parse_option_flags(options))
+        print(f"engine: {config.engine}")
         folder = ResultFolder(asked.output) if asked.output is not None else None
         done, title = run_rounds(config, choice, folder, workers=asked.workers, ray=asked.ray)
     summary = {
@@ -137,13 +138,10 @@ def _plan(
     from edgegrasp_cli.planners import PlannerChoice
     from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
-    from edgegrasp_sim.engine import choose_engine
     from edgegrasp_sim.objects import SceneKind
     from edgegrasp_sim.protocol import load_protocol
 
     rules = load_protocol(asked.protocol)
-    chosen = choose_engine("mujoco" if asked.robot else asked.engine, rules.engine)
-    print(chosen)
     # The Panda's hand has shapes of its own.
     hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
     arm = None
@@ -170,7 +168,7 @@ def _plan(
         rules,
         asked.objects.resolve() if asked.objects is not None else None,
         asked.split,
-        chosen.name,
+        "mujoco" if asked.robot else asked.engine or "",
         hand,
         arm,
     )

@@ -44,7 +44,7 @@ def generate_data(
     from edgegrasp_training.views import find_views, write_data_card
 
     asked = given_flags(DataFlags, flags)
-    print(choose_engine(asked.engine))
+    print(f"engine: {choose_engine(asked.engine)}")
     missing = len(missing_scenes(output, asked))
     tried = held = 0
     with interruptible("generate-data", resumes=True):

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from edgegrasp_sim.engine import ArmModel, choose_engine, engine_constants
+from edgegrasp_sim.engine import ArmModel, choose_engine, world_type
 from edgegrasp_sim.hand import (
     CLOSE_SECONDS,
     MIN_OPENING,
@@ -67,7 +67,7 @@ class BenchmarkConfig:
             raise ValueError(f"seeds is {self.seeds}; pass numbers of 0 or more")
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds is {self.seeds}; pass each seed once")
-        chosen = choose_engine(self.engine, self.protocol.engine).name
+        chosen = choose_engine(self.engine, self.protocol.engine)
         object.__setattr__(self, "engine", chosen)
 
     def object_set(self) -> ObjectSet:
@@ -166,7 +166,7 @@ def manifest(config: BenchmarkConfig, planner: dict[str, Any]) -> dict[str, Any]
 def constants(engine: str) -> dict[str, float]:
     """The simulator's own constants, the same under every protocol."""
     hand = panda()
-    return engine_constants(engine) | {
+    return world_type(engine).constants | {
         "table_friction": TABLE_FRICTION,
         "packed_attempts": PACKED.attempts,
         "pile_drop_height": PILE.drop_height,

@@ -144,7 +144,7 @@ def generate(
         RuntimeError: Workers keep dying, or there is no such Ray cluster.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Any] = {"engine": choose_engine(options.engine).name}
+    found: dict[str, Any] = {"engine": choose_engine(options.engine)}
     if options.weights is not None:  # other machines find it there too
         found["weights"] = options.weights.resolve()
     options = options.model_copy(update=found)

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
+from edgegrasp_sim.engine.urdf import parse_obj
 from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_training.household import household_mesh
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
@@ -328,10 +329,10 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> 
 
 def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMesh]:
     """Objects to draw from: of a set, drawn at random, hollow, and of a household."""
-    pool = [pool_mesh(rng, read_obj(path.read_text())) for path in objects]
+    pool = [pool_mesh(rng, _mesh(path.read_text())) for path in objects]
     pool = [pool[k] for k in rng.permutation(len(pool))[: NUM_POOL // 3]]
     pool += [
-        pool_mesh(rng, read_obj(drawn_shape(int(k))))
+        pool_mesh(rng, _mesh(drawn_shape(int(k))))
         for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]
     ]
     while len(pool) < NUM_POOL:
@@ -353,18 +354,9 @@ def pool_mesh(rng: np.random.Generator, mesh: Mesh) -> PoolMesh:
     return PoolMesh((points, triangles), np.concatenate([samples, corners]))
 
 
-def read_obj(text: str) -> Mesh:
-    """Points and triangles of an OBJ file; polygons as fans."""
-    points = [line.split()[1:4] for line in text.splitlines() if line.startswith("v ")]
-    faces = [
-        [int(corner.split("/")[0]) for corner in line.split()[1:]]
-        for line in text.splitlines()
-        if line.startswith("f ")
-    ]
-    fans = [(face[0], face[k], face[k + 1]) for face in faces for k in range(1, len(face) - 1)]
-    triangles = np.array(fans)
-    triangles = np.where(triangles < 0, triangles + len(points), triangles - 1)
-    return np.array(points, dtype=np.float64), triangles
+def _mesh(obj: str) -> Mesh:
+    """All of an OBJ file as one mesh."""
+    return merged([surface for _, surface in parse_obj(obj)])
 
 
 def simplified(mesh: Mesh, triangles: int) -> Mesh:

@@ -199,16 +199,18 @@ def split_by_scene(
 def write_data_card(folder: Path, paths: list[Path], command: str) -> Path:
     """Count views, scenes, labels and objects of each kind of scene in `card.md`."""
     views = {path: load_view(path) for path in paths}
-    columns = {}
-    for kind in (*sorted({_kind(path) for path in paths}), "all"):
-        columns[kind] = _facts({p: v for p, v in views.items() if kind in (_kind(p), "all")})
-    rows = [(fact, *(column[fact] for column in columns.values())) for fact in columns["all"]]
-    lines = ["# Labelled views", "", *table(("", *columns), rows)]
+    kind = {path: path.stem.split("_")[0] for path in paths}
+    kinds = [*sorted(set(kind.values())), "all"]
+    columns = [
+        _facts({p: v for p, v in views.items() if each in (kind[p], "all")}) for each in kinds
+    ]
+    rows = [(fact, *(column[fact] for column in columns)) for fact in columns[0]]
     objects = Counter(
         known
         for view in views.values()
         for known in set(zip(view.objects, view.object_digests, strict=True))
     )
+    lines = ["# Labelled views", "", *table(("", *kinds), rows)]
     lines += ["", "Made by:", "", "```", command, "```", ""]
     lines += ["Objects, the SHA-256 of their files, and in how many views they are:", ""]
     lines += [f"- {name} `{digest}`: {count}" for (name, digest), count in sorted(objects.items())]
@@ -223,28 +225,26 @@ def table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str]
     return ["|" + "".join(f" {cell} |" if cell != "" else " |" for cell in line) for line in lines]
 
 
-def _kind(path: Path) -> str:
-    return path.stem.split("_")[0]
-
-
-def _facts(views: dict[Path, LabelledView]) -> dict[str, str]:
+def _facts(views: dict[Path, LabelledView]) -> dict[str, object]:
     """The rows of one column."""
-    tried = sum(len(view.tried()) for view in views.values())
-    held = sum(int((view.success == 1).sum()) for view in views.values())
-    shaken = [view for view in views.values() if view.firm is not None]
-    shaken_held = sum(int((view.success == 1).sum()) for view in shaken)
-    firm = sum(int((view.firm == 1).sum()) for view in shaken if view.firm is not None)
-    return {
-        "scenes": str(len({scene_of(path) for path in views})),
-        "views": str(len(views)),
-        "engine": ", ".join(sorted({view.engine for view in views.values()})),
-        "hands": str(len({view.gripper for view in views.values()})),
-        "grasps tried": str(tried),
-        "held after the lift": _share(held, tried),
-        "of those, held after shaking too": _share(firm, shaken_held),
-        "objects": str(len({name for view in views.values() for name in view.objects})),
+    success = np.concatenate([view.success for view in views.values()])
+    firm = np.concatenate(
+        [view.firm[view.success == 1] for view in views.values() if view.firm is not None]
+        or [np.empty(0)]
+    )
+    shares = {
+        "held after the lift": success[success != UNTRIED] == 1,
+        "of those, held after shaking too": firm == 1,
     }
-
-
-def _share(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.1f} %" if whole else "-"
+    return {
+        "scenes": len({scene_of(path) for path in views}),
+        "views": len(views),
+        "engine": ", ".join(sorted({view.engine for view in views.values()})),
+        "hands": len({view.gripper for view in views.values()}),
+        "grasps tried": int((success != UNTRIED).sum()),
+        **{
+            name: f"{100 * part.mean():.1f} %" if len(part) else "-"
+            for name, part in shares.items()
+        },
+        "objects": len({name for view in views.values() for name in view.objects}),
+    }

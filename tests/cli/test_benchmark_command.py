@@ -48,7 +48,7 @@ def test_a_planner_of_one_s_own_needs_only_its_name(benchmark, tmp_path, monkeyp
 def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tmp_path) -> None:
     few = ("--num-approach-points", 16, "--num-candidates", 400)
     gate = tmp_path / "gate.json"  # all held, in the one engine and the other
-    committed = json.loads(SMOKE_GATE.read_text()) | {"engine": choose_engine().name}
+    committed = json.loads(SMOKE_GATE.read_text()) | {"engine": choose_engine()}
     gate.write_text(json.dumps(committed))
     benchmark(tmp_path, "in-process", *few, "--gate", gate, rounds=4)
     planner = json.loads((tmp_path / "manifest.json").read_text())["run"]["planner"]

@@ -12,7 +12,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 def engine(request: pytest.FixtureRequest) -> str:
     """Each engine that is installed."""
     try:
-        return choose_engine(request.param).name
+        return choose_engine(request.param)
     except RuntimeError as error:
         pytest.skip(str(error))
 

@@ -58,7 +58,7 @@ def test_nothing_is_made_twice_and_a_lost_view_is_made_again_the_same(data: Path
 
 def test_labels_of_two_engines_are_not_mixed(data: Path) -> None:
     engine = load_view(find_views([data])[0]).engine
-    assert engine == choose_engine().name
+    assert engine == choose_engine()
     for other in set(ENGINES) - {engine}:
         if installed(other):
             with pytest.raises(ValueError, match=f"holds labels of {engine}, not of {other}"):

@@ -23,22 +23,8 @@ SLIDE_MASS = 0.05  # kg, of what carries fingers that swing
 ENGINES = ("pybullet", "mujoco")  # the first that is installed is the default
 
 
-class EngineChoice(NamedTuple):
-    """The engine to use, and why it is this one, in words."""
-
-    name: str
-    reason: str
-
-    def __str__(self) -> str:
-        return f"engine: {self.name}, {self.reason}"
-
-
-def choose_engine(asked: str | None = None, protocol: str = "") -> EngineChoice:
-    """The engine asked for, else the protocol's, else the first there is.
-
-    Args:
-        asked: one of `ENGINES`.
-        protocol: the engine that a protocol names; another takes its place where it is missing.
+def choose_engine(asked: str | None = None, protocol: str = "") -> str:
+    """The engine asked for, else the protocol's where it is installed, else the first there is.
 
     Raises:
         ValueError: there is no such engine.
@@ -47,20 +33,12 @@ def choose_engine(asked: str | None = None, protocol: str = "") -> EngineChoice:
     for name in filter(None, (asked, protocol)):
         if name not in ENGINES:
             raise ValueError(f"engine is {name!r}; choose one of {', '.join(ENGINES)}")
-    if asked:
-        if not installed(asked):
-            raise RuntimeError(f"engine {asked} is not installed: pip install {asked}")
-        return EngineChoice(asked, "as asked for")
-    if protocol and installed(protocol):
-        return EngineChoice(protocol, "the protocol's")
-    there = next((name for name in ENGINES if installed(name)), None)
-    if there is None:
-        raise RuntimeError("no physics engine is installed: pip install 'edgegrasp[sim]'")
-    without = protocol or (ENGINES[0] if there != ENGINES[0] else "")
-    if without:
-        whose = "the protocol's " if protocol else ""
-        return EngineChoice(there, f"because {whose}{without} is not installed")
-    return EngineChoice(there, "the default")
+    if asked and not installed(asked):
+        raise RuntimeError(f"engine {asked} is not installed: pip install {asked}")
+    for name in filter(None, (asked, protocol, *ENGINES)):
+        if installed(name):
+            return name
+    raise RuntimeError("no physics engine is installed: pip install 'edgegrasp[sim]'")
 
 
 def installed(engine: str) -> bool:
@@ -73,26 +51,18 @@ def installed(engine: str) -> bool:
 
 def make_world(engine: str | None = None) -> "World":
     """An empty world of an engine, see `choose_engine` for the default and errors."""
-    match choose_engine(engine).name:
-        case "mujoco":
-            from edgegrasp_sim.engine.with_mujoco import MujocoWorld
-
-            return MujocoWorld()
-        case _:
-            from edgegrasp_sim.engine.with_pybullet import PybulletWorld
-
-            return PybulletWorld()
+    return world_type(choose_engine(engine))()
 
 
-def engine_constants(engine: str) -> dict[str, float]:
-    """The constants of an engine, for the record of a result."""
+def world_type(engine: str) -> "type[World]":
+    """The worlds of an engine."""
     if engine == "mujoco":
-        from edgegrasp_sim.engine import with_mujoco
+        from edgegrasp_sim.engine.with_mujoco import MujocoWorld
 
-        return with_mujoco.CONSTANTS
-    from edgegrasp_sim.engine import with_pybullet
+        return MujocoWorld
+    from edgegrasp_sim.engine.with_pybullet import PybulletWorld
 
-    return with_pybullet.CONSTANTS
+    return PybulletWorld
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +167,7 @@ class World(ABC):
     """A physics world; a process may have several. Bodies that are removed are gone for good."""
 
     name: ClassVar[str]  # of the engine
+    constants: ClassVar[dict[str, float]]  # for the record of a result
     collision_depth: ClassVar[float]  # metres; a finger sliding along an object overlaps it by less
     shake: ClassVar[Shake]  # of a held object
 

@@ -89,10 +89,15 @@ def read_obj(path: Path) -> list[tuple[str, Surface]]:
 
 @lru_cache(maxsize=256)
 def _read_obj(path: Path, _changed: int) -> list[tuple[str, Surface]]:
+    return parse_obj(path.read_text(errors="replace"))
+
+
+def parse_obj(text: str) -> list[tuple[str, Surface]]:
+    """What `read_obj` reads of a file's text."""
     points: list[str] = []
     parts: list[tuple[str, int, list[str]]] = [("", 0, [])]  # name, first point, lines of faces
     # Only points count, not the normals and texture places behind their slashes.
-    for line in re.sub(r"/\S*", "", path.read_text(errors="replace")).splitlines():
+    for line in re.sub(r"/\S*", "", text).splitlines():
         word, _, rest = line.strip().partition(" ")
         if word == "v":
             points.append(rest)

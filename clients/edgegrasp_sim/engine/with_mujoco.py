@@ -75,6 +75,7 @@ class MujocoWorld(World):
     """A model that is compiled anew when a body came or went, and its state."""
 
     name = "mujoco"
+    constants = CONSTANTS
     collision_depth = COLLISION_DEPTH
     shake = SHAKE
 

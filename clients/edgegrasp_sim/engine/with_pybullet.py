@@ -54,6 +54,7 @@ class PybulletWorld(World):
     """
 
     name = "pybullet"
+    constants = CONSTANTS
     collision_depth = COLLISION_DEPTH
     shake = SHAKE
 
