@@ -24,7 +24,7 @@ from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import CheckpointMetadata, NetworkConfig
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_sim.camera import Observation, TableView
+from edgegrasp_sim.camera import EVALUATION_VIEWS, Observation, TableView
 from edgegrasp_sim.engine import ENGINES, installed
 from edgegrasp_sim.objects import CLUTTER, SceneKind
 from edgegrasp_sim.protocol import load_protocol
@@ -113,7 +113,7 @@ def demo_view() -> Observation:
     scene, camera, noise = (np.random.default_rng([0, 0, stream]) for stream in range(3))
     with ClutterSimulation() as simulation:
         simulation.reset(SceneKind.PILE, scene, num_objects=6)
-        return simulation.observe(camera, noise, table="auto")
+        return simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise, table="auto")
 
 
 def enlarged(image: np.ndarray) -> np.ndarray:
@@ -157,12 +157,13 @@ def simulator(kind: SceneKind) -> dict[str, dict[str, float]]:
     seconds: dict[str, list[tuple[float, float]]] = {engine: [] for engine in simulations}
     labels = dict.fromkeys(simulations, 0)
     for simulation in simulations.values():  # a process draws its first image once
-        simulation.observe(np.random.default_rng(0), np.random.default_rng(0))
+        simulation.observe_from([np.eye(4)], np.random.default_rng(0))
     for seed in range(SIMULATED):
         for engine, simulation in simulations.items():
             start = time.process_time()
             simulation.reset(kind, np.random.default_rng(seed))
-            observation = simulation.observe(*map(np.random.default_rng, ([seed, 1], [seed, 2])))
+            camera, noise = map(np.random.default_rng, ([seed, 1], [seed, 2]))
+            observation = simulation.observe_from(EVALUATION_VIEWS.sample(camera), noise)
             seen = time.process_time()
             poses = _sampled_poses(observation)
             begin = time.process_time()
@@ -189,8 +190,8 @@ def observe(kind: SceneKind = SceneKind.PILE, table: TableView = "known") -> Obs
     """A view of a scene of the built-in objects."""
     with ClutterSimulation() as simulation:
         simulation.reset(kind, np.random.default_rng(1))
-        streams = np.random.default_rng(1), np.random.default_rng(2)
-        return simulation.observe(*streams, table=table)
+        views = EVALUATION_VIEWS.sample(np.random.default_rng(1))
+        return simulation.observe_from(views, np.random.default_rng(2), table=table)
 
 
 def detector(config: NetworkConfig) -> GraspDetector:

@@ -13,11 +13,9 @@ from edgegrasp_camera.picture import lit
 from edgegrasp_sim.arm import ArmGripper, ArmMotion
 from edgegrasp_sim.camera import (
     CAMERA,
-    EVALUATION_VIEWS,
     FARTHEST,
     Observation,
     TableView,
-    ViewRange,
     crop,
     points_of,
     seen_box,
@@ -257,26 +255,6 @@ class ClutterSimulation:
             item.body.set_pose(placement.position, placement.quaternion_xyzw)
             self._objects.append(item)
         self._gripper = self._add_gripper()
-
-    def observe(
-        self,
-        rng_camera: np.random.Generator,
-        rng_noise: np.random.Generator,
-        *,
-        views: ViewRange = EVALUATION_VIEWS,
-        num_views: int = 1,
-        **seen: Unpack[Seeing],
-    ) -> Observation:
-        """Look at the scene from a random viewpoint, or several around it.
-
-        Args:
-            rng_camera: stream of the viewpoint.
-            rng_noise: stream of the noise.
-            views: where the camera may stand.
-            num_views: images, spread evenly over a full turn from the random one.
-            **seen: see `Seeing`.
-        """
-        return self.observe_from(views.sample(rng_camera, num_views), rng_noise, **seen)
 
     def observe_from(
         self,

@@ -204,11 +204,9 @@ class RoundDriver:
     def look(self) -> Observation:
         """Take the next view; the round ends if it shows almost nothing."""
         rules = self.protocol
-        self._seen = self.simulation.observe(
-            self._camera,
+        self._seen = self.simulation.observe_from(
+            rules.camera.view_range().sample(self._camera, rules.camera.views),
             self._noise,
-            views=rules.camera.view_range(),
-            num_views=rules.camera.views,
             noise_std=rules.noise.point_std,
             depth_noise=rules.noise,
             sensor=rules.noise.depth_sensor(self._noise),

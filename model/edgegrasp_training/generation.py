@@ -311,7 +311,7 @@ def ask(
     around = not open_table or noise.random() < AROUND_SHARE
     seen = _noise(noise)
     seen["table"] = "around" if around else "known"
-    observation = simulation.observe(streams[CAMERA_STREAM], noise, views=seen_from, **seen)
+    observation = simulation.observe_from(seen_from.sample(streams[CAMERA_STREAM]), noise, **seen)
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
     workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))

@@ -54,16 +54,6 @@ def test_packed_balls_hold_each_tried_grasp_and_its_contact(made_up_view, balls)
     assert 0 < len(some.label) < len(label)
 
 
-def test_packed_balls_lie_in_the_axes_that_a_detector_works_in(made_up_view, balls) -> None:
-    view = replace(made_up_view(1), camera_position=np.array([0.5, -0.3, 0.6], np.float32))
-    grasps = grasps_of(view, balls)
-    np.testing.assert_allclose(grasps.turn @ grasps.turn.T, np.eye(3), atol=1e-6)
-    toward_camera = grasps.turn @ (view.camera_position - view.points.mean(axis=0))
-    assert toward_camera[0] > 0.5
-    assert toward_camera[1] == pytest.approx(0, abs=1e-5)
-    assert (grasps.turn @ UP)[2] == pytest.approx(1)
-
-
 def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(made_up_view, hands):
     view = made_up_view(1)
     grasps = grasps_of(view, hands)

@@ -10,14 +10,9 @@ from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.scene import load_object
 from edgegrasp_training.shapes import (
     DRAWN_NAMES,
-    LONGEST,
     NUM_DRAWN,
-    NUM_FREE,
     NUM_VARIED,
-    PLAIN_HEIGHT,
-    PLAIN_WIDTH,
     STRETCH,
-    THINNEST,
     drawn_shape,
     household_objects,
     made_object,
@@ -33,28 +28,13 @@ def _surface(obj: str) -> tuple[np.ndarray, np.ndarray]:
     return points, faces
 
 
-def _volume(obj: str) -> float:
-    points, faces = _surface(obj)
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all(), "not closed"
-    a, b, c = points[faces].transpose(1, 0, 2)
-    return float((np.cross(a, b) * c).sum() / 6)
-
-
 @pytest.mark.parametrize("index", range(0, NUM_DRAWN, 13))
-def test_drawn_shapes_are_closed_and_of_a_size_to_grasp(index: int) -> None:
-    shape = drawn_shape(index)
-    extents = np.ptp(_surface(shape)[0], axis=0)
-    share = _volume(shape) / extents.prod()
-    if index < NUM_FREE:
-        assert 0.0 < share < 4.0  # parts overlap
-        assert extents.min() > 0.999 * THINNEST - 1e-5
-        assert LONGEST[0] - 1e-5 < extents.max() < LONGEST[1] + 1e-5
-    else:  # stands on a shelf
-        assert 0.4 < share < 1.001
-        assert 0.86 * PLAIN_WIDTH[0] < extents[:2].min()  # a hexagon is less wide one way
-        assert extents[:2].max() < PLAIN_WIDTH[1] + 1e-5
-        assert PLAIN_HEIGHT[0] - 1e-5 < extents[2] < PLAIN_HEIGHT[1] + 1e-5
+def test_drawn_shapes_are_closed(index: int) -> None:
+    points, faces = _surface(drawn_shape(index))
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    a, b, c = points[faces].transpose(1, 0, 2)
+    assert (np.cross(a, b) * c).sum() / 6 > 0
 
 
 def test_drawn_shapes_differ_and_stay_the_same() -> None:
