@@ -39,7 +39,7 @@ def beside(detection: Detection) -> Float64:
     support = detection.support
     assert support is not None
     up = support.normal.astype(np.float64)
-    middle = np.mean([thing.center for thing in detection.objects], axis=0)
+    middle = np.mean([found.center for found in detection.objects], axis=0)
     middle -= (up @ middle - support.offset) * up
     ahead = np.cross(up, [1.0, 0.0, 0.0])  # the image's x lies level
     ahead /= np.linalg.norm(ahead)

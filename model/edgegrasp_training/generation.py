@@ -73,7 +73,7 @@ SIDE_VIEWS = ViewRange((0.5, 1.2), (np.radians(40), np.radians(80)), _ANY_SIDE, 
 KEPT_DISTANCE = 0.18  # metres from the nearest hand that was tried: from its axis there,
 BEHIND_TIPS = 0.1122  # metres behind the fingertips, where the Panda's frame is
 AROUND_SHARE = 0.3  # of the views of packed scenes and piles that are not cut off at the sides
-TOLD_SHARE = {  # of the views that are not cut off, where support and workspace are told
+GIVEN_SHARE = {  # of the views that are not cut off, where support and workspace are given
     SceneKind.PACKED: 0.0,
     SceneKind.PILE: 0.0,
     SceneKind.BIN: 0.7,
@@ -81,7 +81,7 @@ TOLD_SHARE = {  # of the views that are not cut off, where support and workspace
 }
 AIMED_SHARE = 0.85  # of the views of bins and tables with grasps of the objects alone
 AIM_MARGIN = np.array([[-0.005], [0.005]])  # metres around an object
-AROUND_MARGIN = 0.006  # metres around a thing that is no object
+AROUND_MARGIN = 0.006  # metres around an obstacle
 PLANE_TILT, PLANE_ERROR = 0.006, 0.001  # radians, metres; standard deviations
 OTHER_OBJECTS = 0.3  # share of the scenes made of the other kind's objects
 VARIED_SHARE = 0.85  # of the scenes of an object folder, made of stretched and computed objects
@@ -100,7 +100,7 @@ BEST_SHARE = 0.1  # of the candidates, by score: those a network would execute
 UNSURE = 0.1, 0.8  # range of scores that leave the outcome open
 SURE = 0.99  # score of the best grasp from which on a view teaches little
 EASY_SHARE = 0.4  # of the grasps, tried in a view whose best grasp is sure
-FREE_SHARE = 0.75  # of the grasps chosen at random, those free of collision with the cloud
+FREE_SHARE = 0.75  # of the grasps chosen at random, those that are collision-free
 GUIDED_SHARE = 0.5  # of the tried grasps, the network's best and unsure ones
 
 
@@ -127,7 +127,7 @@ def generate(
     workers: int | None = 1,
     ray: str | None = None,
 ) -> Iterator[tuple[int, int, int]]:
-    """Generate the scenes that are missing, in any order; who makes them changes nothing.
+    """Generate the scenes that are missing, in any order; the result does not depend on the workers.
 
     Args:
         folder: Where the views go, one file each.
@@ -304,7 +304,7 @@ def ask(
     """Look at the scene, and request grasps as a benchmark does, around fewer points.
 
     In bins, on tables and in some of the other views the cloud holds all that the camera sees, and
-    the support is told, not quite where it is, or has to be found.
+    the support is given, not quite where it is, or has to be found.
     """
     noise, choice = streams[NOISE_STREAM], streams[CHOICE_STREAM]
     open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
@@ -315,7 +315,7 @@ def ask(
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
     workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))
-    if around and choice.random() >= TOLD_SHARE[kind]:
+    if around and choice.random() >= GIVEN_SHARE[kind]:
         support, workspace = AutoPlane(), None
     aimed = not open_table and choice.random() < AIMED_SHARE
     objects = _objects_of(simulation) if aimed else None
@@ -355,7 +355,7 @@ def _plane(rng: np.random.Generator) -> SupportPlane:
 
 
 def _objects_of(simulation: ClutterSimulation) -> Region:
-    """Where the objects are, without the things around them."""
+    """Where the objects are, without the obstacles around them."""
     boxes = simulation.object_bounds + AIM_MARGIN
     around = []
     for box in simulation.surroundings.boxes:
@@ -462,7 +462,7 @@ def _chosen(
     """Ascending rows of the candidates to try, `total` at most.
 
     Some that a network would execute, as many whose outcome it leaves open, and the rest at
-    random, mostly free of collision. Fewer where the best one is sure to hold, unless the scene is
+    random, mostly collision-free. Fewer where the best one is sure to hold, unless the scene is
     known to be hard.
     """
     left = np.ones(len(sample.candidates), dtype=bool)

@@ -56,7 +56,7 @@ def prepare_to_train(network: nn.Module) -> None:
 def start_from(network: nn.Module, start: nn.Module) -> int:
     """Give a network the weights of a trained one; a hand network may describe hands further.
 
-    What the trained one was not told counts for nothing at first: both score alike.
+    Numbers that the trained one does not read have no weight at first: both score alike.
 
     Args:
         network: To train; gets the weights.

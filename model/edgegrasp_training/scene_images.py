@@ -565,7 +565,7 @@ def _room(
     pool: Sequence[PoolMesh],
     label: int = OTHER,
 ) -> None:
-    """A floor at a height, walls, and large things that stand around."""
+    """A floor at a height, walls, and large background around."""
     if label == SUPPORT or rng.random() < 0.85:
         scene.add(box((30, 30, 0.02), (0, 0, floor - 0.01)), label)
     for yaw in rng.uniform(0, 2 * np.pi) + np.arange(4) * np.pi / 2:
@@ -579,7 +579,7 @@ def _room(
         stand = floor + (rng.uniform(0, 0.6) if rng.random() < 0.3 else 0.0)
         where = (*(away * np.array([np.cos(yaw), np.sin(yaw)])), stand + size[2] / 2)
         scene.add(box(size, where, rng.uniform(0, 3)))
-    for _ in range(int(rng.integers(0, 5))):  # small things out of reach
+    for _ in range(int(rng.integers(0, 5))):  # small background out of reach
         yaw, away = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 3.0)
         (points, triangles), _ = pool[int(rng.integers(len(pool)))]
         points = points * rng.uniform(1.0, 3.0)

@@ -93,7 +93,7 @@ class LabelledView:
         return UP if plane is None else np.asarray(plane.normal, dtype=np.float32)
 
     def cut_off(self) -> Bools:
-        """Which points (N,) lie where a side of the workspace cuts things off."""
+        """Which points (N,) lie at a side of the workspace, which cuts the cloud off."""
         if self.at_side is not None:
             return self.at_side
         if len(self.points) == 0:

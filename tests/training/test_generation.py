@@ -78,9 +78,9 @@ def test_random_hands_differ_between_scenes_and_are_what_the_network_is_told(tmp
     for view in views:
         if len(view.tried()):
             hand, seen = view.hand, tried_grasps(view, HAND).seen
-            told = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
+            measures = (hand.max_opening, hand.tip_z - hand.palm_z, hand.pad_half_width)
             assert seen.description[:, 71:74] == pytest.approx(
-                np.tile(told, (len(seen.points), 1)), rel=1e-3
+                np.tile(measures, (len(seen.points), 1)), rel=1e-3
             )
     before = paths[2].read_bytes()
     paths[2].unlink()
