@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -133,7 +133,7 @@ def _write(
     from edgegrasp_sim.page import image, page, table
 
     total = summary(list(done.values()))
-    scenes = {name: figures.document() for name, figures in done.items()}
+    scenes = {name: asdict(figures) for name, figures in done.items()}
     results = {"model": model, "options": dict(options), "all": total, "scenes": scenes}
     (output / "results.json").write_text(json.dumps(results, indent=1) + "\n")
     tables = [_grasp_table(done, total), _segmentation_table(done, total)]

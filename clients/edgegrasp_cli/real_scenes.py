@@ -4,7 +4,7 @@ A scene is an .npz file: docs/benchmark.md has its arrays.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -69,11 +69,7 @@ class PlaneFigures:
 
     angle: float  # degrees between the normals
     offset: float  # metres between the planes at the foot of an object, the greatest
-
-    @property
-    def right(self) -> bool:
-        """Whether grasps may rely on it."""
-        return self.angle <= MAX_ANGLE and self.offset <= MAX_OFFSET
+    right: bool  # whether grasps may rely on it
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,6 @@ class SceneFigures:
     grasps: int  # in the answer
     best: int  # of those judged, BEST at most
     on_object: int  # approach and contact point on one and the same object
-    elsewhere: int  # the others
     from_below: int  # the hand comes up through the support, whose plane is labelled
     through_points: int  # the open hand at the grasp holds measured points
     objects: int  # in the scene
@@ -93,11 +88,6 @@ class SceneFigures:
     segmentation: Segmentation
     milliseconds: float  # from the request to the answer
     refused: str = ""  # why the request was
-
-    def document(self) -> dict[str, Any]:
-        """As plain JSON values."""
-        plane = None if self.plane is None else {**asdict(self.plane), "right": self.plane.right}
-        return {**asdict(self), "plane": plane}
 
 
 def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
@@ -182,12 +172,10 @@ def judge(
     apart = scene.normal is not None
     up = np.zeros(3) if scene.normal is None else scene.normal
     upward = [float(grasp.approach_direction @ up) for grasp in best]
-    held = int((on_object[:BEST] >= FIRST_OBJECT).sum())
     return SceneFigures(
         grasps=len(grasps),
         best=len(best),
-        on_object=held,
-        elsewhere=len(best) - held,
+        on_object=int((on_object[:BEST] >= FIRST_OBJECT).sum()),
         from_below=sum(sine > BELOW for sine in upward),
         through_points=int(_meet_points(scene, best, gripper).sum()),
         objects=len(scene.objects),
@@ -225,8 +213,9 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
 def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
     assert scene.normal is not None
     cosine = float(np.clip(np.asarray(normal, dtype=np.float64) @ scene.normal, -1.0, 1.0))
-    apart = np.abs(scene.feet @ normal - offset)
-    return PlaneFigures(float(np.degrees(np.arccos(cosine))), float(apart.max()))
+    angle = float(np.degrees(np.arccos(cosine)))
+    apart = float(np.abs(scene.feet @ normal - offset).max())
+    return PlaneFigures(angle, apart, angle <= MAX_ANGLE and apart <= MAX_OFFSET)
 
 
 class _Arrays:

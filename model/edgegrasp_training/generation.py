@@ -127,7 +127,7 @@ def generate(
     workers: int | None = 1,
     ray: str | None = None,
 ) -> Iterator[tuple[int, int, int]]:
-    """Generate the scenes that are missing, in any order; the result does not depend on the workers.
+    """Generate the scenes that are missing, in any order; workers do not change the result.
 
     Args:
         folder: Where the views go, one file each.
