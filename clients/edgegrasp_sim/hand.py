@@ -105,22 +105,20 @@ def run_grasp(
     gripper.world.detect_collisions()
     start_contact = any(contact.distance < 0.0 for contact in gripper.body.contacts())
     target = _object_between_fingers(gripper, T_world_hand, objects)
-
     touched = False
 
-    def failed(cause: FailureCause) -> GraspResult:
-        return GraspResult(
-            gripper.opening, start_contact, None, target, cause, touched_on_the_way=touched
-        )
+    def result(cause: FailureCause | None, held: SceneObject | None = None) -> GraspResult:
+        found = GraspResult(gripper.opening, start_contact, held, target, cause)
+        return replace(found, touched_on_the_way=touched)
 
     if _cut_into(gripper) & obstacles:
-        return failed(FailureCause.START_COLLISION)
+        return result(FailureCause.START_COLLISION)
     collided = False
     for _ in gripper.approach(T_world_hand):
         cut = _cut_into(gripper)
         touched = touched or (gripper.on_the_way and bool(cut))
         if cut & obstacles:
-            return failed(FailureCause.APPROACH_COLLISION)
+            return result(FailureCause.APPROACH_COLLISION)
         collided = collided or bool(cut)
     _close(gripper, objects, to_the_end=to_the_end)
     missed = gripper.opening <= MIN_OPENING
@@ -128,21 +126,19 @@ def run_grasp(
     if not missed or to_the_end:
         held = _retreat(gripper, T_world_hand, objects, to_the_end=to_the_end)
         if held is not None and gripper.opening > MIN_OPENING:
-            result = GraspResult(
-                gripper.opening, start_contact, held, target, touched_on_the_way=touched
-            )
-            if not shake:
-                return result
-            still = _holds_when_shaken(gripper, T_world_hand, held, objects)
-            return replace(result, held_after_shaking=still)
+            found = result(None, held)
+            if shake:
+                still = _holds_when_shaken(gripper, T_world_hand, held, objects)
+                found = replace(found, held_after_shaking=still)
+            return found
     if start_contact:
-        return failed(FailureCause.START_COLLISION)
+        return result(FailureCause.START_COLLISION)
     if collided:
-        return failed(FailureCause.APPROACH_COLLISION)
+        return result(FailureCause.APPROACH_COLLISION)
     if missed or not caught:
-        return failed(FailureCause.MISSED)
+        return result(FailureCause.MISSED)
     wrong = target is not None and target not in caught
-    return failed(FailureCause.WRONG_OBJECT if wrong else FailureCause.SLIPPED)
+    return result(FailureCause.WRONG_OBJECT if wrong else FailureCause.SLIPPED)
 
 
 def retreat_pose(T_world_hand: Matrix) -> Matrix:
