@@ -117,16 +117,3 @@ def test_distances_of_boxes_are_those_of_a_convex_optimiser(seed: int) -> None:
         moved = least_distance(np.array([*both, way[row] / 2]), offset - way[row] / 2)
         assert (swept[row] > 0) == (moved > 1e-7)
         assert swept[row] <= moved + 1e-9
-
-
-@given(seed=st.integers(0, SEED))
-def test_boxes_moved_apart_by_their_depth_just_touch(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    ours, theirs = random_boxes(rng, 20), random_boxes(rng, 20)
-    depth = signed_distance(ours, theirs)
-    shifts = rng.normal(size=(20, 3))
-    shifts /= np.linalg.norm(shifts, axis=1, keepdims=True)
-    inside = depth < -1e-3
-    # No shift shorter than the depth separates them.
-    moved = SolidBoxes(ours.center + shifts * (np.abs(depth) * 0.99)[:, None], ours.half)
-    assert (separation(moved, theirs)[inside] < 0).all()
