@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from edgegrasp_camera.depth import DepthView, Intrinsics, fuse_depth_images
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_device
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.networks.checkpoint import save_checkpoint
@@ -39,6 +40,17 @@ def test_seed_decides_and_zero_is_a_seed() -> None:
     first = detect(seed=0)
     assert same(first, detect(seed=0))
     assert not same(first, detect(seed=1))
+
+
+def test_several_depth_images_show_each_object_once() -> None:
+    boxes = [table(), *boxes_on_table(1)]
+    poses = [camera(0.7, turn, 0.9) for turn in (0.0, 2.1, 4.2)]
+    intrinsics = Intrinsics(FOCAL_LENGTH, FOCAL_LENGTH, WIDTH / 2, HEIGHT / 2)
+    depths = [render(boxes, pose)[..., 2] for pose in poses]
+    cloud, cameras = fuse_depth_images(depths, [DepthView(intrinsics, pose) for pose in poses])
+    found = detector().detect(cloud, DetectOptions.model_validate({"viewpoint": cameras}))
+    assert len(found.objects) == 4
+    assert found.grasps
 
 
 def test_a_raw_cloud_is_seen_from_its_origin_and_the_answer_says_so() -> None:
