@@ -66,6 +66,7 @@ fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect
 
 bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the tables of it
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --pages
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/robot.py
 
 view: $(or $(wildcard $(INSTALLED)),$(TO_LOOK)) ## look at a scene and its grasps in the browser: make view FILE=scene.npz
 	$(BIN)/edgegrasp view $(FILE)

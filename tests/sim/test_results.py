@@ -51,6 +51,18 @@ def test_figures_count_as_the_reference_does() -> None:
     assert objects["cube"] == {"present": 2, "removed": 1, "attempts": 0, "successes": 0}
 
 
+def test_an_arm_s_figures_are_those_of_its_motions() -> None:
+    held = replace(HELD, motion_seconds=3.75)
+    missed = replace(held, object=None, cause=FailureCause.MISSED, touched_on_the_way=True)
+    assert summarise([replace(ROUNDS[0], attempts=(held, missed))])["arm"] == {
+        "picks_per_hour": pytest.approx(3600 / 8.0),
+        "motion_seconds": 3.75,
+        "touched_on_the_way": 1,
+        "scenes_with_a_reachable_grasp": 1,
+    }
+    assert summarise(ROUNDS)["arm"] is None
+
+
 def test_figures_of_nothing_are_none() -> None:
     summary = summarise([Round(0, 0, (), (), 0, RoundEnd.CLEARED)])
     assert summary["grasp_success_rate"]["value"] is None
