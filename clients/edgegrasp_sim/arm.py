@@ -57,7 +57,7 @@ class ArmGripper(Gripper):
         motion = self._planned
         self.on_the_way = True
         for seconds in self._follow(0, motion.grasp_row):
-            self.on_the_way = seconds < motion.times[motion.pregrasp_row]
+            self.on_the_way = bool(seconds < motion.times[motion.pregrasp_row])
             yield
 
     def retreat(self, T_world_hand: Matrix) -> Iterator[None]:
