@@ -29,7 +29,7 @@ Option = typer.Option
 # Options of a detection that the simulation, the protocol or another flag decides.
 DECIDED = (
     *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
-    *("top_k", "debug", "robot"),
+    *("top_k", "debug", "robot", "previous"),
 )
 
 

@@ -185,6 +185,32 @@ class Suppression(TypedDict, total=False):
     rotation: float
 
 
+class PreviousGrasp(TypedDict):
+    """A grasp of an earlier answer."""
+
+    id: int
+    T_cloud_hand: Sequence[float]
+    object: NotRequired[int | None]
+
+
+class PreviousObject(TypedDict):
+    """An object of an earlier answer."""
+
+    number: int
+    surface: Sequence[float]
+    confidence: NotRequired[float | None]
+
+
+class Previous(TypedDict, total=False):
+    """What an earlier answer found, which the next one keeps where it is still there."""
+
+    gripper: str
+    next_id: int
+    grasps: Sequence[PreviousGrasp]
+    objects: Sequence[PreviousObject]
+    search: bool
+
+
 class DetectOptions(TypedDict, total=False):
     """Options of one detection; the defaults suit a tabletop scene seen by one camera."""
 
@@ -211,4 +237,5 @@ class DetectOptions(TypedDict, total=False):
     top_k: int
     suppression: Suppression | None
     order: Literal["score", "highest", "clearance"]
+    previous: Previous | None
     debug: bool

@@ -54,6 +54,7 @@ class Grasp:
     clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
     object: int | None = None  # number of the object that the contact is on; None: of none
     arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
+    id: int | None = None  # the same in every answer that follows it; None without `previous`
 
     def pregrasp(self, distance: float = 0.05) -> Float32:
         """The hand's pose (4, 4) `distance` metres back, where the straight way in begins."""
@@ -106,6 +107,15 @@ class DetectedObject:
     # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
     # nobody can say.
     reason: str | None
+    surface: Float32 | None = None  # (3 K,) points by which it is found again; with `previous`
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How an answer follows the one before, which `previous` told."""
+
+    first: str  # what became of the first grasp: "started", "kept", "replaced" or "lost"
+    next_id: int  # above all ids and numbers so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +149,7 @@ class Detection:
     support: FoundSupport | None  # given or found
     up: Float32  # (3,) unit, away from gravity, as it was used
     objects: list[DetectedObject]  # the largest first
+    tracking: Tracking | None = None  # where `previous` was sent
 
     @property
     def best_pick(self) -> Grasp | None:
@@ -207,7 +218,9 @@ _STAGES = (
 )
 
 
-Record = TypeVar("Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp)
+Record = TypeVar(
+    "Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp, Tracking
+)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
@@ -215,6 +228,7 @@ Read = Callable[[Any, str], Any]
 def detection_from(answer: Any, read: Read) -> Detection:
     """The answer to a request for grasps."""
     debug, support = read(answer, "debug"), read(answer, "support")
+    tracking = read(answer, "tracking")
     return Detection(
         grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
         up=_array(read(answer, "up")),
@@ -222,6 +236,7 @@ def detection_from(answer: Any, read: Read) -> Detection:
         objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
         gripper=_record(GripperOutline, read(answer, "gripper"), read),
         debug=None if debug is None else _debug(debug, read),
+        tracking=None if tracking is None else _record(Tracking, tracking, read),
         **_common(answer, read),
     )
 

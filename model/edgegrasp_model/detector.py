@@ -4,7 +4,8 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -28,7 +29,7 @@ from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.checkpoint import check_reference_logits, load_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
-from edgegrasp_model.options import DetectOptions
+from edgegrasp_model.options import Collision, DetectOptions
 from edgegrasp_model.ranking import (
     SURE_SCORE,
     debug_info,
@@ -53,6 +54,7 @@ from edgegrasp_model.scene.scene import (
     object_probability,
     select_points,
 )
+from edgegrasp_model.tracking import Followed, follow, merged, narrowed, relabelled, untracked, with_surfaces
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
@@ -83,6 +85,7 @@ class Prepared:
     counts: dict[str, int]
     warnings: list[str]
     seconds: dict[str, float]
+    followed: Followed | None = None  # objects of an earlier answer
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -194,8 +197,10 @@ class GraspDetector:
         Half of the approach points first, then the other half on objects without a sure grasp,
         then others where few hands are collision-free.
         """
-        scene = prepared.scene
+        scene, previous = prepared.scene, prepared.options.previous
         if scene is None or not scene.approach_allowed.any():
+            return None
+        if previous is not None and not previous.search:
             return None
         sampler = self.sampler(prepared)
         with prepared.timed("candidates"):
@@ -239,7 +244,7 @@ class GraspDetector:
         with prepared.timed("ranking"):
             logits = np.empty(0, dtype=np.float32) if scored is None else scored.logits
             score, outcome = self._probability(logits), np.empty(0, dtype=np.int8)
-            if scene is not None and scored is None:
+            if scene is not None and not scene.approach_allowed.any():
                 prepared.warnings.append(NO_APPROACH_POINT)
             elif scored is not None and len(logits) == 0:
                 prepared.warnings.append(NO_CANDIDATE)
@@ -252,6 +257,15 @@ class GraspDetector:
                 grasps = grasps_in_cloud(scene, best, gripper, score[rows], free, clear)
             if options.debug and scene is not None:
                 debug = debug_info(scene, sample, score, outcome, prepared.selected.labels)
+        tracking, objects = untracked(options.previous), []
+        if scene is not None:
+            if prepared.followed is not None:
+                score_poses = partial(self._score_poses, prepared, scene)
+                up = prepared.selected.up
+                grasps, tracking = merged(grasps, prepared.followed, options, up, score_poses)
+            objects = detected_objects(scene, grasps, sample, score, gripper)
+            if prepared.followed is not None:
+                objects = with_surfaces(objects, prepared.followed)
         counts["returned"] = len(grasps)
         return Detection(
             grasps,
@@ -263,7 +277,8 @@ class GraspDetector:
             debug,
             found_support(prepared.selected.support),
             prepared.selected.up.astype(np.float32),
-            [] if scene is None else detected_objects(scene, grasps, sample, score, gripper),
+            objects,
+            tracking,
         )
 
     def score(
@@ -306,24 +321,36 @@ class GraspDetector:
         evaluations = [Evaluation(None, NoGrasp.NO_POINT)] * len(asked)
         if prepared.scene is not None:
             scene, gripper = prepared.scene, prepared.gripper
-            scorer = Scorer(
-                lambda batch: self._probability(self.run(batch)),
-                prepared.crop_radius,
-                self.metadata.network,
-            )
-            with prepared.timed("candidates"):
-                if edges is None:
-                    poses = scene.frame.poses(asked)
-                    given = from_hand_poses(scene, poses, gripper, scorer.crop_radius)
-                else:
+            if edges is None:
+                evaluations = self._score_poses(prepared, scene, asked, options.collision)
+            else:
+                with prepared.timed("candidates"):
                     margin = options.collision.margin
-                    given = from_edges(scene, asked, gripper, scorer.crop_radius, margin)
-            with prepared.timed("network"):
-                evaluations = evaluate(scene, given, gripper, options.collision, scorer)
+                    given = from_edges(scene, asked, gripper, prepared.crop_radius, margin)
+                with prepared.timed("network"):
+                    scorer = self._scorer(prepared)
+                    evaluations = evaluate(scene, given, gripper, options.collision, scorer)
         prepared.counts["given"] = len(asked)
         prepared.counts["scored"] = sum(each.grasp is not None for each in evaluations)
         seconds, name = prepared.total_seconds(), self.metadata.name
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
+
+    def _score_poses(
+        self, prepared: Prepared, scene: Scene, T_cloud_hand: Float32, request: Collision
+    ) -> list[Evaluation]:
+        """An evaluation of each hand pose (M, 4, 4)."""
+        with prepared.timed("candidates"):
+            poses = scene.frame.poses(T_cloud_hand)
+            given = from_hand_poses(scene, poses, prepared.gripper, prepared.crop_radius)
+        with prepared.timed("network"):
+            return evaluate(scene, given, prepared.gripper, request, self._scorer(prepared))
+
+    def _scorer(self, prepared: Prepared) -> Scorer:
+        return Scorer(
+            lambda batch: self._probability(self.run(batch)),
+            prepared.crop_radius,
+            self.metadata.network,
+        )
 
     def _with_scene(
         self, sent: CheckedCloud, options: DetectOptions, max_voxels: int | None = None
@@ -341,6 +368,9 @@ class GraspDetector:
                 f"uncalibrated for {gripper.name!r}; use them for ranking only."
             )
         options = _with_viewpoint(sent, options, warnings)
+        previous, followed = options.previous, None
+        if previous is not None:
+            options = narrowed(options, gripper.name, sent.points)
         start = time.perf_counter()
         selected = select_points(sent, options, counts, warnings)
         voxel_size = self.metadata.voxel_size
@@ -356,8 +386,14 @@ class GraspDetector:
                 "after removing the support plane, background and outliers, "
                 f"{counts['kept']} points remain: too few for a surface; see counts."
             )
+        elif previous is not None:
+            scene, followed = follow(scene, previous, sent.segment_ids is not None)
+            labels = relabelled(selected.labels, followed.named)
+            selected = replace(selected, labels=labels)
         seconds = {"cloud": time.perf_counter() - start}
-        return Prepared(options, gripper, radius, selected, scene, counts, warnings, seconds)
+        return Prepared(
+            options, gripper, radius, selected, scene, counts, warnings, seconds, followed
+        )
 
     def _probability(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
         """Calibrated probabilities (E,) of logits (E,)."""

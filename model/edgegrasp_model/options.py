@@ -61,6 +61,7 @@ Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
+MAX_PREVIOUS, MAX_SURFACE = 64, 64  # grasps or objects of an earlier answer; points of an object
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
@@ -90,6 +91,7 @@ Pixel = Annotated[
 
 
 Matrix = Annotated[tuple[Finite, ...], Field(min_length=16, max_length=16)]  # row by row
+Places = Annotated[tuple[Finite, ...], Field(max_length=3 * MAX_SURFACE)]  # x, y, z of each
 Quaternion = Annotated[
     tuple[Finite, Finite, Finite, Finite],
     AfterValidator(_of_length_one),
@@ -473,13 +475,22 @@ def rigid(value: Pose) -> Pose:
     return value
 
 
+def _in_threes(value: tuple[float, ...]) -> tuple[float, ...]:
+    if len(value) % 3:
+        raise ValueError("must be three numbers for each point")
+    return value
+
+
+Pose = Annotated[
+    Matrix, AfterValidator(rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
+]
+
+
 class RobotArm(Strict):
     """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
 
     name: str = Field(max_length=100, description="one of the server's robots")
-    T_base_cloud: Annotated[
-        Matrix, AfterValidator(rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
-    ] = Field(
+    T_base_cloud: Pose = Field(
         description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
     )
     joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
@@ -489,6 +500,60 @@ class RobotArm(Strict):
         default="motion",
         description="reach: joints before and at each grasp; motion: a timed trajectory too",
     )
+
+
+class PreviousGrasp(Strict):
+    """A grasp of an earlier answer."""
+
+    id: Row = Field(description="as in that answer")
+    T_cloud_hand: Pose = Field(description="as in that answer: a 4 x 4 matrix, row by row")
+    object: Row | None = Field(default=None, description="number of the object that it is on")
+
+
+class PreviousObject(Strict):
+    """An object of an earlier answer."""
+
+    number: Row = Field(description="as in that answer")
+    surface: Annotated[
+        Places,
+        AfterValidator(_in_threes),
+        BeforeValidator(_row_by_row, json_schema_input_type=Places),
+    ] = Field(description="as in that answer: x, y, z of points on it, one after another, metres")
+    confidence: Annotated[float, Field(ge=0.0, le=1.0), numeric] | None = Field(
+        default=None, description="as in that answer"
+    )
+
+
+class Previous(Strict):
+    """What an earlier answer found, which the next one keeps where it is still there.
+
+    All of it is in the frame of the cloud that is sent now.
+    """
+
+    gripper: str = Field(default="", max_length=100, description="its name in that answer")
+    next_id: Row = Field(default=0, description="as in that answer")
+    grasps: tuple[PreviousGrasp, ...] = Field(
+        default=(), max_length=MAX_PREVIOUS, description="best first; the first is the one to keep"
+    )
+    objects: tuple[PreviousObject, ...] = Field(
+        default=(), max_length=MAX_PREVIOUS, description="those that the grasps are on, and others"
+    )
+    search: StrictBool = Field(
+        default=True,
+        description="whether to look for other grasps too; false: only these are moved along and "
+        "scored anew, which takes a fraction of the time, best with the `support` of that answer",
+    )
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        for name, numbers in (
+            ("grasps", [grasp.id for grasp in self.grasps]),
+            ("objects", [one.number for one in self.objects]),
+        ):
+            if len(set(numbers)) < len(numbers):
+                twice = next(one for one in numbers if numbers.count(one) > 1)
+                raise ValueError(f"{name} must differ: {twice} is the id of two of them")
+        return self
 
 
 def _mode_as_object(value: object) -> object:
@@ -648,6 +713,11 @@ class DetectOptions(Strict):
         description="what comes first: the score (before others, the best grasp of each object "
         "that has one of 0.5 and more); the highest TCP along up among scores of 0.9 and more, "
         "then the others by score; or the clearance",
+    )
+    previous: Previous | None = Field(
+        default=None,
+        description="what an earlier answer found: what is still there keeps its id, its number "
+        "and its place; an empty object begins; null: each answer stands alone",
     )
     debug: StrictBool = Field(
         default=False, description="whether to return the processed cloud and every candidate"

@@ -49,6 +49,15 @@ class Ungraspable(StrEnum):
     HIDDEN = "hidden"  # no camera sees where it ends beyond the fingers
 
 
+class Following(StrEnum):
+    """What became of the first grasp of `previous`."""
+
+    STARTED = "started"  # there was none
+    KEPT = "kept"  # it is the first again, moved with its object
+    REPLACED = "replaced"  # another one is better by a margin
+    LOST = "lost"  # its object is not found again, or the hand no longer fits
+
+
 @dataclass(frozen=True)
 class ArmTrajectory:
     """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
@@ -89,6 +98,15 @@ class Grasp:
     clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
     object: int | None = None  # number of the object that the contact is on; None: of none
     arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
+    id: int | None = None  # the same in every answer that follows it; None without `previous`
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How an answer follows the one before."""
+
+    first: Following
+    next_id: int  # above all ids and numbers so far
 
 
 @dataclass(frozen=True)
@@ -122,6 +140,7 @@ class DetectedObject:
     best_score: float | None  # of the grasps returned; None: there is none on it
     confidence: float | None  # probability that it is an object; None: the caller named it
     reason: Ungraspable | None  # why it has no good grasp; None: it has one, or nobody can say
+    surface: Float32 | None = None  # (K, 3) points by which it is found again; with `previous`
 
 
 @dataclass(frozen=True)
@@ -155,6 +174,7 @@ class Detection:
     support: FoundSupport | None = None  # given or found
     up: Float32 = field(default_factory=lambda: np.array([0, 0, 1], np.float32))  # (3,) unit, used
     objects: list[DetectedObject] = field(default_factory=list)  # the largest first
+    tracking: Tracking | None = None  # where `previous` was sent
 
 
 @dataclass(frozen=True)

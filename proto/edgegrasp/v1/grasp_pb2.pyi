@@ -588,6 +588,7 @@ class DetectOptions(_message.Message):
     TOP_K_FIELD_NUMBER: _builtins.int
     SUPPRESSION_FIELD_NUMBER: _builtins.int
     ORDER_FIELD_NUMBER: _builtins.int
+    PREVIOUS_FIELD_NUMBER: _builtins.int
     DEBUG_FIELD_NUMBER: _builtins.int
     OBJECT_CHOICE_FIELD_NUMBER: _builtins.int
     model: _builtins.str
@@ -675,6 +676,12 @@ class DetectOptions(_message.Message):
         """Non-maximum suppression; disabled: none."""
 
     @_builtins.property
+    def previous(self) -> Global___Previous:
+        """What an earlier answer found: what is still there keeps its id, its number and its place; an
+        empty object begins; absent: each answer stands alone.
+        """
+
+    @_builtins.property
     def object_choice(self) -> Global___ObjectChoice:
         """`objects` where it is an object in JSON."""
 
@@ -704,12 +711,13 @@ class DetectOptions(_message.Message):
         top_k: _builtins.int | None = ...,
         suppression: Global___Suppression | None = ...,
         order: _builtins.str | None = ...,
+        previous: Global___Previous | None = ...,
         debug: _builtins.bool | None = ...,
         object_choice: Global___ObjectChoice | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "previous", b"previous", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "workspace", b"workspace"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_debug", b"_debug", "_max_object_size", b"_max_object_size", "_min_score", b"_min_score", "_model", b"_model", "_num_approach_points", b"_num_approach_points", "_num_candidates", b"_num_candidates", "_objects", b"_objects", "_order", b"_order", "_sampling", b"_sampling", "_seed", b"_seed", "_top_k", b"_top_k", "approach_direction", b"approach_direction", "approach_region", b"approach_region", "at", b"at", "collision", b"collision", "contact_region", b"contact_region", "debug", b"debug", "gripper", b"gripper", "max_object_size", b"max_object_size", "min_score", b"min_score", "model", b"model", "near", b"near", "num_approach_points", b"num_approach_points", "num_candidates", b"num_candidates", "object_choice", b"object_choice", "objects", b"objects", "order", b"order", "previous", b"previous", "robot", b"robot", "sampling", b"sampling", "seed", b"seed", "support", b"support", "suppression", b"suppression", "top_k", b"top_k", "up", b"up", "viewpoint", b"viewpoint", "workspace", b"workspace"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__debug: _TypeAlias = _typing.Literal["debug"]  # noqa: Y015
     _WhichOneofArgType__debug: _TypeAlias = _typing.Literal["_debug", b"_debug"]  # noqa: Y015
@@ -1230,6 +1238,61 @@ class Suppression(_message.Message):
 Global___Suppression: _TypeAlias = Suppression  # noqa: Y015
 
 @_typing.final
+class Previous(_message.Message):
+    """What an earlier answer found, which the next one keeps where it is still there."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    GRIPPER_FIELD_NUMBER: _builtins.int
+    NEXT_ID_FIELD_NUMBER: _builtins.int
+    GRASPS_FIELD_NUMBER: _builtins.int
+    OBJECTS_FIELD_NUMBER: _builtins.int
+    SEARCH_FIELD_NUMBER: _builtins.int
+    gripper: _builtins.str
+    """Its name in that answer."""
+    next_id: _builtins.int
+    """As in that answer."""
+    search: _builtins.bool
+    """Whether to look for other grasps too; false: only these are moved along and scored anew, which
+    takes a fraction of the time, best with the `support` of that answer.
+    """
+    @_builtins.property
+    def grasps(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousGrasp]:
+        """Best first; the first is the one to keep."""
+
+    @_builtins.property
+    def objects(self) -> _containers.RepeatedCompositeFieldContainer[Global___PreviousObject]:
+        """Those that the grasps are on, and others."""
+
+    def __init__(
+        self,
+        *,
+        gripper: _builtins.str | None = ...,
+        next_id: _builtins.int | None = ...,
+        grasps: _abc.Iterable[Global___PreviousGrasp] | None = ...,
+        objects: _abc.Iterable[Global___PreviousObject] | None = ...,
+        search: _builtins.bool | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_gripper", b"_gripper", "_next_id", b"_next_id", "_search", b"_search", "gripper", b"gripper", "next_id", b"next_id", "search", b"search"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_gripper", b"_gripper", "_next_id", b"_next_id", "_search", b"_search", "grasps", b"grasps", "gripper", b"gripper", "next_id", b"next_id", "objects", b"objects", "search", b"search"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__gripper: _TypeAlias = _typing.Literal["gripper"]  # noqa: Y015
+    _WhichOneofArgType__gripper: _TypeAlias = _typing.Literal["_gripper", b"_gripper"]  # noqa: Y015
+    _WhichOneofReturnType__next_id: _TypeAlias = _typing.Literal["next_id"]  # noqa: Y015
+    _WhichOneofArgType__next_id: _TypeAlias = _typing.Literal["_next_id", b"_next_id"]  # noqa: Y015
+    _WhichOneofReturnType__search: _TypeAlias = _typing.Literal["search"]  # noqa: Y015
+    _WhichOneofArgType__search: _TypeAlias = _typing.Literal["_search", b"_search"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__gripper) -> _WhichOneofReturnType__gripper | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__next_id) -> _WhichOneofReturnType__next_id | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__search) -> _WhichOneofReturnType__search | None: ...
+
+Global___Previous: _TypeAlias = Previous  # noqa: Y015
+
+@_typing.final
 class HandPart(_message.Message):
     """Boxes of the hand or of one finger, hand frame."""
 
@@ -1515,6 +1578,84 @@ class Cone(_message.Message):
 Global___Cone: _TypeAlias = Cone  # noqa: Y015
 
 @_typing.final
+class PreviousGrasp(_message.Message):
+    """A grasp of an earlier answer."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ID_FIELD_NUMBER: _builtins.int
+    T_CLOUD_HAND_FIELD_NUMBER: _builtins.int
+    OBJECT_FIELD_NUMBER: _builtins.int
+    id: _builtins.int
+    """As in that answer."""
+    object: _builtins.int
+    """Number of the object that it is on."""
+    @_builtins.property
+    def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """As in that answer: a 4 x 4 matrix, row by row."""
+
+    def __init__(
+        self,
+        *,
+        id: _builtins.int | None = ...,
+        T_cloud_hand: _abc.Iterable[_builtins.float] | None = ...,
+        object: _builtins.int | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_id", b"_id", "_object", b"_object", "id", b"id", "object", b"object"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "_id", b"_id", "_object", b"_object", "id", b"id", "object", b"object"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__id: _TypeAlias = _typing.Literal["id"]  # noqa: Y015
+    _WhichOneofArgType__id: _TypeAlias = _typing.Literal["_id", b"_id"]  # noqa: Y015
+    _WhichOneofReturnType__object: _TypeAlias = _typing.Literal["object"]  # noqa: Y015
+    _WhichOneofArgType__object: _TypeAlias = _typing.Literal["_object", b"_object"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__id) -> _WhichOneofReturnType__id | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__object) -> _WhichOneofReturnType__object | None: ...
+
+Global___PreviousGrasp: _TypeAlias = PreviousGrasp  # noqa: Y015
+
+@_typing.final
+class PreviousObject(_message.Message):
+    """An object of an earlier answer."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NUMBER_FIELD_NUMBER: _builtins.int
+    SURFACE_FIELD_NUMBER: _builtins.int
+    CONFIDENCE_FIELD_NUMBER: _builtins.int
+    number: _builtins.int
+    """As in that answer."""
+    confidence: _builtins.float
+    """As in that answer."""
+    @_builtins.property
+    def surface(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """As in that answer: x, y, z of points on it, one after another, metres."""
+
+    def __init__(
+        self,
+        *,
+        number: _builtins.int | None = ...,
+        surface: _abc.Iterable[_builtins.float] | None = ...,
+        confidence: _builtins.float | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_confidence", b"_confidence", "_number", b"_number", "confidence", b"confidence", "number", b"number"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_confidence", b"_confidence", "_number", b"_number", "confidence", b"confidence", "number", b"number", "surface", b"surface"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__confidence: _TypeAlias = _typing.Literal["confidence"]  # noqa: Y015
+    _WhichOneofArgType__confidence: _TypeAlias = _typing.Literal["_confidence", b"_confidence"]  # noqa: Y015
+    _WhichOneofReturnType__number: _TypeAlias = _typing.Literal["number"]  # noqa: Y015
+    _WhichOneofArgType__number: _TypeAlias = _typing.Literal["_number", b"_number"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__confidence) -> _WhichOneofReturnType__confidence | None: ...
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__number) -> _WhichOneofReturnType__number | None: ...
+
+Global___PreviousObject: _TypeAlias = PreviousObject  # noqa: Y015
+
+@_typing.final
 class Shape(_message.Message):
     """In JSON `kind` is the name of the field set here, its fields beside it."""
 
@@ -1783,6 +1924,7 @@ class DetectGraspsResponse(_message.Message):
     UP_FIELD_NUMBER: _builtins.int
     OBJECTS_FIELD_NUMBER: _builtins.int
     GRIPPER_FIELD_NUMBER: _builtins.int
+    TRACKING_FIELD_NUMBER: _builtins.int
     model: _builtins.str
     """Name of the weights used."""
     @_builtins.property
@@ -1821,6 +1963,10 @@ class DetectGraspsResponse(_message.Message):
     def gripper(self) -> Global___GripperOutline:
         """The gripper that they are for."""
 
+    @_builtins.property
+    def tracking(self) -> Global___Tracking:
+        """Set where options.previous is."""
+
     def __init__(
         self,
         *,
@@ -1834,14 +1980,43 @@ class DetectGraspsResponse(_message.Message):
         up: _abc.Iterable[_builtins.float] | None = ...,
         objects: _abc.Iterable[Global___DetectedObject] | None = ...,
         gripper: Global___GripperOutline | None = ...,
+        tracking: Global___Tracking | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug", "gripper", b"gripper", "support", b"support"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["debug", b"debug", "gripper", b"gripper", "support", b"support", "tracking", b"tracking"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "gripper", b"gripper", "model", b"model", "objects", b"objects", "seconds", b"seconds", "support", b"support", "up", b"up", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["counts", b"counts", "debug", b"debug", "grasps", b"grasps", "gripper", b"gripper", "model", b"model", "objects", b"objects", "seconds", b"seconds", "support", b"support", "tracking", b"tracking", "up", b"up", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___DetectGraspsResponse: _TypeAlias = DetectGraspsResponse  # noqa: Y015
+
+@_typing.final
+class Tracking(_message.Message):
+    """How an answer follows the one before, which options.previous tells."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    FIRST_FIELD_NUMBER: _builtins.int
+    NEXT_ID_FIELD_NUMBER: _builtins.int
+    first: _builtins.str
+    """What became of the first grasp: "started": there was none; "kept": it is the first again, moved
+    with its object; "replaced": another one is better by a margin; "lost": it is not there any more.
+    """
+    next_id: _builtins.int
+    """Above all ids of grasps and numbers of objects so far."""
+    def __init__(
+        self,
+        *,
+        first: _builtins.str = ...,
+        next_id: _builtins.int = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["first", b"first", "next_id", b"next_id"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Tracking: _TypeAlias = Tracking  # noqa: Y015
 
 @_typing.final
 class GripperOutline(_message.Message):
@@ -1924,6 +2099,7 @@ class DetectedObject(_message.Message):
     BEST_SCORE_FIELD_NUMBER: _builtins.int
     CONFIDENCE_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
+    SURFACE_FIELD_NUMBER: _builtins.int
     number: _builtins.int
     """As in Grasp.object; the segment, where segment_ids were sent."""
     points: _builtins.int
@@ -1950,6 +2126,12 @@ class DetectedObject(_message.Message):
     def quaternion(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """4 floats x, y, z, w: turns the box's axes into the cloud's (T_cloud_box)."""
 
+    @_builtins.property
+    def surface(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """K * 3 floats: points by which it is found again in the next cloud; empty (null in JSON) without
+        options.previous.
+        """
+
     def __init__(
         self,
         *,
@@ -1961,10 +2143,11 @@ class DetectedObject(_message.Message):
         best_score: _builtins.float | None = ...,
         confidence: _builtins.float | None = ...,
         reason: _builtins.str | None = ...,
+        surface: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "_reason", b"_reason", "best_score", b"best_score", "confidence", b"confidence", "reason", b"reason"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "_reason", b"_reason", "best_score", b"best_score", "center", b"center", "confidence", b"confidence", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion", "reason", b"reason"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_best_score", b"_best_score", "_confidence", b"_confidence", "_reason", b"_reason", "best_score", b"best_score", "center", b"center", "confidence", b"confidence", "half_extents", b"half_extents", "number", b"number", "points", b"points", "quaternion", b"quaternion", "reason", b"reason", "surface", b"surface"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__best_score: _TypeAlias = _typing.Literal["best_score"]  # noqa: Y015
     _WhichOneofArgType__best_score: _TypeAlias = _typing.Literal["_best_score", b"_best_score"]  # noqa: Y015
@@ -1998,6 +2181,7 @@ class Grasp(_message.Message):
     CLEARANCE_FIELD_NUMBER: _builtins.int
     OBJECT_FIELD_NUMBER: _builtins.int
     ARM_FIELD_NUMBER: _builtins.int
+    ID_FIELD_NUMBER: _builtins.int
     score: _builtins.float
     """Probability that the grasp holds, in [0, 1]."""
     width: _builtins.float
@@ -2008,6 +2192,10 @@ class Grasp(_message.Message):
     """Metres from the open hand at the grasp to the nearest surface; 0 or less: within it."""
     object: _builtins.int
     """Number of the object that the contact point is on; absent (null in JSON): of none."""
+    id: _builtins.int
+    """The same in every answer that follows this grasp; absent (null in JSON) without
+    options.previous.
+    """
     @_builtins.property
     def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """16 floats, 4 x 4 row-major. Hand frame: z out of the palm, y the closing direction."""
@@ -2048,13 +2236,19 @@ class Grasp(_message.Message):
         clearance: _builtins.float = ...,
         object: _builtins.int | None = ...,
         arm: Global___ArmPlan | None = ...,
+        id: _builtins.int | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_object", b"_object", "arm", b"arm", "object", b"object"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_id", b"_id", "_object", b"_object", "arm", b"arm", "id", b"id", "object", b"object"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "arm", b"arm", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_id", b"_id", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "arm", b"arm", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "id", b"id", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__id: _TypeAlias = _typing.Literal["id"]  # noqa: Y015
+    _WhichOneofArgType__id: _TypeAlias = _typing.Literal["_id", b"_id"]  # noqa: Y015
     _WhichOneofReturnType__object: _TypeAlias = _typing.Literal["object"]  # noqa: Y015
     _WhichOneofArgType__object: _TypeAlias = _typing.Literal["_object", b"_object"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__id) -> _WhichOneofReturnType__id | None: ...
+    @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__object) -> _WhichOneofReturnType__object | None: ...
 
 Global___Grasp: _TypeAlias = Grasp  # noqa: Y015

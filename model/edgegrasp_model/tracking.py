@@ -1,0 +1,305 @@
+"""Follow grasps from one answer to the next: `previous` in, ids and moved grasps out.
+
+Nothing is kept between requests. An answer gives some points on the surface of each object; sent
+back, they are registered with the next cloud, and the grasps on the object move as they do.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.hand_kernels import non_max_suppression
+from edgegrasp_model.options import (
+    MAX_SURFACE,
+    Collision,
+    DetectOptions,
+    Previous,
+    Suppression,
+    Workspace,
+)
+from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
+from edgegrasp_model.results import (
+    OBSTACLE,
+    DetectedObject,
+    Evaluation,
+    Following,
+    Grasp,
+    Tracking,
+)
+from edgegrasp_model.scene.grouping import FIXED
+from edgegrasp_model.scene.scene import Scene
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+MARGIN = 0.1  # of the score, by which another grasp has to be better
+ALIVE = 0.25  # score from which a followed grasp may stay the first
+SLACK = 0.004  # metres by which the hand of a followed grasp may overlap what is seen
+AROUND = 0.03  # metres around followed objects in which they are looked for
+FOREIGN = 0.5  # metres from the cloud beyond which `previous` is in another frame
+# Registration: in each step, points further from the cloud than this are left out, metres.
+STEPS = (*(0.03,) * 6, *(0.015,) * 5, *(0.008,) * 5)
+SPACING = 0.004  # metres along the surface to the nearest point within which it goes on there
+TANGENT = 0.3  # weight of distances beyond that, beside 1 of those across the surface
+STIFF = 0.3  # points' worth of not moving: where the shape does not say, it stays
+FEWEST = 6  # points that say how an object moved
+FOUND, GOOD = 0.5, 0.75  # share of an object's points that lie on the cloud: it is there; well seen
+ON_OBJECT = 0.012  # metres from an object's points to what belongs to it
+
+
+@dataclass(frozen=True)
+class Followed:
+    """The objects of `previous` that a scene shows again, by their numbers."""
+
+    moved: dict[int, Float64]  # (4, 4) T_now_before of each, cloud frame
+    surface: dict[int, Float32]  # (K, 3) its points as they lie now; taken anew where few fit
+    named: dict[int, int]  # numbers in the scene: numbers in the answer
+    next_id: int
+
+
+def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
+    """The options with which the scene is built: around what is followed where no search is asked.
+
+    Args:
+        options: Of the request, with `previous`.
+        gripper: Name of the hand.
+        points: (N, 3) the cloud.
+
+    Raises:
+        InvalidRequest: `previous` is of another gripper, or in another frame.
+    """
+    previous = options.previous
+    assert previous is not None
+    if previous.gripper not in ("", gripper) or (previous.grasps and not previous.gripper):
+        fix = f"Send what was found for {gripper!r}, or leave previous out."
+        raise InvalidRequest("options.previous.gripper", repr(previous.gripper), fix)
+    places = [np.reshape(grasp.T_cloud_hand, (4, 4))[:3, 3] for grasp in previous.grasps]
+    places += [place for one in previous.objects for place in np.reshape(one.surface, (-1, 3))]
+    if not places:
+        return options
+    some = points[:: max(len(points) // 2000, 1)]
+    away, _ = cKDTree(some).query(places)
+    if away.min() > FOREIGN:
+        value = f"grasps {away.min():.2g} m from the nearest point of the cloud"
+        fix = "Send previous in the frame of this cloud, or leave it out."
+        raise InvalidRequest("options.previous", value, fix)
+    if previous.search:
+        return options
+    low, high = np.min(places, axis=0) - AROUND, np.max(places, axis=0) + AROUND
+    if options.workspace is not None:
+        inside = np.maximum(low, options.workspace.min), np.minimum(high, options.workspace.max)
+        low, high = inside if (inside[0] < inside[1]).all() else (low, high)
+    box = Workspace(min=tuple(low.tolist()), max=tuple(high.tolist()))
+    unused = dict.fromkeys(("at", "near", "approach_region", "contact_region"))
+    return options.model_copy(update={**unused, "workspace": box, "objects": "off"})
+
+
+def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Followed]:
+    """Find the objects of an earlier answer, and give what is seen of them their numbers.
+
+    Args:
+        scene: Its objects are numbered as they were found; or all that is seen is one of them,
+            where no search is asked for.
+        previous: The earlier answer.
+        given: Whether the caller numbered the objects.
+    """
+    points, number = scene.points_in_cloud, scene.object_of_point
+    seen = np.flatnonzero(number >= 0)
+    cloud = Surface(
+        points[seen],
+        scene.frame.directions_in_cloud(scene.cloud.normals[seen]),
+        cKDTree(points[seen]),
+    )
+    moved: dict[int, Float64] = {}
+    surface: dict[int, Float32] = {}
+    named = {int(one): int(one) for one in np.unique(number[seen])} if given else {}
+    renamed = number.copy() if given else np.full_like(number, FIXED)
+    for one in previous.objects:
+        before = np.reshape(one.surface, (-1, 3)).astype(np.float64)
+        T, share = registered(before, cloud)
+        if share < FOUND:
+            continue
+        now = before @ T[:3, :3].T + T[:3, 3]
+        near = seen[cloud.near(now)]
+        moved[one.number], surface[one.number] = T, now.astype(np.float32)
+        if not given:
+            which = int(np.bincount(number[near]).argmax())
+            renamed[number == which if previous.search else near] = one.number
+            named[which] = one.number
+        if share < GOOD:
+            surface[one.number] = sampled(points[renamed == one.number])
+    next_id = max([previous.next_id, *(1 + one for one in [*moved, *named.values()])])
+    for which in np.unique(number[seen]) if previous.search else ():
+        if which not in named:
+            named[int(which)], next_id = next_id, next_id + 1
+            renamed[number == which] = named[which]
+        if (mine := named[which]) not in surface:
+            surface[mine] = sampled(points[renamed == mine])
+    confidence = {named[old]: value for old, value in scene.confidence.items() if old in named}
+    if not previous.search:
+        known = [(one.number, one.confidence) for one in previous.objects]
+        confidence = {which: value for which, value in known if value is not None}
+    scene = replace(scene, object_of_point=renamed, confidence=confidence)
+    return scene, Followed(moved, surface, named, next_id)
+
+
+def merged(
+    found: list[Grasp],
+    followed: Followed,
+    options: DetectOptions,
+    up: Float64,
+    score: Callable[[Float32, Collision], list[Evaluation]],
+) -> tuple[list[Grasp], Tracking]:
+    """The grasps of an earlier answer where they are now, and others; the same one first.
+
+    Args:
+        found: Grasps of this cloud alone, best first.
+        followed: How the objects have moved.
+        options: Of the request, with `previous`.
+        up: (3,) unit, cloud frame.
+        score: Evaluates poses (M, 4, 4) T_cloud_hand.
+    """
+    previous = options.previous
+    assert previous is not None
+    old = [one for one in previous.grasps if one.object is None or one.object in followed.moved]
+    kept: list[Grasp] = []
+    if old:
+        before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
+        move = [np.eye(4) if one.object is None else followed.moved[one.object] for one in old]
+        rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
+        there = zip(old, score((move @ before).astype(np.float32), rule), strict=True)
+        kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
+    if options.collision.mode == "avoid":
+        kept = [grasp for grasp in kept if grasp.collision_free]
+    new = [replace(grasp, id=followed.next_id + row) for row, grasp in enumerate(found)]
+    grasps = [grasp for grasp in [*kept, *new] if grasp.score >= options.min_score]
+    order = _order(grasps, options, up, len(kept))[: options.top_k]
+    tracking = Tracking(Following.STARTED, followed.next_id + len(new))
+    if not previous.grasps:
+        return [grasps[row] for row in order], tracking
+    first, became = previous.grasps[0].id, Following.LOST
+    held = next((row for row in order if grasps[row].id == first), None)
+    if held is not None and _worth(grasps[held]) >= ALIVE:
+        better = _worth(grasps[order[0]]) > _worth(grasps[held]) + MARGIN
+        became = Following.REPLACED if better else Following.KEPT
+        order = order if better else [held, *(row for row in order if row != held)]
+    return [grasps[row] for row in order], replace(tracking, first=became)
+
+
+def untracked(previous: Previous | None) -> Tracking | None:
+    """What is said of `previous` where nothing is seen."""
+    if previous is None:
+        return None
+    became = Following.LOST if previous.grasps else Following.STARTED
+    return Tracking(became, previous.next_id)
+
+
+def _order(grasps: list[Grasp], options: DetectOptions, up: Float64, kept: int) -> list[int]:
+    """Rows of grasps, best first, without those near one of the first `kept` or a better one."""
+    if not grasps:
+        return []
+    rule = options.suppression or Suppression()
+    T_cloud_tcp = np.stack([grasp.T_cloud_tcp for grasp in grasps])
+    rows = np.arange(len(grasps), dtype=np.int64)
+    rows, _ = non_max_suppression(T_cloud_tcp, rows, rule.translation, rule.rotation, len(rows))
+    score = np.array([grasps[row].score for row in rows])
+    free = np.array([grasps[row].collision_free for row in rows])
+    clearance = np.array([grasps[row].clearance for row in rows])
+    order = ranked(score, free, options.order, T_cloud_tcp[rows, :3, 3] @ up, clearance)
+    if options.order == "score":
+        number = np.array(
+            [-1 if grasps[row].object is None else grasps[row].object for row in rows]
+        )
+        order = objects_first(order, score, number)
+    return [int(row) for row in rows[order]]
+
+
+def _worth(grasp: Grasp) -> float:
+    return grasp.score if grasp.collision_free else COLLIDING * grasp.score
+
+
+class Surface(NamedTuple):
+    """V points that are seen, cloud frame."""
+
+    points: Float32  # (V, 3)
+    normals: Float32  # (V, 3) unit
+    tree: cKDTree
+
+    def near(self, places: Float64) -> Int64:
+        """The points within ON_OBJECT of any of some places (K, 3)."""
+        rows = self.tree.query_ball_point(places, ON_OBJECT)
+        return np.unique(np.concatenate([np.asarray(one, dtype=np.int64) for one in rows]))
+
+
+def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
+    """How an object has moved: (4, 4) T_now_before; and the share of its points found there.
+
+    Iterated closest points, mostly across the surface; distances along it count only where an
+    object ends. Small motions between two images need no other start than where it was.
+
+    Args:
+        before: (K, 3) points on its surface.
+        cloud: What is seen now.
+    """
+    T = np.eye(4)
+    if len(before) < FEWEST or len(cloud.points) < FEWEST:
+        return T, 0.0
+    spread = float(np.square(before - before.mean(axis=0)).sum(axis=1).mean())
+    stiff = STIFF * np.diag([spread] * 3 + [1.0] * 3)
+    for reach in STEPS:
+        now = before @ T[:3, :3].T + T[:3, 3]
+        apart, row = cloud.tree.query(now, distance_upper_bound=reach)
+        hit = np.isfinite(apart)
+        if hit.sum() < FEWEST:
+            return T, 0.0
+        off, normal = cloud.points[row[hit]] - now[hit], cloud.normals[row[hit]].astype(np.float64)
+        middle = now.mean(axis=0)
+        across = np.einsum("kd,kd->k", off, normal)
+        along = off - across[:, None] * normal
+        length = np.linalg.norm(along, axis=1)
+        along *= (np.maximum(length - SPACING, 0.0) / np.maximum(length, 1e-9))[:, None]
+        arm = now[hit] - middle
+        rows = np.hstack([np.cross(arm, normal), normal])  # (K, 6) turn, shift
+        ends = length > SPACING
+        sides = [
+            np.hstack([np.cross(arm[ends], axis), np.tile(axis, (ends.sum(), 1))])
+            for axis in np.eye(3)
+        ]
+        system, target = rows.T @ rows + stiff, rows.T @ across
+        for axis, side in enumerate(sides):
+            system += TANGENT * side.T @ side
+            target += TANGENT * side.T @ along[ends, axis]
+        step = np.linalg.solve(system, target)
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        move = np.eye(4)
+        move[:3, :3], move[:3, 3] = turn, middle + step[3:] - turn @ middle
+        T = move @ T
+    now = before @ T[:3, :3].T + T[:3, 3]
+    apart, _ = cloud.tree.query(now, distance_upper_bound=STEPS[-1])
+    return T, float(np.isfinite(apart).mean())
+
+
+def sampled(points: Float32) -> Float32:
+    """Up to MAX_SURFACE of points (N, 3), evenly spread in their order."""
+    rows = np.linspace(0, len(points) - 1, min(MAX_SURFACE, len(points))).astype(np.int64)
+    return points[rows]
+
+
+def with_surfaces(objects: list[DetectedObject], followed: Followed) -> list[DetectedObject]:
+    """The objects, with the points by which they are found again."""
+    return [replace(one, surface=followed.surface.get(one.number)) for one in objects]
+
+
+def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
+    """Labels (R,) of rows, with the numbers of objects in the answer; what has none: OBSTACLE."""
+    table = np.full(labels.max(initial=0) + 1, OBSTACLE)
+    for before, now in named.items():
+        table[before] = now
+    return np.where(labels >= 0, table[np.maximum(labels, 0)], labels)
