@@ -90,7 +90,9 @@ class DetectFlags(BaseModel):
     device: str = Field("cpu", description="auto, cpu, cuda or cuda:N, without a server")
 
 
-@takes_flags(flags=model_flags(DetectFlags), connection=CONNECTION, options=option_flags("robot", "previous"))
+@takes_flags(
+    flags=model_flags(DetectFlags), connection=CONNECTION, options=option_flags("robot", "previous")
+)
 def detect(
     file: Cloud = None,
     as_document: Annotated[bool, Option("--json", help="Print JSON, as the HTTP API.")] = False,

@@ -49,6 +49,7 @@ from edgegrasp_client.requests import StreamRequest as StreamRequest
 from edgegrasp_client.requests import object_in_scene as object_in_scene
 from edgegrasp_client.requests import on_mask as on_mask
 from edgegrasp_client.results import DebugInfo as DebugInfo
+from edgegrasp_client.results import DetectedObject as DetectedObject
 from edgegrasp_client.results import Detection as Detection
 from edgegrasp_client.results import Evaluation as Evaluation
 from edgegrasp_client.results import Grasp as Grasp
@@ -56,3 +57,5 @@ from edgegrasp_client.results import GripperOutline as GripperOutline
 from edgegrasp_client.results import Model as Model
 from edgegrasp_client.results import Scoring as Scoring
 from edgegrasp_client.results import StreamAnswer as StreamAnswer
+from edgegrasp_client.results import Tracking as Tracking
+from edgegrasp_client.tracker import GraspTracker as GraspTracker

@@ -218,9 +218,7 @@ _STAGES = (
 )
 
 
-Record = TypeVar(
-    "Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp, Tracking
-)
+Record = TypeVar("Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp, Tracking)
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 

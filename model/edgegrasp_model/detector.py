@@ -54,7 +54,15 @@ from edgegrasp_model.scene.scene import (
     object_probability,
     select_points,
 )
-from edgegrasp_model.tracking import Followed, follow, merged, narrowed, relabelled, untracked, with_surfaces
+from edgegrasp_model.tracking import (
+    Followed,
+    follow,
+    merged,
+    narrowed,
+    relabelled,
+    untracked,
+    with_surfaces,
+)
 
 Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]

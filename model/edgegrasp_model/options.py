@@ -61,7 +61,7 @@ Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
-MAX_PREVIOUS, MAX_SURFACE = 64, 64  # grasps or objects of an earlier answer; points of an object
+MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an earlier answer; points of an object
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 

@@ -32,7 +32,7 @@ from edgegrasp_model.results import (
     Grasp,
     Tracking,
 )
-from edgegrasp_model.scene.grouping import FIXED
+from edgegrasp_model.scene.grouping import UNKNOWN
 from edgegrasp_model.scene.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -41,14 +41,15 @@ Int64 = NDArray[np.int64]
 
 MARGIN = 0.1  # of the score, by which another grasp has to be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first
-SLACK = 0.004  # metres by which the hand of a followed grasp may overlap what is seen
+SLACK = 0.006  # metres by which the hand of a followed grasp may overlap what is seen
 AROUND = 0.03  # metres around followed objects in which they are looked for
 FOREIGN = 0.5  # metres from the cloud beyond which `previous` is in another frame
 # Registration: in each step, points further from the cloud than this are left out, metres.
-STEPS = (*(0.03,) * 6, *(0.015,) * 5, *(0.008,) * 5)
+STEPS = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
 SPACING = 0.004  # metres along the surface to the nearest point within which it goes on there
 TANGENT = 0.3  # weight of distances beyond that, beside 1 of those across the surface
-STIFF = 0.3  # points' worth of not moving: where the shape does not say, it stays
+# Points' worth of not turning and not shifting: where the shape does not say, it stays.
+STIFF = (2.0,) * 3 + (0.3,) * 3
 FEWEST = 6  # points that say how an object moved
 FOUND, GOOD = 0.5, 0.75  # share of an object's points that lie on the cloud: it is there; well seen
 ON_OBJECT = 0.012  # metres from an object's points to what belongs to it
@@ -120,7 +121,7 @@ def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Follow
     moved: dict[int, Float64] = {}
     surface: dict[int, Float32] = {}
     named = {int(one): int(one) for one in np.unique(number[seen])} if given else {}
-    renamed = number.copy() if given else np.full_like(number, FIXED)
+    renamed = number.copy() if given or previous.search else np.full_like(number, UNKNOWN)
     for one in previous.objects:
         before = np.reshape(one.surface, (-1, 3)).astype(np.float64)
         T, share = registered(before, cloud)
@@ -252,7 +253,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     if len(before) < FEWEST or len(cloud.points) < FEWEST:
         return T, 0.0
     spread = float(np.square(before - before.mean(axis=0)).sum(axis=1).mean())
-    stiff = STIFF * np.diag([spread] * 3 + [1.0] * 3)
+    stiff, total = np.diag(np.multiply(STIFF, [spread] * 3 + [1.0] * 3)), np.zeros(6)
     for reach in STEPS:
         now = before @ T[:3, :3].T + T[:3, 3]
         apart, row = cloud.tree.query(now, distance_upper_bound=reach)
@@ -266,19 +267,16 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
         length = np.linalg.norm(along, axis=1)
         along *= (np.maximum(length - SPACING, 0.0) / np.maximum(length, 1e-9))[:, None]
         arm = now[hit] - middle
-        rows = np.hstack([np.cross(arm, normal), normal])  # (K, 6) turn, shift
-        ends = length > SPACING
-        sides = [
-            np.hstack([np.cross(arm[ends], axis), np.tile(axis, (ends.sum(), 1))])
-            for axis in np.eye(3)
-        ]
-        system, target = rows.T @ rows + stiff, rows.T @ across
-        for axis, side in enumerate(sides):
-            system += TANGENT * side.T @ side
-            target += TANGENT * side.T @ along[ends, axis]
+        moves = np.zeros((len(arm), 3, 6))  # of each point, by a turn and a shift
+        moves[:, (1, 2, 0), (2, 0, 1)], moves[:, (2, 0, 1), (1, 2, 0)] = arm, -arm
+        moves[:, :, 3:] = np.eye(3)
+        rows, ends = np.einsum("kd,kdm->km", normal, moves), length > SPACING
+        sides = moves[ends].reshape(-1, 6)
+        system = rows.T @ rows + TANGENT * sides.T @ sides + stiff
+        target = rows.T @ across + TANGENT * sides.T @ along[ends].ravel() - stiff @ total
         step = np.linalg.solve(system, target)
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        move = np.eye(4)
+        total += step
+        turn, move = Rotation.from_rotvec(step[:3]).as_matrix(), np.eye(4)
         move[:3, :3], move[:3, 3] = turn, middle + step[3:] - turn @ middle
         T = move @ T
     now = before @ T[:3, :3].T + T[:3, 3]

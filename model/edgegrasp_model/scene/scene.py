@@ -68,6 +68,7 @@ SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may 
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
 SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around an object in which a hand at it may meet something
+FOLLOWED_REACH = 0.16  # the same where only grasps that are known are looked at
 PLAN_CELL = 0.05  # metres
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 CLOSE = 0.06  # metres within which no camera measures
@@ -124,7 +125,7 @@ def select_points(
     counts["points"] = len(sent.points)
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    sent = near_workspace(sent, options.workspace, REACH)
+    sent = near_workspace(sent, options.workspace, FOLLOWED_REACH if follows(options) else REACH)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
@@ -205,6 +206,11 @@ def _recognised(
             number = with_clusters(number, plan)
             confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
     return number, confidence
+
+
+def follows(options: DetectOptions) -> bool:
+    """Whether only grasps of an earlier answer are asked for."""
+    return options.previous is not None and not options.previous.search
 
 
 def _known_up(options: DetectOptions) -> Float64 | None:
@@ -379,6 +385,8 @@ def choose_support(
     if isinstance(request, SupportPlane):
         # A bin's floor is not measured by the table around it.
         around = BELOW_WORKSPACE * np.abs(request.normal)
+        if follows(options):
+            around = np.full(3, REACH)  # the workspace is a followed object's
         over = inside_workspace(seen.points, options.workspace, around)
         found = measured(Seen(seen.points[over], seen.viewpoint), request)
     else:
@@ -513,8 +521,9 @@ def inside_workspace(
     """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
     if box is None:
         return np.ones(len(points), dtype=bool)
-    inside = (points >= np.asarray(box.min) - around) & (points <= np.asarray(box.max) + around)
-    return np.asarray(inside.all(axis=1))
+    low, high = (np.float32(box.min) - around, np.float32(box.max) + around)
+    x, y, z = ((axis >= a) & (axis <= b) for axis, a, b in zip(points.T, low, high, strict=True))
+    return np.asarray(x & y & z)
 
 
 def near_workspace(sent: CheckedCloud, box: Workspace | None, around: float) -> CheckedCloud:

@@ -113,6 +113,14 @@ GRIPPER = {
     "finger": {"boxes": [[[-0.01, 0.0, 0.05], [0.01, 0.01, 0.1]]]},
 }
 
+POSE = np.eye(4).ravel().tolist()
+HELD = {"id": 7, "T_cloud_hand": POSE}
+
+
+def previous(**fields: Any) -> dict[str, Any]:
+    return {"gripper": "panda", "grasps": [HELD], **fields}
+
+
 CASES = {
     # The cloud.
     "no cloud": Malformed("", "nothing", "Se"),
@@ -182,6 +190,22 @@ CASES = {
     "gripper without fingertips": option(
         "gripper", {name: GRIPPER[name] for name in GRIPPER if name != "tip_z"}, ".tip_z",
         "nothing", "required",
+    ),
+    # What an earlier answer found.
+    "grasps of two with one id": option(
+        "previous", previous(grasps=[HELD, HELD]), "", "{", "7 is the id of two of them"
+    ),
+    "10,000 previous grasps": option(
+        "previous", previous(grasps=[{**HELD, "id": n} for n in range(10_000)]), ".grasps", "",
+        "at most 64",
+    ),
+    "previous pose that is not rigid": option(
+        "previous", previous(grasps=[{**HELD, "T_cloud_hand": [2.0, *POSE[1:]]}]),
+        ".grasps.0.T_cloud_hand", "2.0", "a rotation and a translation",
+    ),
+    "surface of two numbers": option(
+        "previous", previous(objects=[{"number": 0, "surface": [0.1, 0.2]}]), ".objects.0.surface",
+        "0.2", "three numbers for each point",
     ),
     # Numbers beyond every measure, and what is no number.
     "up beyond measure": option("up", [1e200, 0.0, 1e200], ".0", "1e+200", "10000000"),

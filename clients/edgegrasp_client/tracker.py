@@ -1,0 +1,155 @@
+"""Follow grasps through the images of a camera."""
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from typing import Any, cast
+
+from typing_extensions import Unpack
+
+from edgegrasp_client.client import GraspClient
+from edgegrasp_client.options import DetectOptions, Previous
+from edgegrasp_client.requests import StreamRequest
+from edgegrasp_client.results import DetectedObject, Detection
+
+FOLLOWED = 4  # grasps on one object, of which the first is the one to keep
+MOST = 64  # objects that a request may name
+DROP = 0.7  # share of a grasp's score when it was found, below which others are looked for
+
+
+class GraspTracker:
+    """Sends with each image what the last answer said, so that the answer follows it.
+
+    Most answers only move the grasps along with their object, in a fraction of the time; now and
+    then, and where the score drops or the grasp is lost, others are looked for too.
+
+    Args:
+        search_every: Images after which others are looked for.
+        **options: As of `GraspClient.detect`; `previous` and `seed` are the tracker's.
+    """
+
+    def __init__(self, search_every: int = 30, **options: Unpack[DetectOptions]) -> None:
+        self._options: dict[str, Any] = dict(options)
+        self._every = search_every
+        self._last: Detection | None = None  # with a grasp
+        self._objects: dict[int, DetectedObject] = {}
+        self._next_id = 0
+        self._since = 0  # images since others were looked for
+        self._score = 0.0  # of the first grasp then
+        self._searching = True  # in the request that is to be answered
+
+    def follow(
+        self,
+        client: GraspClient,
+        images: Iterable[Mapping[str, Any]],
+        *,
+        timeout: float | None = None,
+    ) -> Iterator[tuple[Mapping[str, Any], Detection]]:
+        """Find grasps in one image after the other, over one stream.
+
+        Of the images that come while one is at work, only the latest is sent.
+
+        Args:
+            client: Over gRPC or REST.
+            images: For each what `GraspClient.detect` gets, such as {"depth_images": [image]}.
+            timeout: Seconds for each request; None: the client's own.
+
+        Yields:
+            An image and its answer. Raises GraspClientError, and whatever `images` raises.
+        """
+        latest: queue.Queue[Any] = queue.Queue(1)
+        asked, stopped = threading.Semaphore(1), threading.Event()
+        at_work: list[Mapping[str, Any]] = []
+
+        def requests() -> Iterator[StreamRequest]:
+            while True:
+                asked.acquire()
+                image = latest.get()
+                if isinstance(image, Exception):
+                    raise image
+                if image is None or stopped.is_set():
+                    return
+                at_work.append(image)
+                yield StreamRequest(**{**image, **self.options()})
+
+        threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
+        answers = client.detect_stream(requests(), timeout=timeout)
+        try:
+            for answer in answers:
+                detection = answer.result()
+                self.take(detection)
+                yield at_work.pop(), detection
+                asked.release()  # only now: an image taken earlier would be old
+        finally:
+            stopped.set()
+            asked.release()
+            _put(latest, None)
+
+    def options(self) -> DetectOptions:
+        """The options of the next request."""
+        last, options = self._last, dict(self._options)
+        self._searching = last is None or self._since >= self._every
+        previous: dict[str, Any] = {"next_id": self._next_id, "search": self._searching}
+        if last is not None:
+            object_ = last.grasps[0].object
+            grasps = [grasp for grasp in last.grasps if grasp.object == object_][:FOLLOWED]
+            previous["gripper"] = last.gripper.name
+            previous["grasps"] = [
+                {"id": one.id, "T_cloud_hand": one.T_cloud_hand.ravel(), "object": one.object}
+                for one in grasps
+            ]
+            previous["objects"] = [
+                {"number": one.number, "surface": one.surface, "confidence": one.confidence}
+                for one in self._objects.values()
+                if self._searching or one.number == object_
+            ][:MOST]
+            if not self._searching:
+                plane = last.support and {
+                    "normal": last.support.normal.tolist(),
+                    "offset": last.support.offset,
+                }
+                options |= {"support": options.get("support", plane), "up": last.up}
+            if options.keys() & {"at", "near"} and object_ in self._objects:
+                options |= {"at": None, "near": self._objects[object_].center}
+        return cast("DetectOptions", options | {"previous": cast("Previous", previous)})
+
+    def take(self, detection: Detection) -> None:
+        """Remember an answer to a request with `options()`."""
+        tracking = detection.tracking
+        assert tracking is not None
+        self._next_id = tracking.next_id
+        self._since += 1
+        if not self._searching and (tracking.first == "lost" or not detection.grasps):
+            self._since = self._every  # perhaps a bad image: look once more for the same grasp
+            return
+        if self._searching:
+            self._objects, self._since = {}, 1
+            self._last = None
+        self._objects |= {one.number: one for one in detection.objects if one.surface is not None}
+        if detection.grasps:
+            self._last, score = detection, detection.grasps[0].score
+            self._score = score if self._searching else self._score
+            if score < DROP * self._score:
+                self._since = self._every
+
+
+def _read(images: Iterable[Any], latest: "queue.Queue[Any]", stopped: threading.Event) -> None:
+    """Keep the latest image in a queue of one; then None, or the error that there was."""
+    end = None
+    try:
+        for image in images:
+            if stopped.is_set():
+                return
+            _put(latest, image)
+    except Exception as error:
+        end = error
+    latest.put(end)  # once the last image is taken
+
+
+def _put(latest: "queue.Queue[Any]", image: Any) -> None:
+    """Put an image in the place of one that is there."""
+    with suppress(queue.Empty):
+        latest.get_nowait()
+    with suppress(queue.Full):
+        latest.put_nowait(image)

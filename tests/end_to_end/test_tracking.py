@@ -1,0 +1,80 @@
+"""Grasps are followed through a stream of images, over both transports."""
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edgegrasp_client import GraspClient, GraspTracker, InvalidRequestError
+
+IMAGES = 6
+STEP = 0.003  # metres along y from one image to the next
+
+
+def image(number: int) -> dict[str, Any]:
+    """A box on a table, further along in each image."""
+    rng = np.random.default_rng(number)
+    surface = rng.uniform(-1.0, 1.0, (5000, 3))
+    axis = rng.integers(0, 3, 5000)
+    surface[axis == 0, 0] = 1.0  # the side toward the camera
+    surface[axis == 1, 1] = np.where(rng.random(np.sum(axis == 1)) < 0.5, -1.0, 1.0)
+    surface[axis == 2, 2] = 1.0
+    box = surface * (0.03, 0.02, 0.04) + (0.0, STEP * number, 0.04)
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (20000, 2)), np.zeros(20000)])
+    hidden = np.abs(table[:, :2] - (-0.03, STEP * number)) < (0.06, 0.025)
+    points = np.concatenate([box, table[~hidden.all(axis=1)]])
+    noisy = points + rng.normal(0.0, 0.0004, points.shape)
+    return {"cloud": noisy.astype(np.float32), "view_ids": np.zeros(len(points), np.int32)}
+
+
+@pytest.fixture(scope="module")
+def server(start_server) -> Iterator[Any]:
+    with start_server() as running:
+        yield running
+
+
+@pytest.mark.parametrize("transport", ["grpc_address", "http_url"])
+def test_a_grasp_keeps_its_id_and_moves_with_its_object(server, transport: str) -> None:
+    tracker = GraspTracker(search_every=3, viewpoint=(0.35, 0.0, 0.55), max_object_size=0.3)
+    wanted = threading.Semaphore(1)
+
+    def camera() -> Iterator[dict[str, Any]]:
+        for number in range(IMAGES):
+            wanted.acquire()
+            yield image(number)
+
+    with GraspClient(getattr(server, transport)) as client:
+        found = []
+        for _, detection in tracker.follow(client, camera()):
+            found.append(detection)
+            wanted.release()
+    best = [detection.grasps[0] for detection in found]
+    assert [one.tracking.first for one in found] == ["started"] + ["kept"] * (IMAGES - 1)
+    assert len({(grasp.id, grasp.object) for grasp in best}) == 1
+    moved = [grasp.T_cloud_hand[:3, 3] - best[0].T_cloud_hand[:3, 3] for grasp in best]
+    np.testing.assert_allclose(moved, [(0, STEP * n, 0) for n in range(IMAGES)], atol=0.003)
+    assert all(len({grasp.id for grasp in one.grasps}) == len(one.grasps) for one in found)
+    # Only every third image is searched for other grasps.
+    assert ["scored" in one.counts for one in found] == [n % 3 == 0 for n in range(IMAGES)]
+
+
+def test_a_grasp_of_an_object_that_is_gone_is_lost_and_another_takes_its_place(server) -> None:
+    with GraspClient(server.http_url) as client:
+        first = client.detect(**image(0), viewpoint=(0.35, 0.0, 0.55), previous={})
+        (box,), best = first.objects, first.grasps[0]
+        previous = {
+            "gripper": first.gripper.name,
+            "next_id": first.tracking.next_id,
+            "grasps": [{"id": best.id, "T_cloud_hand": best.T_cloud_hand.ravel(), "object": 0}],
+            "objects": [{"number": box.number, "surface": box.surface}],
+        }
+        far = image(60)
+        again = client.detect(**far, viewpoint=(0.35, 0.0, 0.55), previous=previous)
+        assert again.tracking.first == "lost"
+        assert again.grasps[0].id >= first.tracking.next_id
+        assert again.objects[0].number >= first.tracking.next_id
+        previous["gripper"] = "wsg-50"
+        with pytest.raises(InvalidRequestError, match=r"options.previous.gripper: got 'wsg-50'"):
+            client.detect(**far, previous=previous)

@@ -1,0 +1,95 @@
+"""Previous grasps: found again where their object is, first unless another is clearly better."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.results import Evaluation, Grasp
+from edgegrasp_model.tracking import Followed, Surface, merged, narrowed, registered, sampled
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def box_corner(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of three sides of a box of 6 x 4 x 8 cm, as voxels sample them."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.0, 1.0, (1500, 3))
+    axis = rng.integers(0, 3, 1500)
+    points[np.arange(1500), axis] = 1.0
+    noise = rng.normal(0.0, 0.0005, points.shape)
+    return points * (0.03, 0.02, 0.04) + noise, np.eye(3)[axis]
+
+
+@pytest.mark.parametrize("millimetres", [(0, 0, 0), (5, -3, 0), (20, 0, 0)])
+@pytest.mark.parametrize("degrees", [0.0, 20.0])
+def test_an_object_is_found_where_it_was_moved_to(millimetres: Any, degrees: float) -> None:
+    before, _ = box_corner(0)
+    points, normals = box_corner(1)
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    shift = np.array(millimetres) / 1000
+    points, normals = points @ turn.T + shift, normals @ turn.T
+    surface = Surface(points.astype(np.float32), normals.astype(np.float32), cKDTree(points))
+    T, share = registered(sampled(before), surface)
+    assert share > 0.9
+    apart = np.linalg.norm(before @ T[:3, :3].T + T[:3, 3] - (before @ turn.T + shift), axis=1)
+    assert apart.max() < 0.003
+
+
+def test_an_object_that_is_gone_is_not_found() -> None:
+    before, _ = box_corner(0)
+    points, normals = box_corner(1)
+    surface = Surface(points + 1.0, normals, cKDTree(points + 1.0))
+    assert registered(before, surface)[1] == 0.0
+
+
+def grasp(score: float, x: float, free: bool = True) -> Grasp:
+    pose = np.eye(4, dtype=np.float32)
+    pose[0, 3] = x
+    return Grasp(score, pose, pose, 0.08, pose[:3, 3], pose[:3, 3], pose[:3, 2], free, 0.01, 0)
+
+
+def answer(found: list[Grasp], now: Grasp | None, **options: Any) -> tuple[list[Grasp], Any]:
+    """What becomes of a grasp with the id 7, which is `now`, beside those found anew."""
+    pose = np.eye(4).ravel().tolist()
+    previous = {"gripper": "panda", "grasps": [{"id": 7, "T_cloud_hand": pose, "object": 0}]}
+    asked = parse_options({"previous": previous, **options})
+    moved = {} if now is None else {0: np.eye(4)}
+    return merged(found, Followed(moved, {}, {}, 8), asked, UP, lambda *_: [Evaluation(now, None)])
+
+
+def test_a_grasp_stays_first_unless_another_is_better_by_a_margin() -> None:
+    grasps, tracking = answer([grasp(0.88, 0.2)], grasp(0.8, 0.0))
+    assert ([one.id for one in grasps], tracking.first) == ([7, 8], "kept")
+    assert tracking.next_id == 9
+    grasps, tracking = answer([grasp(0.95, 0.2)], grasp(0.8, 0.0))
+    assert ([one.id for one in grasps], tracking.first) == ([8, 7], "replaced")
+
+
+def test_what_is_found_at_the_place_of_a_followed_grasp_is_that_grasp() -> None:
+    grasps, tracking = answer([grasp(0.95, 0.001)], grasp(0.5, 0.0))
+    assert ([one.id for one in grasps], tracking.first) == ([7], "kept")
+
+
+@pytest.mark.parametrize("now", [None, grasp(0.1, 0.0), grasp(0.9, 0.0, free=False)])
+def test_a_grasp_that_is_gone_fails_or_collides_is_lost(now: Grasp | None) -> None:
+    grasps, tracking = answer([grasp(0.6, 0.2)], now)
+    assert (grasps[0].id, tracking.first) == (8, "lost")
+
+
+@pytest.mark.parametrize(
+    ("gripper", "x", "error"),
+    [
+        ("wsg-50", 0.0, r"options.previous.gripper: got 'wsg-50'. Send what was found for 'panda'"),
+        ("panda", 7.0, r"options.previous: got grasps 7 m from .* in the frame of this cloud"),
+    ],
+)
+def test_previous_of_another_hand_or_frame_is_refused(gripper: str, x: float, error: str) -> None:
+    pose = [1, 0, 0, x, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    previous = {"gripper": gripper, "grasps": [{"id": 7, "T_cloud_hand": pose}]}
+    with pytest.raises(InvalidRequest, match=error):
+        narrowed(parse_options({"previous": previous}), "panda", np.zeros((9, 3), np.float32))
