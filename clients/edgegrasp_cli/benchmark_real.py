@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from edgegrasp_model.gripper import Gripper
 
 Option = typer.Option
-DECIDED = ("viewpoint", "debug", "robot", "previous")  # options that the scene decides, or this command
+# Options that the scene decides, or this command.
+DECIDED = ("viewpoint", "debug", "robot", "previous")
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
 ON_SUPPORT, BACKGROUND, NO_READING = (92, 112, 140), (48, 48, 52), (0, 0, 0)  # colours
