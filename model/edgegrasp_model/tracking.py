@@ -86,9 +86,10 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
     if not places:
         return options
     some = points[:: max(len(points) // 2000, 1)]
-    away, _ = cKDTree(some).query(places)
-    if away.min() > FOREIGN:
-        value = f"grasps {away.min():.2g} m from the nearest point of the cloud"
+    apart, _ = cKDTree(some).query(np.array(places))
+    away = float(np.min(apart))
+    if away > FOREIGN:
+        value = f"grasps {away:.2g} m from the nearest point of the cloud"
         fix = "Send previous in the frame of this cloud, or leave it out."
         raise InvalidRequest("options.previous", value, fix)
     if previous.search:
@@ -257,7 +258,7 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
     for reach in STEPS:
         now = before @ T[:3, :3].T + T[:3, 3]
         apart, row = cloud.tree.query(now, distance_upper_bound=reach)
-        hit = np.isfinite(apart)
+        row, hit = np.asarray(row), np.isfinite(apart)
         if hit.sum() < FEWEST:
             return T, 0.0
         off, normal = cloud.points[row[hit]] - now[hit], cloud.normals[row[hit]].astype(np.float64)

@@ -521,7 +521,7 @@ def inside_workspace(
     """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
     if box is None:
         return np.ones(len(points), dtype=bool)
-    low, high = (np.float32(box.min) - around, np.float32(box.max) + around)
+    low, high = np.asarray(box.min) - around, np.asarray(box.max) + around
     x, y, z = ((axis >= a) & (axis <= b) for axis, a, b in zip(points.T, low, high, strict=True))
     return np.asarray(x & y & z)
 

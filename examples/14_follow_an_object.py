@@ -1,0 +1,40 @@
+"""A grasp that follows an object on a belt, through a simulated stream of depth images.
+
+usage: python examples/14_follow_an_object.py [ADDRESS]    needs pip install 'edgegrasp[sim]'
+"""
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from edgegrasp_client import GraspClient, GraspTracker
+from edgegrasp_sim.camera import look_at
+from edgegrasp_sim.simulation import ClutterSimulation
+
+T_WORLD_CAMERA = look_at(np.array([0.15, -0.4, 0.6]), np.array([0.15, 0.15, 0.1]))
+
+
+def camera() -> Iterator[dict[str, Any]]:
+    """Thirty images a second of one object that moves by 5 cm a second."""
+    with ClutterSimulation() as simulation:
+        rng = np.random.default_rng(0)
+        simulation.reset("packed", rng, num_objects=1)
+        start = simulation.placements[0]
+        for number in range(60):
+            x, y, z = start.position
+            simulation.reset_from_poses([replace(start, position=(x + number / 600, y, z))])
+            yield {"cloud": simulation.observe_from([T_WORLD_CAMERA], rng, table="auto").image}
+            time.sleep(1 / 30)
+
+
+address = sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:50051"
+tracker = GraspTracker(viewpoint=T_WORLD_CAMERA[:3, 3])
+with GraspClient(address) as client:
+    client.wait_until_ready()
+    for _, found in tracker.follow(client, camera()):
+        at = [(grasp.id, *grasp.T_cloud_tcp[:3, 3].round(3).tolist()) for grasp in found.grasps[:1]]
+        print(found.tracking.first if found.tracking else "", *at)
