@@ -1,13 +1,12 @@
 """A grasp that follows an object on a belt, through a simulated stream of depth images.
 
-usage: python examples/14_follow_an_object.py [ADDRESS]    needs pip install 'edgegrasp[sim]'
+usage: python examples/follow_an_object.py [ADDRESS]    needs pip install 'edgegrasp[sim]'
 """
 
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from edgegrasp_sim.simulation import ClutterSimulation
 T_WORLD_CAMERA = look_at(np.array([0.15, -0.4, 0.6]), np.array([0.15, 0.15, 0.1]))
 
 
-def camera() -> Iterator[dict[str, Any]]:
+def camera() -> Iterator[dict[str, np.ndarray]]:
     """Thirty images a second of one object that moves by 5 cm a second."""
     with ClutterSimulation() as simulation:
         rng = np.random.default_rng(0)
@@ -36,5 +35,5 @@ tracker = GraspTracker(viewpoint=T_WORLD_CAMERA[:3, 3])
 with GraspClient(address) as client:
     client.wait_until_ready()
     for _, found in tracker.follow(client, camera()):
-        at = [(grasp.id, *grasp.T_cloud_tcp[:3, 3].round(3).tolist()) for grasp in found.grasps[:1]]
-        print(found.tracking.first if found.tracking else "", *at)
+        for best in found.grasps[:1]:
+            print(best.id, f"score {best.score:.2f}", best.T_cloud_tcp[:3, 3].round(3))
