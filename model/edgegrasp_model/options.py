@@ -481,7 +481,7 @@ def _in_threes(value: tuple[float, ...]) -> tuple[float, ...]:
     return value
 
 
-Pose = Annotated[
+RigidPose = Annotated[
     Matrix, AfterValidator(rigid), BeforeValidator(_row_by_row, json_schema_input_type=Matrix)
 ]
 
@@ -490,7 +490,7 @@ class RobotArm(Strict):
     """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
 
     name: str = Field(max_length=100, description="one of the server's robots")
-    T_base_cloud: Pose = Field(
+    T_base_cloud: RigidPose = Field(
         description="where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row"
     )
     joints: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=16)] = Field(
@@ -506,7 +506,7 @@ class PreviousGrasp(Strict):
     """A grasp of an earlier answer."""
 
     id: Row = Field(description="as in that answer")
-    T_cloud_hand: Pose = Field(description="as in that answer: a 4 x 4 matrix, row by row")
+    T_cloud_hand: RigidPose = Field(description="as in that answer: a 4 x 4 matrix, row by row")
     object: Row | None = Field(default=None, description="number of the object that it is on")
 
 

@@ -92,6 +92,14 @@ def test_depth_camera(tmp_path: Path) -> None:
         assert depth.size == color.size == (640, 480)
 
 
+def test_follow_an_object(real_server) -> None:
+    shown = example("follow_an_object.py", real_server.grpc_address)
+    found = re.findall(r"^(\d+) score (0\.\d+) \[ ?(\S+) ", shown, re.MULTILINE)
+    identities, _, along = np.array(found, dtype=float).T
+    assert np.mean(identities == identities[0]) > 0.5
+    assert along[identities == identities[0]].max() - along[0] > 0.01
+
+
 def test_several_views(real_server) -> None:
     pattern = r"each view: \[(.*)\] grasps, best holds \[.*\]; all three: (\d+), True"
     printed = re.findall(pattern, example("several_views.py", real_server.grpc_address, "2"))
