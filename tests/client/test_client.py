@@ -92,6 +92,13 @@ ALL_OPTIONS: dict[str, Any] = {
     "top_k": 3,
     "suppression": {"translation": 0.02},
     "order": "clearance",
+    "previous": {
+        "gripper": "panda",
+        "next_id": 8,
+        "grasps": [{"id": 7, "T_cloud_hand": np.eye(4).ravel(), "object": np.int64(3)}],
+        "objects": [{"number": 3, "surface": np.zeros(6, np.float32), "confidence": None}],
+        "search": True,
+    },
     "debug": True,
 }
 
