@@ -38,7 +38,7 @@ ALL_DOCS = "\n".join(PAGES[page.name] for page in DOCS.glob("*.md"))
 # elsewhere have them), and a page whose blocks stand on each other (test_integrations.py).
 ABSENT = {"pyrealsense2", "pyk4a", "pyorbbecsdk", "zivid", "harvesters", "ray"}
 COMPILED = ("Tls(", *(f"import {name}" for name in ABSENT), *(f"from {name}" for name in ABSENT))
-ELSEWHERE = {"integrations.md", "robots.md"}
+ELSEWHERE = {"integrations.md", "robots.md", "tracking.md"}
 # Commands of other programs, which change the machine or need what it has not.
 OTHERS = {".", "apt-get", "cd", "colcon", "docker", "git", "ln", "openssl", "pip", "ray", "rosdep"}
 OTHERS |= {"python3", "ros2", "serve"}
