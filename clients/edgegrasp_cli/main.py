@@ -27,8 +27,8 @@ COMMANDS = {
     "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
     "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),
     "train": ("train", "train", "Train weights on generated data."),
-    "generate-scenes": ("train_scene", "train", "Make depth images to train the scene network."),
-    "train-scene": ("train_scene", "train", "Train the network that recognises objects."),
+    "generate-scenes": ("train", "train", "Make depth images to train the scene network."),
+    "train-scene": ("train", "train", "Train the network that recognises objects."),
     "import-checkpoint": ("train", "model", "Convert the authors' checkpoints to safetensors."),
 }
 

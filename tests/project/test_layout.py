@@ -1,5 +1,6 @@
 """The tree holds what it should, and nothing of the machine it was made on."""
 
+import ast
 import re
 import subprocess
 from pathlib import Path
@@ -44,4 +45,19 @@ def test_no_tracked_file_names_a_registry_or_a_path_of_one_machine() -> None:
 
 def test_tracked_files_are_small_enough_for_a_clone() -> None:
     large = [path.name for path in tracked_files() if path.stat().st_size > 20 * 2**20]
+    assert large == []
+
+
+def test_functions_fit_on_a_screen() -> None:
+    large = []
+    for path in tracked_files():
+        if path.suffix != ".py" or "_pb2" in path.name:
+            continue
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                count = sum(one.arg not in ("self", "cls") for one in given)
+                if lines > 60 or count > 10:
+                    large.append(f"{path.name}: {node.name}, {lines} lines, {count} parameters")
     assert large == []
