@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 from edgegrasp_camera.arrays import Float32, Float64
+from edgegrasp_camera.depth import Intrinsics, metres, unproject
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.results import Detection
@@ -27,11 +28,8 @@ FOCAL, SEEDS, FAR = 540.0, 20, 0.5  # pixels; seeds; metres from the arm's base 
 
 def cloud_of_sample() -> Float32:
     """The image's points (480, 640, 3), camera frame, metres."""
-    depth = np.asarray(Image.open(Path(__file__).parents[1] / SAMPLE), dtype=np.float32) / 1000
-    depth[depth == 0.0] = np.nan
-    row, column = np.indices(depth.shape)
-    rays = [(column - 320) / FOCAL, (row - 240) / FOCAL, np.ones_like(depth)]
-    return (np.stack(rays, axis=-1) * depth[..., None]).astype(np.float32)
+    depth = metres(np.asarray(Image.open(Path(__file__).parents[1] / SAMPLE)))
+    return unproject(depth, Intrinsics(FOCAL, FOCAL, 320, 240)).astype(np.float32)
 
 
 def beside(detection: Detection) -> Float64:

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, nullcontext
 from functools import lru_cache
 from itertools import islice
 from typing import Any, TypeAlias, TypeVar
@@ -91,8 +91,7 @@ def _in_processes(
         context = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, context, initializer=_start_process)
         try:
-            with _one_thread_each():
-                futures = {pool.submit(_run, made, task): task for task in missing}
+            futures = {pool.submit(_run, made, task): task for task in missing}
             for future in as_completed(futures):
                 result, task = future.result(), futures[future]
                 crashes = 0
@@ -110,21 +109,10 @@ def _in_processes(
 
 
 def _start_process() -> None:
+    for name in THREADS:  # all cores are busy anyway
+        os.environ.setdefault(name, "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops its workers
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)  # however the parent ends
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Make processes started meanwhile use one thread each: all cores are busy anyway."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update({name: value or "1" for name, value in before.items()})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
 
 
 def _run(made: bytes, task: Any) -> Any:
