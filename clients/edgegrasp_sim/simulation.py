@@ -358,7 +358,9 @@ class ClutterSimulation:
         if isinstance(self._hand, ArmGripper):
             self._hand.motion = motion
         result = self._run(T_world_hand, to_the_end=True)
-        self._forget_rest_state()
+        if self._rest_state is not None:
+            self.world.remove_state(self._rest_state)
+            self._rest_state = None
         self._hand.park()
         if result.held is not None:
             result.held.body.remove()
@@ -410,11 +412,6 @@ class ClutterSimulation:
         self.surroundings = surroundings
         self._obstacles = surroundings.add_to(self.world)
         return surroundings
-
-    def _forget_rest_state(self) -> None:
-        if self._rest_state is not None:
-            self.world.remove_state(self._rest_state)
-            self._rest_state = None
 
 
 def _inside(points: Matrix, low: Matrix, high: Matrix) -> NDArray[np.bool_]:

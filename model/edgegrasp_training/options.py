@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 
-class GenerationOptions(BaseModel):
+class GenerationOptions(BaseModel, extra="forbid"):
     """What to generate."""
 
     scenes: int = Field(100, ge=1, description="Scenes")
@@ -31,7 +31,7 @@ class GenerationOptions(BaseModel):
     )
 
 
-class TrainingOptions(BaseModel):
+class TrainingOptions(BaseModel, extra="forbid"):
     """How to train; the defaults are the recipe for two processor cores."""
 
     steps: int = Field(20_000, ge=1, description="Steps")

@@ -53,9 +53,10 @@ def varied_objects(objects: ObjectSet, folder: Path, rng: np.random.Generator) -
     for _ in range(NUM_VARIED):
         draw = rng.random()
         if draw < MADE_SHARE:
-            model = any_made_object(folder / "made", rng)
+            model = made_object(DRAWN_NAMES[int(rng.integers(NUM_DRAWN))], folder / "made")
         elif draw < MADE_SHARE + BLOB_SHARE:
-            model = any_blob(folder / "made", rng)
+            number, scale = int(rng.integers(*TRAINING_BLOBS)), float(rng.uniform(*BLOB_SCALE))
+            model = blob(number, folder / "made", scale)
         else:
             model = objects.sample(rng)
         factors = np.exp(rng.uniform(-np.log(STRETCH), np.log(STRETCH), size=3))
@@ -121,16 +122,6 @@ def _is_shifted(shape: Element) -> bool:
     origin = shape.find("origin")
     values = [] if origin is None else [*origin.attrib.values()]
     return any(float(each) for value in values for each in value.split())
-
-
-def any_made_object(folder: Path, rng: np.random.Generator) -> ObjectModel:
-    """Draw a computed object and write it into a folder."""
-    return made_object(DRAWN_NAMES[int(rng.integers(NUM_DRAWN))], folder)
-
-
-def any_blob(folder: Path, rng: np.random.Generator) -> ObjectModel:
-    """Draw a convex object of random shape and write it into a folder."""
-    return blob(int(rng.integers(*TRAINING_BLOBS)), folder, float(rng.uniform(*BLOB_SCALE)))
 
 
 def made_object(name: str, folder: Path) -> ObjectModel:
