@@ -73,7 +73,7 @@ def test_the_order_of_grasps_stays_and_few_outcomes_warn(tmp_path: Path) -> None
     after = GraspDetector.load(tmp_path / "edgegrasp-plus-robot.safetensors")
     box = np.random.default_rng(0).uniform(-1, 1, (4000, 3)) * (0.02, 0.03, 0.05)
     boxes = np.concatenate([box, box @ np.diag([1, 0.6, 1]) + (0.15, 0, 0)])
-    alone = {"support": None, "objects": "off", "order": "highest"}
+    alone = {"support": None, "objects": "off", "order": "highest", "min_score": 0.0}
     options = DetectOptions(viewpoint=(0.0, -0.3, 0.5), **alone)
     for asked in (options, options.model_copy(update={"order": "score"})):
         first, second = (one.detect(boxes, asked).grasps for one in (before, after))
