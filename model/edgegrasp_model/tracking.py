@@ -49,7 +49,7 @@ STEPS = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
 SPACING = 0.004  # metres along the surface to the nearest point within which it goes on there
 TANGENT = 0.3  # weight of distances beyond that, beside 1 of those across the surface
 # Points' worth of not turning and not shifting: where the shape does not say, it stays.
-STIFF = (2.0,) * 3 + (0.3,) * 3
+STIFF = (0.5,) * 3 + (0.3,) * 3
 FEWEST = 6  # points that say how an object moved
 FOUND, GOOD = 0.5, 0.75  # share of an object's points that lie on the cloud: it is there; well seen
 ON_OBJECT = 0.012  # metres from an object's points to what belongs to it
