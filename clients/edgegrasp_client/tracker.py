@@ -40,11 +40,7 @@ class GraspTracker:
         self._searching = True  # in the request that is to be answered
 
     def follow(
-        self,
-        client: GraspClient,
-        images: Iterable[Mapping[str, Any]],
-        *,
-        timeout: float | None = None,
+        self, client: GraspClient, images: Iterable[Mapping[str, Any]]
     ) -> Iterator[tuple[Mapping[str, Any], Detection]]:
         """Find grasps in one image after the other, over one stream.
 
@@ -53,7 +49,6 @@ class GraspTracker:
         Args:
             client: Over gRPC or REST.
             images: For each what `GraspClient.detect` gets, such as {"depth_images": [image]}.
-            timeout: Seconds for each request; None: the client's own.
 
         Yields:
             An image and its answer. Raises GraspClientError, and whatever `images` raises.
@@ -74,7 +69,7 @@ class GraspTracker:
                 yield StreamRequest(**{**image, **self.options()})
 
         threading.Thread(target=_read, args=(images, latest, stopped), daemon=True).start()
-        answers = client.detect_stream(requests(), timeout=timeout)
+        answers = client.detect_stream(requests())
         try:
             for answer in answers:
                 detection = answer.result()

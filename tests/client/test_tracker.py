@@ -75,7 +75,7 @@ def test_images_that_come_while_one_is_at_work_are_dropped_but_for_the_latest() 
             yield {"cloud": CLOUD + number}
         read.set()
 
-    def stream(requests: Any, timeout: float | None) -> Iterator[StreamAnswer]:
+    def stream(requests: Any) -> Iterator[StreamAnswer]:
         for _ in requests:
             read.wait()
             yield StreamAnswer("", answer("started"))
@@ -91,7 +91,7 @@ def test_an_error_of_the_camera_is_raised() -> None:
         yield {"cloud": CLOUD}
         raise OSError("unplugged")
 
-    def stream(requests: Any, timeout: float | None) -> Iterator[StreamAnswer]:
+    def stream(requests: Any) -> Iterator[StreamAnswer]:
         for _ in requests:
             yield StreamAnswer("", answer("started"))
 
