@@ -88,12 +88,14 @@ class PointNetConv(nn.Module):
         weight, output = self.hidden.weight, PackedLinear(self.output.weight)
         u = torch.cat((features, batch.points), dim=1)
         u = by_chunks(PackedLinear(weight, self.hidden.bias), u)  # (P, width)
-        pooled = []
-        for points, neighbors in in_chunks(CONVOLVED, batch.points, batch.neighbors):
-            hidden = gathered_relu(u, points, weight[:, -3:].t(), neighbors)  # (p k, width)
-            messages = output(hidden).view(*neighbors.shape, -1)  # (p, k, width)
-            pooled.append(maximum(messages, dim=1))
         # The bias is the same for all neighbours: added once, after the maximum.
+        if float32_inference(u):
+            offset = weight[:, -3:].t().contiguous()  # (3, width)
+            return _convolved(u, offset, output, batch).add_(self.output.bias)
+        here, pooled = batch.points @ weight[:, -3:].t(), []  # (P, width)
+        for neighbors, own in in_chunks(CONVOLVED, batch.neighbors, here):
+            hidden = gather_rows(u, neighbors).sub_(own.unsqueeze(1)).relu_()  # (p, k, width)
+            pooled.append(maximum(output(hidden), dim=1))  # (p, width)
         return torch.cat(pooled)[: len(features)] + self.output.bias
 
 
@@ -121,15 +123,18 @@ class GlobalFeature(nn.Module):
         return maximum_2.result()
 
 
-def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) -> Tensor:
-    """ReLU of u_j - V p_i for the neighbours (p, k) of each of p points: (p k, width)."""
-    if float32_inference(u):
-        result = torch.empty(neighbors.numel(), u.shape[1])
-        arrays = (u, points, offset.contiguous(), neighbors, result)
-        _gathered_relu(*(array.numpy() for array in arrays))
-        return result
-    here = points @ offset  # (p, width)
-    return (gather_rows(u, neighbors) - here.unsqueeze(1)).relu_().flatten(0, 1)
+def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
+    """The maximum (P, width) of the messages of each point's neighbours, in memory used again."""
+    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
+    (count, k), width = neighbors.shape, u.shape[1]
+    hidden = torch.zeros(CONVOLVED * k, width)
+    pooled = torch.empty(count, width)
+    for first in range(0, count, CONVOLVED):
+        part = slice(first, min(first + CONVOLVED, count))
+        _gathered_relu(u.numpy(), points[part], offset.numpy(), neighbors[part], hidden.numpy())
+        messages = output(hidden).view(CONVOLVED, k, width)[: part.stop - part.start]
+        torch.amax(messages, dim=1, out=pooled[part])
+    return pooled
 
 
 @compiled("contract", "nsz")

@@ -93,12 +93,17 @@ class VNPointNetConv(nn.Module):
         output = PackedLinear(_with_reach(self.output, self.reach))
         u = torch.cat((features, batch.points.unsqueeze(2)), dim=2)
         u = by_chunks(PackedLinear(weight), u, VN_ROWS)  # (P, 3, 2 width)
-        k, pooled = batch.neighbors.shape[1], []
-        for points, neighbors in in_chunks(VN_CONVOLVED, batch.points, batch.neighbors):
-            both = output(gathered_relu(u, points, weight[:, -1], neighbors))  # (p k, 3, 2 width)
-            pooled.append(furthest_of_each(both, k))  # (p, 3, width)
-        vectors: Tensor = self.output_relu(torch.cat(pooled)[: len(features)])
-        return vectors
+        if float32_inference(u):
+            vectors = _convolved(u, weight[:, -1].contiguous(), output, batch)
+        else:
+            here, pooled = batch.points.unsqueeze(2) * weight[:, -1], []  # (P, 3, 2 width)
+            for neighbors, own in in_chunks(VN_CONVOLVED, batch.neighbors, here):
+                both = gather_rows(u, neighbors) - own.unsqueeze(1)  # (p, k, 3, 2 width)
+                messages = output(relu(both.flatten(0, 1))).view(both.shape)
+                pooled.append(_furthest(messages, dim=1))  # (p, 3, width)
+            vectors = torch.cat(pooled)[: len(features)]
+        activated: Tensor = self.output_relu(vectors)
+        return activated
 
 
 class VNGlobalFeature(nn.Module):
@@ -194,25 +199,21 @@ def relu(both: Tensor) -> Tensor:
     return torch.addcmul(vectors, along / (length_squared + _TINY), directions, value=-1.0)
 
 
-def gathered_relu(u: Tensor, points: Tensor, offset: Tensor, neighbors: Tensor) -> Tensor:
-    """`relu` of u_j - offset p_i for the neighbours (p, k) of each of p points: (p k, 3, C)."""
-    if float32_inference(u):
-        result = torch.empty(neighbors.numel(), 3, u.shape[2] // 2)
-        arrays = (u, points, offset.contiguous(), neighbors, result)
-        _gathered_relu_rows(*(array.numpy() for array in arrays))
-        return result
-    here = points.unsqueeze(2) * offset  # (p, 3, 2C)
-    return relu((gather_rows(u, neighbors) - here.unsqueeze(1)).flatten(0, 1))
-
-
-def furthest_of_each(both: Tensor, k: int) -> Tensor:
-    """Of each k vectors in a row that which reaches furthest: (M k, 3, 2C) to (M, 3, C)."""
-    if not float32_inference(both):
-        return _furthest(both.view(-1, k, *both.shape[1:]), dim=1)
-    groups = len(both) // k
-    furthest = Furthest(groups, both.shape[2] // 2)
-    furthest.add(both, list(range(groups)), [k] * groups)
-    return furthest.result()
+def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
+    """The furthest (P, 3, C) of the messages of each point's neighbours, in memory used again."""
+    (count, k), width = batch.neighbors.shape, len(offset) // 2
+    points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
+    hidden = torch.zeros(VN_CONVOLVED * k, 3, width)
+    best = np.empty((VN_CONVOLVED, width), np.float32)
+    pooled = torch.zeros(count, 3, width)
+    for first in range(0, count, VN_CONVOLVED):
+        part = slice(first, min(first + VN_CONVOLVED, count))
+        arrays = (u.numpy(), points[part], offset.numpy(), neighbors[part], hidden.numpy())
+        _gathered_relu_rows(*arrays)
+        best.fill(-np.inf)
+        bounds = np.arange(0, (part.stop - part.start) * k + 1, k)
+        _furthest_rows(output(hidden).numpy(), bounds, best, pooled[part].numpy())
+    return pooled
 
 
 class Furthest:
