@@ -22,13 +22,10 @@ FIXED, UNKNOWN = -1, -2
 class GroupingLimits:
     """When pixels show the same object."""
 
-    link: float = 0.35  # probability that neighbouring pixels show one object
-    vote: float = 0.04  # metres between the centres that neighbours vote for
+    link: float = 0.5  # probability that neighbouring pixels show one object
     jump: float = 0.035  # metres of depth between neighbours, as to a wrong reading before it
-    core: int = 24  # pixels of two parts that only become one where they vote for one centre,
-    apart: float = 0.04  # metres between these
-    same_centre: float = 0.035  # metres between the mean votes of two parts of one object
-    smallest: int = 20  # pixels of the network's output
+    centre: float = 0.035  # metres between the mean votes of two parts of one object
+    smallest: int = 20  # pixels of an object, in the network's output
     smallest_area: float = 5e-4  # square metres, as seen
     smooth: float = 0.97  # cosine between normals of neighbours on one smooth surface
     step: float = 3.0  # pixels between neighbours on one smooth surface
@@ -62,15 +59,14 @@ def group(pixels: Pixels) -> Int64:
     index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
     right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
     for link, (first, second) in zip(links, (right, lower), strict=True):
-        near = np.linalg.norm(centre[first] - centre[second], axis=-1) < LIMITS.vote
-        near &= np.abs(points[first][..., 2] - points[second][..., 2]) < LIMITS.jump
+        near = np.abs(points[first][..., 2] - points[second][..., 2]) < LIMITS.jump
         joined = held[first] & held[second] & (link[first] > LIMITS.link) & near
         pairs.append(np.stack([index[first][joined], index[second][joined]], axis=1))
         strength.append(link[first][joined])
     order = np.argsort(-np.concatenate(strength), kind="stable")
     component = np.arange(held.size)
     flat = np.nan_to_num(centre.reshape(-1, 3)).astype(np.float64)
-    _join(np.concatenate(pairs)[order], component, flat.copy(), LIMITS.core, LIMITS.apart)
+    _join(np.concatenate(pairs)[order], component, flat.copy(), LIMITS.smallest, LIMITS.centre)
     rows = np.flatnonzero(held)
     _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
     flat = flat[rows]
@@ -81,7 +77,7 @@ def group(pixels: Pixels) -> Int64:
         return number
     # Parts that something in front separates vote for one centre.
     apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
-    _, merged = connected_components(apart < LIMITS.same_centre, directed=False)
+    _, merged = connected_components(apart < LIMITS.centre, directed=False)
     of_part = np.full(len(count), UNKNOWN)
     of_part[large] = merged
     number.reshape(-1)[rows] = of_part[part]
@@ -89,7 +85,7 @@ def group(pixels: Pixels) -> Int64:
 
 
 @compiled()
-def _join(pairs: Int64, component: Int64, centre: Float64, core: int, apart: float) -> None:
+def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: float) -> None:
     """Join pairs (P, 2) of pixels in order, but not two large parts with different centres.
 
     One weak link then does not join two objects (Kruskal's algorithm, with that exception).
@@ -98,7 +94,7 @@ def _join(pairs: Int64, component: Int64, centre: Float64, core: int, apart: flo
         pairs: Those that most probably show one object first.
         component: (N,) each pixel; becomes the part that it belongs to.
         centre: (N, 3) metres, what each pixel votes for; overwritten by sums.
-        core: Pixels of a large part.
+        large: Pixels of a large part.
         apart: Metres between centres.
     """
     count = np.ones(len(component), dtype=np.int64)
@@ -112,7 +108,7 @@ def _join(pairs: Int64, component: Int64, centre: Float64, core: int, apart: flo
             b = component[b]
         if a == b:
             continue
-        if count[a] >= core and count[b] >= core:
+        if count[a] >= large and count[b] >= large:
             away = 0.0
             for d in range(3):
                 away += (centre[a, d] / count[a] - centre[b, d] / count[b]) ** 2
