@@ -187,8 +187,8 @@ def draw_scene(
 ) -> SceneMeshes:
     """Any of the kinds of scenes."""
     draw: list[tuple[float, Callable[..., SceneMeshes]]] = [
-        (0.42, _table),
-        (0.24, _bin),
+        (0.38, _table),
+        (0.28, _bin),
         (0.16, _shelf),
         (0.11, _tray),
         (0.07, _floor),
@@ -782,14 +782,14 @@ def _bin(rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Mesh
         scene.add(mesh)
     scene.add(box((2 * half[0] + 0.004, 2 * half[1] + 0.004, 0.01), (0, 0, -0.012)))
     heights = HeightMap(half, walls=depth)
-    fill = rng.uniform(-0.15, 1.25)
+    fill = rng.uniform(-0.15, 1.5)
     around = rng.uniform(0.3, 1.0) * max(half)
     while fill > 0 and len(scene.centres) < 70:
         if heights.within(half).mean() > fill * depth * 0.9:
             break
         if (
             not _lay_objects(
-                rng, scene, pool, heights, 3, "heap", around=around, ceiling=depth + 0.12
+                rng, scene, pool, heights, 3, "heap", around=around, ceiling=depth + 0.16
             )
             and rng.random() < 0.3
         ):
