@@ -64,7 +64,7 @@ test: $(INSTALLED) ## run the tests, on every core
 fuzz: $(INSTALLED) ## send decoders and a running server what they cannot expect, for some minutes
 	$(BIN)/pytest -q tests/fuzz --hypothesis-profile=fuzz
 
-bench: $(INSTALLED) ## measure speed beside a textbook implementation; rewrites the tables of it
+bench: $(INSTALLED) ## measure speed; rewrites the tables of README and docs/speed.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.speed --pages
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/robot.py
 

@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
-from benchmarks import load, soak
 
 from edgegrasp_client import DeadlineError, Detection, GripperOutline, InvalidRequestError
 
@@ -19,20 +17,22 @@ def test_load_tells_answers_from_refusals_and_the_server_from_the_detector() -> 
 
 
 def test_a_soak_finds_faults() -> None:
-    memory = [(done, 100.0 + 0.002 * done) for done in range(0, 10_001, 100)]
-    assert soak.slope(memory, 10_000) == pytest.approx(2.0)
-    warm = [(done, 100.0 + min(done, 1500) / 100) for done in range(0, 10_001, 100)]
-    assert soak.slope(warm, 10_000) == pytest.approx(0.0, abs=1e-6)
-    good = {"wrong": [], "outcomes": {"": 10_000}, "exit_code": 0, "requests": 10_000}
-    good["memory_slope_mb_per_1000"] = 0.1
+    part = {"wrong": [], "lost": 0, "health": {"refused": 0}}
+    memory = [100.0, 180.0, 200.0, 200.0]
+    attacks = [{"offset: 400": 9, "header: 413": 9}, {"pages": 540}]
+    good = {"alone": part, "attacked": part | {"attacks": attacks, "memory_mb": memory}}
+    good |= {"minutes": 10, "exit_code": 0}
     assert soak.faults(good) == []
     for change in (
-        {"memory_slope_mb_per_1000": 2.0},
-        {"exit_code": -9},
         {"wrong": [{}]},
-        {"outcomes": {"": 9_999}},
+        {"lost": 1},
+        {"health": {"refused": 1}},
+        {"memory_mb": [100.0, 180.0, 200.0, 300.0]},
+        {"attacks": [{"offset: 503": 1}, {"pages": 540}]},
+        {"attacks": [{"offset: 400": 1}, {"pages": 0}]},
     ):
-        assert len(soak.faults(good | change)) == 1
+        assert len(soak.faults(good | {"attacked": good["attacked"] | change})) == 1
+    assert len(soak.faults(good | {"exit_code": -9})) == 1
 
 
 def test_an_answer_to_another_cloud_is_noticed() -> None:
