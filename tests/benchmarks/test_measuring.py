@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from benchmarks import load, soak
 
 from edgegrasp_client import DeadlineError, Detection, GripperOutline, InvalidRequestError
 
