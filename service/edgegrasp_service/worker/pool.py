@@ -157,9 +157,9 @@ class WorkerPool:
                     break
                 self._answered = time.monotonic()
                 worker.finish(answer)
-                usable = answer.error is None or answer.error.kind != WORKER_LOST
-                if not usable:
+                if answer.error is not None and answer.error.kind == WORKER_LOST:
                     worker.kill()  # it ran out of memory: its state cannot be trusted
+                usable = not worker.killed  # its last answer may arrive after that
         finally:
             worker.finish(WorkerLost(LOST))
             worker.close()
@@ -299,6 +299,7 @@ class _Worker:
         self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
         self.at_work = False  # on a request
+        self.killed = False
 
     async def start(self) -> None:
         """Fork it and wait until it is ready; raises InvalidSettings if it cannot load."""
@@ -330,17 +331,17 @@ class _Worker:
             WorkerLost: It died of something else.
         """
         loop = asyncio.get_running_loop()
-        self.answer = loop.create_future()
-        self.answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
+        answer = self.answer = loop.create_future()
+        answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
         self.at_work = job.method != "Beat"
         assert self._writer is not None
         for part in pack(replace(job, remaining=deadline - loop.time())):
             self._writer.write(part)
         del job
         try:
-            return await asyncio.shield(self.answer)
+            return await asyncio.shield(answer)
         except asyncio.CancelledError:
-            if self.answer is not None:
+            if self.answer is answer:  # otherwise it is done, and may be on another job
                 self._killing = loop.call_later(KILL_SECONDS, self.kill)
             raise
 
@@ -360,6 +361,7 @@ class _Worker:
 
     def kill(self) -> None:
         """Kill it."""
+        self.killed = True
         if self.pid:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
