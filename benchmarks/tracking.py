@@ -11,9 +11,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as pyplot
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Floats
 from edgegrasp_camera.clouds import CloudInput
 from edgegrasp_cli.real_scenes import RealScene, load_scenes
 from edgegrasp_client import GraspTracker
@@ -23,8 +23,6 @@ from edgegrasp_model.options import parse_options
 
 NOISE = 0.0003, 0.0015  # metres, and for each square metre of depth
 MISSING = 0.005  # share of the pixels
-
-Floats = NDArray[np.floating]
 
 
 def image(scene: RealScene, number: int) -> Floats:

@@ -7,10 +7,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_client.errors import GraspClientError
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 
 
@@ -311,7 +310,7 @@ def _evaluation(answer: Any, read: Read) -> Evaluation:
 
 
 def _debug(answer: Any, read: Read) -> DebugInfo:
-    def array(name: str, dtype: type, *shape: int) -> NDArray[Any]:
+    def array(name: str, dtype: type, *shape: int) -> Array:
         return np.array(read(answer, name) or (), dtype=dtype).reshape(shape)
 
     return DebugInfo(

@@ -7,10 +7,9 @@ Precision, recall and F of the overlap as in Xie et al., "Unseen Object Instance
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-Int64 = NDArray[np.int64]
+from edgegrasp_camera.arrays import Float64, Int64
 
 FOUND_F = 0.75  # F from which a labelled object counts as found, as in the paper
 
@@ -69,9 +68,7 @@ def _common_pixels(labels: Int64, answer: Int64) -> tuple[Int64, Int64, Int64]:
     return count[1:].sum(axis=1), count[:, 1:].sum(axis=0), count[1:, 1:]
 
 
-def _matches(
-    called: Int64, labelled: Int64, common: Int64
-) -> tuple[Int64, Int64, NDArray[np.float64]]:
+def _matches(called: Int64, labelled: Int64, common: Int64) -> tuple[Int64, Int64, Float64]:
     """Rows, columns and F (M,) of the pairs that overlap, matched for the greatest sum of F."""
     f = 2 * common / np.maximum(called[:, None] + labelled, 1)
     rows, columns = linear_sum_assignment(f, maximize=True)

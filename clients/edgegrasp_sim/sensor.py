@@ -10,14 +10,10 @@ of a time-of-flight camera that fly between an edge and what is behind it (Sarbo
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter, zoom
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64
 from edgegrasp_sim.engine import Intrinsics
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 EDGE = 0.015  # metres between neighbouring pixels from which on they show different surfaces
 SAME_SURFACE = 0.004  # metres by which a pixel may lie behind what hides it

@@ -11,9 +11,9 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
+from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
 from edgegrasp_model.candidates.collision import clearances
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
@@ -63,9 +63,6 @@ from edgegrasp_model.tracking import (
     untracked,
     with_surfaces,
 )
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
 
 NO_APPROACH_POINT = (
     "the approach region holds no point of the processed cloud. Rows hold a voxel by "
@@ -321,7 +318,7 @@ class GraspDetector:
             value = "neither edges nor hand_poses" if edges is None else "edges and hand_poses"
             raise InvalidRequest("edges", value, "Send one of the two.")
         sent, options = check_cloud(cloud), options or DetectOptions()
-        asked: NDArray[Any] = (
+        asked: Array = (
             check_hand_poses(hand_poses) if edges is None else check_edges(edges, sent.rows_sent)
         )
         no_region = {"approach_region": None, "contact_region": None}
@@ -403,17 +400,17 @@ class GraspDetector:
             options, gripper, radius, selected, scene, counts, warnings, seconds, followed
         )
 
-    def _probability(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
+    def _probability(self, logits: Floats) -> Float64:
         """Calibrated probabilities (E,) of logits (E,)."""
         scaled = logits.astype(np.float64) / self.metadata.temperature
-        probability: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-scaled))
+        probability: Float64 = 1.0 / (1.0 + np.exp(-scaled))
         return probability
 
-    def _rating(self, logits: NDArray[np.floating]) -> NDArray[np.float64]:
+    def _rating(self, logits: Floats) -> Float64:
         """The probabilities (E,) as they were before outcomes of a robot rescaled them."""
         scale, shift = self.metadata.training.get("outcomes_scale_shift", (1.0, 0.0))
         scaled = logits.astype(np.float64) / self.metadata.temperature
-        rating: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-(scaled - shift) / scale))
+        rating: Float64 = 1.0 / (1.0 + np.exp(-(scaled - shift) / scale))
         return rating
 
     @property

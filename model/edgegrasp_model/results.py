@@ -5,12 +5,8 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 
 OBSTACLE, SUPPORT, UNLABELLED = -1, -2, -3  # labels of rows of a cloud that are no object's
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.options import (
@@ -34,10 +34,6 @@ from edgegrasp_model.results import (
 )
 from edgegrasp_model.scene.grouping import UNKNOWN
 from edgegrasp_model.scene.scene import Scene
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 MARGIN = 0.1  # of the score, by which another grasp has to be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first

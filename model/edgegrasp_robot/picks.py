@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from roboplan import core
 from roboplan.rrt import RRT, RRTOptions
 from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
+from edgegrasp_camera.arrays import Float64, Floats
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, RobotArm
@@ -22,8 +22,6 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.held import can_leave
 from edgegrasp_robot.robot import GROUP, Robot
 from edgegrasp_robot.surroundings import surrounded
-
-Float64 = NDArray[np.float64]
 
 TRIED = 200  # grasps that the arm may be asked for, in their order
 SPARE = 4  # more than asked for that are brought within reach, as some may get no motion
@@ -235,9 +233,7 @@ class _Arm:
     def _within_limits(self, joints: Float64) -> bool:
         return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
 
-    def _straight(
-        self, grasp: Grasp, direction: NDArray[np.floating], begin: float, end: float
-    ) -> list[Float64]:
+    def _straight(self, grasp: Grasp, direction: Floats, begin: float, end: float) -> list[Float64]:
         """Poses T_base_hand along a direction, `begin` to `end` metres from the grasp."""
         steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
         poses = np.repeat(grasp.T_cloud_hand[None].astype(np.float64), steps + 1, axis=0)

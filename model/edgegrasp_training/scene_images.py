@@ -20,6 +20,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Int64
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics
 from edgegrasp_sim.engine.urdf import parse_obj
@@ -27,9 +28,7 @@ from edgegrasp_sim.sensor import random_sensor
 from edgegrasp_training.household import household_mesh
 from edgegrasp_training.shapes import NUM_DRAWN, drawn_shape
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Mesh = tuple[Float64, NDArray[np.int64]]  # (V, 3) metres, (F, 3)
+Mesh = tuple[Float64, Int64]  # (V, 3) metres, (F, 3)
 
 WIDTH, HEIGHT = 320, 240  # pixels
 DEPTH_UNIT = 0.0002  # metres of a stored depth; 16 bits reach 13 m
@@ -120,7 +119,7 @@ class HeightMap:
         size = len(self.height)
         return self.height[low[0] : size - low[0], low[1] : size - low[1]]
 
-    def cells(self, points: Float64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def cells(self, points: Float64) -> tuple[Int64, Int64]:
         """The cells below points (N, 3)."""
         index = ((points[:, :2] + REACH) / CELL).astype(np.int64)
         index = np.clip(index, 0, len(self.height) - 1)
@@ -250,7 +249,7 @@ def _casting(parts: Sequence[tuple[Mesh, int]]) -> o3d.t.geometry.RaycastingScen
     return casting
 
 
-def _tensor(array: NDArray[Any]) -> Any:
+def _tensor(array: Array) -> Any:
     """An array as Open3D takes it."""
     return o3d.core.Tensor(array)  # type: ignore[call-overload]
 
@@ -260,7 +259,7 @@ def _cast(
     parts: Sequence[tuple[Mesh, int]],
     camera: Intrinsics,
     pose: Float64,
-) -> tuple[Float64, NDArray[np.uint8], NDArray[np.bool_]]:
+) -> tuple[Float64, NDArray[np.uint8], Bools]:
     """Depth (H, W) in metres, `far` where nothing is hit, labels (H, W), and where it is steep."""
     y, x = np.indices((camera.height, camera.width)) + 0.5
     rays = np.stack(

@@ -1,8 +1,8 @@
 """Where the hand would hit something, how near it comes, and how far its fingers must open."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
 from edgegrasp_model.candidates.edge_grasps import support_clearance
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import (
@@ -17,10 +17,6 @@ from edgegrasp_model.scene.grouping import FIXED
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.unseen import DepthMap, enters_unseen
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of furniture between the fingers that keep them from closing
@@ -165,8 +161,8 @@ def _swept_over(position: Float32, lift: Float32, low: Float64, high: Float64) -
 
 
 def _nearest_obstacle(
-    obstacles: SolidBoxes, T_cloud_hand: Float32, boxes: Float64, nearest: NDArray[np.floating]
-) -> NDArray[np.floating]:
+    obstacles: SolidBoxes, T_cloud_hand: Float32, boxes: Float64, nearest: Floats
+) -> Floats:
     """The distances `nearest` (E,), or those of obstacles that are nearer."""
     hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
     for place in range(len(obstacles)):

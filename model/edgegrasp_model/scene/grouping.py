@@ -4,15 +4,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 # In place of an object's number: background; what may belong to an object.
 FIXED, UNKNOWN = -1, -2

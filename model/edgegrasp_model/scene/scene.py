@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
     AutoPlane,
@@ -56,11 +57,6 @@ from edgegrasp_model.scene.support import (
     measured,
     near_objects,
 )
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 MIN_POINTS = 4  # fewer make no surface
 MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
@@ -498,7 +494,7 @@ def near_workspace_side(
     return np.asarray((at_low | at_high).any(axis=1))
 
 
-def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.float64] | None:
+def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | None:
     """The camera positions (W, 3) that the request gives, if any."""
     if options.viewpoint is None:
         return None
@@ -515,9 +511,7 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> NDArray[np.f
     return viewpoints
 
 
-def inside_workspace(
-    points: Float32, box: Workspace | None, around: NDArray[np.floating] | float = 0.0
-) -> Bools:
+def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
     """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
     if box is None:
         return np.ones(len(points), dtype=bool)
@@ -538,7 +532,7 @@ def _turned_normals(
     kept: Bools,
     voxels: Voxels,
     frame: CanonicalFrame,
-    viewpoints: NDArray[np.float64] | None,
+    viewpoints: Float64 | None,
 ) -> Float32:
     """Unit normals of the kept voxels: those given, else the estimated, turned to the camera."""
     seen_from = assumed_viewpoint(points, UP)
