@@ -104,18 +104,18 @@ def run(
     context = multiprocessing.get_context("spawn")
     stop, processes, tellers = context.Event(), [], []
     for work in (probe, *attacks):
-        teller, told = context.Pipe(duplex=False)
-        given = (work, server.http_url, server.grpc_address, stop, told)
+        reports, pipe = context.Pipe(duplex=False)
+        given = (work, server.http_url, server.grpc_address, stop, pipe)
         processes.append(context.Process(target=begin, args=given))
         processes[-1].start()
-        told.close()  # here: the end of a process is the end of its pipe
-        tellers.append(teller)
-    for teller in tellers:
-        teller.recv()  # it has begun
+        pipe.close()  # here: the end of a process is the end of its pipe
+        tellers.append(reports)
+    for reports in tellers:
+        reports.recv()  # it has begun
     soak = Soak(server, seed)
     asyncio.run(soak.run(clients, seconds))
     stop.set()
-    health, *attacked = (teller.recv() for teller in tellers)
+    health, *attacked = (reports.recv() for reports in tellers)
     for process in processes:
         process.join()
     return soak.figures() | {"health": health, "attacks": attacked}
@@ -252,13 +252,13 @@ def outcome(plan: Plan, came: Detection | GraspClientError) -> str:
 # The attackers and the probe
 
 
-def begin(work: Any, url: str, address: str, stop: Any, told: Any) -> None:
+def begin(work: Any, url: str, address: str, stop: Any, pipe: Any) -> None:
     """Work in a process of its own, once it has imported everything."""
-    told.send("begun")
-    work(url, address, stop, told)
+    pipe.send("begun")
+    work(url, address, stop, pipe)
 
 
-def poison(url: str, address: str, stop: Any, told: Any) -> None:
+def poison(url: str, address: str, stop: Any, pipe: Any) -> None:
     """Small requests that ended workers once; tells the statuses of the answers."""
     came: Counter[str] = Counter()
     transport = httpx.HTTPTransport(local_address=ATTACKER)
@@ -271,7 +271,7 @@ def poison(url: str, address: str, stop: Any, told: Any) -> None:
                     came[f"{media}: {answer.status_code}"] += 1
                 except httpx.HTTPError as error:
                     came[f"{media}: {type(error).__name__}"] += 1
-    told.send(dict(came))
+    pipe.send(dict(came))
 
 
 def poisons(number: int) -> dict[str, bytes]:
@@ -294,7 +294,7 @@ def poisons(number: int) -> dict[str, bytes]:
     }
 
 
-def lock_out(url: str, address: str, stop: Any, told: Any) -> None:
+def lock_out(url: str, address: str, stop: Any, pipe: Any) -> None:
     """Open pages that nobody reads and silent gRPC calls, hold them, and open them anew."""
     came: Counter[str] = Counter()
     page = b"GET /docs/assets/swagger-ui-bundle.js HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -311,7 +311,7 @@ def lock_out(url: str, address: str, stop: Any, told: Any) -> None:
                     connection.sendall(http2_headers(path, 2 * (number % OF_ONE) + 1))
                     came["silent calls"] += 1
             stop.wait(HELD_SECONDS)
-    told.send(dict(came))
+    pipe.send(dict(came))
 
 
 def connect(address: str, source: str = ATTACKER, timeout: float = SECONDS) -> socket.socket:
@@ -342,7 +342,7 @@ def http2_headers(path: str, stream: int) -> bytes:
     return http2_frame(1, 4, stream, headers)
 
 
-def probe(url: str, address: str, stop: Any, told: Any) -> None:
+def probe(url: str, address: str, stop: Any, pipe: Any) -> None:
     """Ask for health over both transports, each time on a new connection; tells how it went."""
     questions = {"http": partial(ask_http, url), "grpc": partial(ask_grpc, address)}
     refused: Counter[str] = Counter()
@@ -356,7 +356,7 @@ def probe(url: str, address: str, stop: Any, told: Any) -> None:
                 refused[f"{name}: {error}"[:200]] += 1
             seconds[name].append(time.monotonic() - start)
     figures = {name: {"asked": len(one), "ms": milliseconds(one)} for name, one in seconds.items()}
-    told.send({"refused": dict(refused), **figures})
+    pipe.send({"refused": dict(refused), **figures})
 
 
 def ask_http(url: str) -> None:

@@ -3,8 +3,8 @@
 usage: python examples/several_views.py [ADDRESS] [SCENES]
 
 Packed and pile scenes in turn, rendered from three sides; a robot's camera would take the images
-from several poses, known from its arm. Says how many grasps each view and all three give, told
-nothing else, and of which the best holds in simulation. An empty ADDRESS: detect in this process.
+from several poses, known from its arm. Prints how many grasps each view and all three give with
+default options, and whose best one holds in simulation. An empty ADDRESS: detect in this process.
 """
 
 import sys

@@ -304,13 +304,13 @@ def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def _grpc_answer(answer: Answer) -> dict[str, Any]:
     """Fields of a ModelInferResponse."""
-    told = {name: {"string_param": text} for name, text in answer.parameters.items()}
+    parameters = {name: {"string_param": text} for name, text in answer.parameters.items()}
     outputs = [
         {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
         for name, array in answer.outputs.items()
     ]
     raw = [array.tobytes() for array in answer.outputs.values()]
-    return {"parameters": told, "outputs": outputs, "raw_output_contents": raw}
+    return {"parameters": parameters, "outputs": outputs, "raw_output_contents": raw}
 
 
 def http_app(models: Models, max_body_bytes: int) -> "Starlette":
@@ -335,8 +335,8 @@ def http_app(models: Models, max_body_bytes: int) -> "Starlette":
         return JSONResponse({"models": models.names()})
 
     def repository(request: Request) -> Response:
-        told = {"version": VERSION, "state": "READY", "reason": ""}
-        return JSONResponse([{"name": name, **told} for name in models.names()])
+        state = {"version": VERSION, "state": "READY", "reason": ""}
+        return JSONResponse([{"name": name, **state} for name in models.names()])
 
     def model(request: Request) -> Response:
         models.check(**request.path_params)

@@ -145,9 +145,9 @@ def _error(problem: Mapping[str, Any], response: httpx.Response) -> GraspClientE
     kind = str(problem.get("type", ""))
     if not kind.startswith(_KIND_PREFIX):
         return _foreign(response)
-    told = [str(problem.get(name, "")) for name in ("detail", "field", "value", "fix")]
+    said = [str(problem.get(name, "")) for name in ("detail", "field", "value", "fix")]
     kind = kind.removeprefix(_KIND_PREFIX)
-    return error_of_kind(kind, *told, retry_after=problem.get("retry_after"))
+    return error_of_kind(kind, *said, retry_after=problem.get("retry_after"))
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:

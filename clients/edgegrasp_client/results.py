@@ -111,7 +111,7 @@ class DetectedObject:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How an answer follows the one before, which `previous` told."""
+    """How an answer follows the one before, which was sent as `previous`."""
 
     first: str  # what became of the first grasp: "started", "kept", "replaced" or "lost"
     next_id: int  # above all ids and numbers so far

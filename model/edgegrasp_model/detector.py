@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from edgegrasp_camera.arrays import Array, Float32, Float64, Floats, Int64
-from edgegrasp_model.candidates.collision import clearances
+from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
@@ -202,10 +202,8 @@ class GraspDetector:
         Half of the approach points first, then the other half on objects without a sure grasp,
         then others where few hands are collision-free.
         """
-        scene, previous = prepared.scene, prepared.options.previous
-        if scene is None or not scene.approach_allowed.any():
-            return None
-        if previous is not None and not previous.search:
+        scene = prepared.scene
+        if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
             return None
         sampler = self.sampler(prepared)
         with prepared.timed("candidates"):
@@ -341,14 +339,20 @@ class GraspDetector:
         return Scoring(evaluations, prepared.counts, seconds, name, prepared.warnings)
 
     def _score_poses(
-        self, prepared: Prepared, scene: Scene, T_cloud_hand: Float32, request: Collision
+        self,
+        prepared: Prepared,
+        scene: Scene,
+        T_cloud_hand: Float32,
+        request: Collision,
+        collide: CollisionCheck = collides,
     ) -> list[Evaluation]:
         """An evaluation of each hand pose (M, 4, 4)."""
         with prepared.timed("candidates"):
             poses = scene.frame.poses(T_cloud_hand)
             given = from_hand_poses(scene, poses, prepared.gripper, prepared.crop_radius)
         with prepared.timed("network"):
-            return evaluate(scene, given, prepared.gripper, request, self._scorer(prepared))
+            scorer = self._scorer(prepared)
+            return evaluate(scene, given, prepared.gripper, request, scorer, collide)
 
     def _scorer(self, prepared: Prepared) -> Scorer:
         return Scorer(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from edgegrasp_camera.arrays import Float32, Floats, Int64
-from edgegrasp_model.candidates.collision import clearances, collides
+from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
     MIN_DEPTH,
@@ -52,7 +52,12 @@ class Given:
 
 
 def evaluate(
-    scene: Scene, given: Given, gripper: Gripper, request: Collision, scorer: Scorer
+    scene: Scene,
+    given: Given,
+    gripper: Gripper,
+    request: Collision,
+    scorer: Scorer,
+    collide: CollisionCheck = collides,
 ) -> list[Evaluation]:
     """Evaluate what a caller gives, in order.
 
@@ -62,6 +67,7 @@ def evaluate(
         gripper: The hand.
         request: What collides.
         scorer: The network.
+        collide: Says which hands collide.
     """
     candidates = given.candidates
     view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
@@ -78,7 +84,7 @@ def evaluate(
         candidates,
         gripper,
         score,
-        ~collides(scene, given.candidates.T_cloud_hand, gripper, request),
+        ~collide(scene, given.candidates.T_cloud_hand, gripper, request),
         clearances(scene, hands, gripper),
     )
     evaluations = [Evaluation(None, reason) for reason in given.reason]

@@ -723,6 +723,11 @@ class DetectOptions(Strict):
         default=False, description="whether to return the processed cloud and every candidate"
     )
 
+    @property
+    def follows_only(self) -> bool:
+        """Whether only the grasps of an earlier answer are asked for."""
+        return self.previous is not None and not self.previous.search
+
 
 def parse_options(fields: object) -> DetectOptions:
     """Build options from decoded JSON.

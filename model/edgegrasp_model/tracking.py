@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_model.candidates.collision import CollisionCheck, collides, hits
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.options import (
@@ -153,7 +154,7 @@ def merged(
     followed: Followed,
     options: DetectOptions,
     up: Float64,
-    score: Callable[[Float32, Collision], list[Evaluation]],
+    score: Callable[[Float32, Collision, CollisionCheck], list[Evaluation]],
 ) -> tuple[list[Grasp], Tracking]:
     """The grasps of an earlier answer where they are now, and others; the same one first.
 
@@ -162,7 +163,7 @@ def merged(
         followed: How the objects have moved.
         options: Of the request, with `previous`.
         up: (3,) unit, cloud frame.
-        score: Evaluates poses (M, 4, 4) T_cloud_hand.
+        score: Evaluates poses (M, 4, 4) T_cloud_hand by a rule and a check of collisions.
     """
     previous = options.previous
     assert previous is not None
@@ -172,7 +173,9 @@ def merged(
         before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
         move = [np.eye(4) if one.object is None else followed.moved[one.object] for one in old]
         rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
-        there = zip(old, score((move @ before).astype(np.float32), rule), strict=True)
+        # A hand that may overlap what is seen was checked for the rest when it was found.
+        collide = hits if rule.margin < 0.0 else collides
+        there = zip(old, score((move @ before).astype(np.float32), rule, collide), strict=True)
         kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
     if options.collision.mode == "avoid":
         kept = [grasp for grasp in kept if grasp.collision_free]

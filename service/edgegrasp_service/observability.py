@@ -146,8 +146,8 @@ class JsonFormatter(logging.Formatter):
             "message": record.getMessage(),
         }
         line |= getattr(record, "fields", {})
-        if told := getattr(record, "traceback", ""):  # by a worker
-            line["exception"] = told
+        if traceback := getattr(record, "traceback", ""):  # by a worker
+            line["exception"] = traceback
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)

@@ -24,7 +24,7 @@ class Recorder:
     """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
     Beyond `most` bytes of all files the oldest are deleted. What `hold` has no room for is not
-    recorded: it is told how many bytes wait to be written, and how many no longer do.
+    recorded: it gets how many bytes wait to be written, and how many no longer do.
 
     Raises:
         InvalidSettings: The folder cannot be made or read.

@@ -36,7 +36,7 @@ from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
 logger = logging.getLogger(__name__)
 
-NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are told, not cut off
+NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are answered, not cut off
 CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
 REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble with sockets
 
@@ -44,7 +44,7 @@ REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble wit
 class Server:
     """Both transports of one service. Must be made in the running event loop.
 
-    `observers` are told of every call, besides the metrics and the log.
+    `observers` get every call, besides the metrics and the log.
 
     Raises:
         InvalidSettings: A certificate or a token cannot be used.

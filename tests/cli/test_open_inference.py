@@ -47,7 +47,8 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
 def post(gateway) -> Callable[..., httpx.Response]:
     def post(body: Any, model: str = "grasps") -> httpx.Response:
         url = f"http://{gateway['http']}/v2/models/{model}/infer"
-        return httpx.post(url, content=body if isinstance(body, bytes) else json.dumps(body))
+        content = body if isinstance(body, bytes) else json.dumps(body)
+        return httpx.post(url, content=content, timeout=60)
 
     return post
 

@@ -303,8 +303,8 @@ def object_results(found: Found, settings: Settings, object_id: str = "", most: 
 def failed_result(object_id: str, why: Exception) -> Message:
     """Result of GenerateGrasps whose goal is aborted."""
     message = f"{type(why).__name__}: {why}"
-    told = {"object_id": object_id, "success": False, "message": message, "candidates": []}
-    return {"results": [told]}
+    failure = {"object_id": object_id, "success": False, "message": message, "candidates": []}
+    return {"results": [failure]}
 
 
 def _object_result(
@@ -321,11 +321,11 @@ def _object_result(
         }
         for grasp in (grasps[:most] if most else grasps)
     ]
-    told = " ".join([f"No grasp: {stages}.", *found.detection.warnings])
+    why = " ".join([f"No grasp: {stages}.", *found.detection.warnings])
     return {
         "object_id": name,
         "success": bool(candidates),
-        "message": "" if candidates else told,
+        "message": "" if candidates else why,
         "candidates": candidates,
     }
 

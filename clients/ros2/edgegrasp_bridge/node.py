@@ -103,7 +103,7 @@ class EdgeGraspNode(Node):
             try:
                 set_message_fields(result, answer(goal.request))
                 goal.succeed()
-            except Exception as error:  # tf2's too: a goal that fails is told, the node goes on
+            except Exception as error:  # tf2's too: a goal that fails is reported, the node goes on
                 self.get_logger().error(f"{type(error).__name__}: {error}")
                 if failed is not None:
                     set_message_fields(result, failed(goal.request.object_id, error))

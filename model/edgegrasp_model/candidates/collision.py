@@ -1,5 +1,7 @@
 """Where the hand would hit something, how near it comes, and how far its fingers must open."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
@@ -19,7 +21,7 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.unseen import DepthMap, enters_unseen
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
-MIN_FIXED = 8  # voxels of furniture between the fingers that keep them from closing
+MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
 TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
 
 
@@ -40,13 +42,7 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     Returns:
         (E,)
     """
-    hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
-    if scene.support is not None:
-        hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
-    if scene.obstacles is not None:
-        hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
-    if request.margin < 0.0:  # a followed grasp: the rest was checked when it was found
-        return hit
+    hit = hits(scene, T_cloud_hand, gripper, request)
     free = np.flatnonzero(~hit)
     hit[free] = closes_on_background(scene, T_cloud_hand[free], gripper)
     depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
@@ -54,8 +50,21 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
     return hit
 
 
+def hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
+    """Which open hands meet the cloud, the support plane or an obstacle.  # (E,)."""
+    hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
+    if scene.support is not None:
+        hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
+    if scene.obstacles is not None:
+        hit |= hits_obstacles(T_cloud_hand, scene.obstacles, gripper, request)
+    return hit
+
+
+CollisionCheck = Callable[[Scene, Float32, Gripper, Collision], Bools]
+
+
 def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Bools:
-    """Which hands have a wall, a rim or another fixed thing between their fingers.  # (E,)."""
+    """Which hands have a wall, a rim or other background between their fingers.  # (E,)."""
     fixed = scene.cloud.points[scene.object_of_point == FIXED]
     half, opening = gripper.pad_half_width, gripper.max_opening
     low = np.array([-half, -opening / 2, gripper.palm_z], dtype=np.float32)

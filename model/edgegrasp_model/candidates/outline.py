@@ -38,9 +38,9 @@ LEVEL = 1e-6  # cosine below which a hand moves along the support
 
 @dataclass(frozen=True)
 class Outline:
-    """Where a cloud of N points breaks off for who looks at it from somewhere."""
+    """Where a cloud of N points breaks off as seen from a viewpoint."""
 
-    toward: Float32  # (N, 3) unit, from each point to who looks
+    toward: Float32  # (N, 3) unit, from each point to the viewpoint
     heading: Float32  # (N, 3) unit, orthogonal to `toward`: across the edge, out of the object
     is_edge: Bools  # (N,)
 
@@ -89,7 +89,7 @@ def outline_grasps(
     gripper: Gripper,
     margin: float = 0.0,
 ) -> Candidates:
-    """Hands that come from who looks at an outline and close across it.
+    """Hands that come from the viewpoint of an outline and close across it.
 
     The contact point lies on the outline, the hand in the middle between it and the opposite edge
     of the same surface, and the approach point between the fingers. The hand goes in until

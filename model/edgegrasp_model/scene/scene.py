@@ -121,7 +121,8 @@ def select_points(
     counts["points"] = len(sent.points)
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    sent = near_workspace(sent, options.workspace, FOLLOWED_REACH if follows(options) else REACH)
+    reach = FOLLOWED_REACH if options.follows_only else REACH
+    sent = near_workspace(sent, options.workspace, reach)
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
@@ -129,8 +130,7 @@ def select_points(
     named = _given_numbers(sent) if sent.segment_ids is not None or shown is None else shown.number
     support = choose_support(seen, inside, shown, named >= 0, options, warnings)
     up = _up(options, support, None if viewpoints is None else shown)
-    everywhere = np.ones(len(sent.points), dtype=np.float32)
-    height, margin = support.heights(seen) if support else (everywhere, 0 * everywhere)
+    height, margin = _heights(seen, support)
     labels = np.full(sent.rows_sent, UNLABELLED, dtype=np.int64)
     labels[sent.row[np.abs(height) <= margin]] = SUPPORT
     above = np.flatnonzero(height > margin)
@@ -176,6 +176,14 @@ def _segmentation(
     return segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
 
 
+def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
+    """As `Support.heights`; without a support everything is above it."""
+    if support is not None:
+        return support.heights(seen)
+    everywhere = np.ones(len(seen.points), dtype=np.float32)
+    return everywhere, 0 * everywhere
+
+
 def _recognised(
     shown: Segmentation,
     support: Support | None,
@@ -202,11 +210,6 @@ def _recognised(
             number = with_clusters(number, plan)
             confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
     return number, confidence
-
-
-def follows(options: DetectOptions) -> bool:
-    """Whether only grasps of an earlier answer are asked for."""
-    return options.previous is not None and not options.previous.search
 
 
 def _known_up(options: DetectOptions) -> Float64 | None:
@@ -285,17 +288,17 @@ def build_scene(
     voxels = voxelise(canonical := frame.points(sent.points), voxel_size)
     counts["voxels"] = len(voxels.size)
     _check_voxels(counts["voxels"], max_voxels, voxel_size, sent, options)
-    cloud, kept = _clean_cloud(sent, canonical, voxels, frame, viewpoints)
+    middles = voxels.mean(canonical)
+    cloud, kept = _clean_cloud(sent, middles, voxels, frame, viewpoints)
     counts["kept"] = int(kept.sum())
     if cloud is None:
         return None
-    in_cloud = frame.points_in_cloud(voxels.mean(canonical))
+    in_cloud = frame.points_in_cloud(middles)
     number = voxels.commonest(selected.number)[kept]
 
     def allowed(region: Region | None) -> Bools:
-        if region is None:
-            return np.asarray(number >= 0)
-        return inside_region(region, in_cloud, voxels, sent)[kept] & (number >= 0)
+        held = True if region is None else inside_region(region, in_cloud, voxels, sent)[kept]
+        return np.asarray(held & (number >= 0))
 
     approach = allowed(options.approach_region)
     counts["in_approach_region"] = int(approach.sum())
@@ -325,7 +328,7 @@ def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
 
 def _clean_cloud(
     sent: CheckedCloud,
-    points: Float64,
+    middles: Float32,
     voxels: Voxels,
     frame: CanonicalFrame,
     viewpoints: Float64 | None,
@@ -334,12 +337,11 @@ def _clean_cloud(
 
     Args:
         sent: M points.
-        points: (M, 3) the same in the canonical frame, metres.
+        middles: (V, 3) the voxels' mean points, canonical frame, metres.
         voxels: V of them.
         frame: The canonical frame.
         viewpoints: (W, 3) cloud frame.
     """
-    middles = voxels.mean(points)
     near = Neighbors.within(middles)
     kept = statistical_outlier_removal(near)
     if kept.sum() < MIN_POINTS:
@@ -381,7 +383,7 @@ def choose_support(
     if isinstance(request, SupportPlane):
         # A bin's floor is not measured by the table around it.
         around = BELOW_WORKSPACE * np.abs(request.normal)
-        if follows(options):
+        if options.follows_only:
             around = np.full(3, REACH)  # the workspace is a followed object's
         over = inside_workspace(seen.points, options.workspace, around)
         found = measured(Seen(seen.points[over], seen.viewpoint), request)

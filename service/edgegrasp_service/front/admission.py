@@ -10,7 +10,7 @@ from contextlib import asynccontextmanager
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
 
 LATEST = 15  # service times whose median is the pace: one slow request does not change it
-MARGIN = 1.5  # the wait is told from a median; half of the requests take longer
+MARGIN = 1.5  # the wait is estimated from a median; half of the requests take longer
 
 
 class Ticket:

@@ -221,8 +221,8 @@ class _Nursery:
         control, theirs = socket.socketpair()
         with theirs:
             environment = os.environ | dict.fromkeys(ONE_THREAD, "1")
-            told = settings.model_dump_json()
-            process = subprocess.Popen([*command, told], stdin=theirs.fileno(), env=environment)
+            command = [*command, settings.model_dump_json()]
+            process = subprocess.Popen(command, stdin=theirs.fileno(), env=environment)
         nursery = cls(process, control)
         try:
             ready = await asyncio.to_thread(receive, control.makefile("rb"))
@@ -242,14 +242,14 @@ class _Nursery:
         loop = asyncio.get_running_loop()
 
         def readable() -> None:
-            told = b""
+            ended = b""
             with contextlib.suppress(OSError):
-                told = self._control.recv(ENDED.size * 64)
-            for pid, status in ENDED.iter_unpack(told[: len(told) // ENDED.size * ENDED.size]):
+                ended = self._control.recv(ENDED.size * 64)
+            for pid, status in ENDED.iter_unpack(ended[: len(ended) // ENDED.size * ENDED.size]):
                 crashed = os.WIFSIGNALED(status) and os.WTERMSIG(status) in CRASHES
                 if not self._crashed[pid].done():
                     self._crashed[pid].set_result(crashed or os.WIFEXITED(status))
-            if not told:
+            if not ended:
                 loop.remove_reader(self._control)
                 lost()
 

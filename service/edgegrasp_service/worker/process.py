@@ -33,17 +33,17 @@ ENDED = struct.Struct("=ii")  # what the nursery tells of a worker: its process 
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 
 
-def main(told: str, load: Callable[[Settings], Any] | None = None) -> None:
+def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> None:
     """Load, then fork a worker for each socket that comes on standard input, until its end.
 
-    `told` is the settings, as JSON; `load` makes the catalogue, in the place of `load_catalogue`.
+    `settings_json` is the settings; `load` makes the catalogue, in the place of `load_catalogue`.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the pool says when to end
     # Here, for the front imports this module, and parses nothing.
     from edgegrasp_service.worker.answer import load_catalogue
 
-    pool, settings = socket.socket(fileno=0), Settings(**json.loads(told))
+    pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
     loading = partial(load or load_catalogue, settings)
     try:
         # A GPU's context cannot be forked: with one, every worker loads the weights for itself.
