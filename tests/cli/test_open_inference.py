@@ -31,6 +31,7 @@ def gateway(dummy_server) -> Iterator[dict[str, str]]:
         config = uvicorn.Config(http_app(models, LIMIT), port=0, log_level="error")
         server = uvicorn.Server(config)
         bound = config.bind_socket()
+        bound.listen()  # what connects before the thread runs waits, and is not refused
         thread = threading.Thread(target=server.run, args=([bound],))
         thread.start()
         with grpc_server(models, "127.0.0.1:0", LIMIT) as port:
