@@ -47,6 +47,7 @@ ARMS = "franka_panda/panda.urdf", "xarm/xarm6_robot.urdf", "kuka_iiwa/model.urdf
 WRONG = 0.02, 0.01  # metres, and share of the depth, by which a reading shows nothing real
 UNSEEN_WALLS = 0.25  # of the images, in which steep background has no readings, or few
 EMPTY_SHARE = 0.03  # of the scenes that have no object
+SOFT_SHARE = 0.25  # of the objects, bent and crumpled as bags, clothes and blister packs are
 
 
 class PoolMesh(NamedTuple):
@@ -186,10 +187,10 @@ def draw_scene(
 ) -> SceneMeshes:
     """Any of the kinds of scenes."""
     draw: list[tuple[float, Callable[..., SceneMeshes]]] = [
-        (0.38, _table),
-        (0.28, _bin),
-        (0.16, _shelf),
-        (0.11, _tray),
+        (0.34, _table),
+        (0.33, _bin),
+        (0.17, _shelf),
+        (0.09, _tray),
         (0.07, _floor),
     ]
     shares = np.array([share for share, _ in draw])
@@ -328,15 +329,15 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, ...], size: int = 10) -> 
 
 def make_pool(rng: np.random.Generator, objects: Sequence[Path]) -> list[PoolMesh]:
     """Objects to draw from: of a set, drawn at random, hollow, and of a household."""
-    pool = [pool_mesh(rng, _mesh(path.read_text())) for path in objects]
-    pool = [pool[k] for k in rng.permutation(len(pool))[: NUM_POOL // 3]]
-    pool += [
-        pool_mesh(rng, _mesh(drawn_shape(int(k))))
-        for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]
+    chosen = rng.permutation(len(objects))[: NUM_POOL // 3]
+    meshes = [_mesh(objects[k].read_text()) for k in chosen]
+    meshes += [_mesh(drawn_shape(int(k))) for k in rng.permutation(NUM_DRAWN)[: NUM_POOL // 5]]
+    while len(meshes) < NUM_POOL:
+        meshes.append(merged(household_mesh(rng).parts))
+    return [
+        pool_mesh(rng, softened(rng, mesh) if rng.random() < SOFT_SHARE else mesh)
+        for mesh in meshes
     ]
-    while len(pool) < NUM_POOL:
-        pool.append(pool_mesh(rng, merged(household_mesh(rng).parts)))
-    return pool
 
 
 def pool_mesh(rng: np.random.Generator, mesh: Mesh) -> PoolMesh:
@@ -367,6 +368,24 @@ def simplified(mesh: Mesh, triangles: int) -> Mesh:
     )
     surface = surface.simplify_quadric_decimation(triangles)
     return np.asarray(surface.vertices).copy(), np.asarray(surface.triangles).astype(np.int64)
+
+
+def softened(rng: np.random.Generator, mesh: Mesh) -> Mesh:
+    """A mesh bent by waves in random directions, most of them longer than half of the object."""
+    surface = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh[0]), o3d.utility.Vector3iVector(mesh[1].astype(np.int32))
+    )
+    while len(surface.triangles) < 1000:
+        surface = surface.subdivide_midpoint()
+    points = np.asarray(surface.vertices).copy()
+    longest = np.ptp(points, axis=0).max()
+    for _ in range(8):
+        length = longest * np.exp(rng.uniform(-1.8, 0.4))
+        direction, shift = rng.normal(size=(2, 3))
+        direction *= 2 * np.pi / length / np.linalg.norm(direction)
+        shift *= rng.uniform(0.0, 0.06) * length
+        points += shift * np.sin(points @ direction + rng.uniform(0, 2 * np.pi))[:, None]
+    return points, np.asarray(surface.triangles).astype(np.int64)
 
 
 def merged(parts: Sequence[Mesh]) -> Mesh:
