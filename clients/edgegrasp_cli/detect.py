@@ -197,7 +197,7 @@ class OwnDetector:
         self, cloud: Any = None, *, depth_images: Any = None, colors: Any = None, **options: Any
     ) -> Any:
         """Find grasps in a cloud: an array, a file, or depth images; raises as the detector."""
-        from edgegrasp_client.clouds import depth_image_fields, npy_bytes
+        from edgegrasp_client.requests import depth_image_fields, npy_bytes
         from edgegrasp_model.options import parse_options
         from edgegrasp_model.request_cloud import File, decode_cloud
 

@@ -9,10 +9,8 @@ best = detection.grasps[0]
 
 from edgegrasp_camera.clouds import PointCloud2 as PointCloud2
 from edgegrasp_camera.clouds import PointField as PointField
-from edgegrasp_client.async_client import AsyncGraspClient as AsyncGraspClient
+from edgegrasp_client.client import AsyncGraspClient as AsyncGraspClient
 from edgegrasp_client.client import GraspClient as GraspClient
-from edgegrasp_client.clouds import DepthImage as DepthImage
-from edgegrasp_client.clouds import Intrinsics as Intrinsics
 from edgegrasp_client.connection import Tls as Tls
 from edgegrasp_client.errors import AccessDeniedError as AccessDeniedError
 from edgegrasp_client.errors import DeadlineError as DeadlineError
@@ -45,6 +43,8 @@ from edgegrasp_client.options import Sphere as Sphere
 from edgegrasp_client.options import SupportPlane as SupportPlane
 from edgegrasp_client.options import Suppression as Suppression
 from edgegrasp_client.options import Workspace as Workspace
+from edgegrasp_client.requests import DepthImage as DepthImage
+from edgegrasp_client.requests import Intrinsics as Intrinsics
 from edgegrasp_client.requests import StreamRequest as StreamRequest
 from edgegrasp_client.requests import object_in_scene as object_in_scene
 from edgegrasp_client.requests import on_mask as on_mask

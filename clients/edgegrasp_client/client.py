@@ -1,28 +1,261 @@
-"""The synchronous client: the asynchronous one, run in a thread."""
+"""The client for asyncio, and the synchronous one, which runs it in a thread."""
 
 import asyncio
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+import time
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Iterable,
+    Iterator,
+    Sequence,
+)
 from concurrent.futures import Future
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import httpx
-from typing_extensions import Self
+from typing_extensions import Self, Unpack
 
-from edgegrasp_client.async_client import AsyncGraspClient
-from edgegrasp_client.connection import DEFAULT_ADDRESS, Tls, is_rest
-from edgegrasp_client.errors import invalid
-from edgegrasp_client.requests import StreamRequest
-from edgegrasp_client.results import StreamAnswer
+from edgegrasp_camera.arrays import Array
+from edgegrasp_client.connection import DEFAULT_ADDRESS, RETRIES, Tls, is_rest, retry_delay
+from edgegrasp_client.errors import (
+    DeadlineError,
+    ServerUnavailableError,
+    WorkerLostError,
+    invalid,
+)
+from edgegrasp_client.options import DetectOptions
+from edgegrasp_client.over_grpc import GrpcTransport
+from edgegrasp_client.over_rest import RestTransport
+from edgegrasp_client.requests import Cloud, DepthImage, Request, StreamRequest
+from edgegrasp_client.results import Detection, Grasp, Model, Scoring, StreamAnswer
 
-Parameters = ParamSpec("Parameters")
+POLL_SECONDS = 0.1
+
 Answer = TypeVar("Answer")
+Parameters = ParamSpec("Parameters")
 
 _LOOPS: dict[int, asyncio.AbstractEventLoop] = {}  # by process
 _STARTING = threading.Lock()
 _ASKED_OVER_GRPC: set[int] = set()  # this process, and those that it was forked from
+
+
+class AsyncGraspClient:
+    """Asks one server for grasps; use as an async context manager, or close it.
+
+    Args:
+        address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
+            of a server on this machine: "unix:/run/edgegrasp/grpc.sock" for gRPC,
+            "http+unix:/run/edgegrasp/http.sock" for REST.
+        timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
+            for each of connecting, sending and waiting.
+        retry: Whether to try again, after short random delays, where the server is away or busy
+            or lost the worker of the request. Requests of a stream are sent once.
+        token: For a server that asks for one; over TLS, or everyone on the way can read it.
+        tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
+            authorities that httpx knows.
+        http_transport: httpx transport to use instead of the network.
+    """
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        timeout: float = 30.0,
+        retry: bool = True,
+        token: str | None = None,
+        tls: Tls | None = None,
+        http_transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self._timeout = timeout
+        self._retry = retry
+        self._transport: GrpcTransport | RestTransport
+        if is_rest(address):
+            self._transport = RestTransport(address, token, tls, http_transport)
+        else:
+            self._transport = GrpcTransport(address, token, tls)
+
+    async def detect(
+        self,
+        cloud: Cloud | None = None,
+        *,
+        depth_images: Sequence[DepthImage] | None = None,
+        normals: Array | None = None,
+        colors: Array | None = None,
+        segment_ids: Array | None = None,
+        view_ids: Array | None = None,
+        timeout: float | None = None,
+        **options: Unpack[DetectOptions],
+    ) -> Detection:
+        """Find grasps in a cloud.
+
+        Args:
+            cloud: (N, 3) float32 or float64, metres; (H, W, 3) with NaN for holes; the path of a
+                .npy, .npz, .ply, .pcd or .xyz file; or an object with the attributes of
+                sensor_msgs/PointCloud2.
+            depth_images: Views to fuse in place of a cloud; their cameras are the viewpoints, and
+                the rows of the cloud their pixels, one image after the other.
+            normals: (N, 3), one for each row of the cloud, outward, of any length.
+            colors: (N, 3), one for each row.
+            segment_ids: (N,) integers, which `segments` of a region name.
+            view_ids: (N,) integers: which of several positions of `viewpoint` saw each row.
+            timeout: Seconds to wait; None: the client's own.
+            options: As in DetectOptions; what is left out takes the server's default.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        beside = (normals, colors, segment_ids, view_ids)
+        request = Request(cloud, depth_images, options, beside)
+        return await self._retried(partial(self._transport.ask, Detection, request), timeout)
+
+    async def score(
+        self,
+        cloud: Cloud | None = None,
+        *,
+        edges: Array | None = None,
+        hand_poses: Array | None = None,
+        depth_images: Sequence[DepthImage] | None = None,
+        normals: Array | None = None,
+        colors: Array | None = None,
+        segment_ids: Array | None = None,
+        view_ids: Array | None = None,
+        timeout: float | None = None,
+        **options: Unpack[DetectOptions],
+    ) -> Scoring:
+        """Score edges or hand poses of one's own: the paper's grasp evaluation function.
+
+        `edges` are (M, 2) integers, approach and contact point, rows of the cloud as sent; in their
+        place `hand_poses`, (M, 4, 4) T_cloud_hand. All else is as for `detect`.
+
+        Returns:
+            An evaluation for each edge or pose, in their order.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        beside, given = (normals, colors, segment_ids, view_ids), (edges, hand_poses)
+        request = Request(cloud, depth_images, options, beside, given)
+        return await self._retried(partial(self._transport.ask, Scoring, request), timeout)
+
+    def detect_stream(
+        self,
+        requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
+        *,
+        timeout: float | None = None,
+    ) -> AsyncGenerator[StreamAnswer, None]:
+        """Find grasps in one cloud after the other, over one stream.
+
+        The next request is sent while earlier ones are at work; where the server is behind, this
+        does not run ahead of it. Over REST, each request waits for the answer before it, on one
+        connection.
+
+        Args:
+            requests: Read as they can be sent; an error in it ends the stream once what went
+                before is answered.
+            timeout: Seconds for each request that does not say; None: the client's own.
+
+        Yields:
+            An answer to each request, in their order; the error of one does not end the stream.
+
+        Raises:
+            GraspClientError: The stream itself failed, so that no more answers come.
+        """
+        return self._transport.detect_stream(_named(requests), self._seconds(timeout))
+
+    async def models(self, *, timeout: float | None = None) -> list[Model]:
+        """The weights that `model` can name.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return (await self._retried(self._transport.models, timeout)).models
+
+    async def record_outcome(
+        self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
+    ) -> None:
+        """Tell a server with an `outcomes_file` what became of a grasp of a detection; over REST.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors; over gRPC there is no such call.
+        """
+        tried = {"model": detection.model, "score": float(grasp.score), "held": bool(held)}
+        call = partial(self._transport.record_outcome, tried)
+        await self._retried(call, timeout)
+
+    async def ready(self, *, timeout: float | None = None) -> bool:
+        """Whether the server answers requests: False if it is not there or still loading."""
+        return await self._transport.ready(self._seconds(timeout))
+
+    async def wait_until_ready(self, timeout: float = 60.0) -> None:
+        """Return once the server answers requests.
+
+        Raises:
+            DeadlineError: It did not within `timeout` seconds.
+        """
+        end = time.monotonic() + timeout
+        while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
+            if time.monotonic() >= end:
+                raise DeadlineError(f"The server was not ready within {timeout:g} s.")
+            await asyncio.sleep(POLL_SECONDS)
+
+    async def close(self) -> None:
+        """Close the connection."""
+        self._retry = False  # a call that this cancels has no connection to try again on
+        await self._transport.close()
+
+    async def __aenter__(self) -> Self:
+        """Itself."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the connection."""
+        await self.close()
+
+    def _seconds(self, timeout: float | None) -> float:
+        return self._timeout if timeout is None else timeout
+
+    async def _retried(
+        self, call: Callable[[float], Awaitable[Answer]], timeout: float | None
+    ) -> Answer:
+        """The answer of a call, made again while the server is away or busy and time is left."""
+        left = self._seconds(timeout)
+        end = time.monotonic() + left
+        attempt = 0
+        while True:
+            try:
+                return await call(left)
+            except ServerUnavailableError as error:
+                delay = retry_delay(error, attempt)
+                if not self._retry or delay is None or time.monotonic() + delay >= end:
+                    raise
+                # A request that a worker died of may be why: one more try.
+                attempt += RETRIES if isinstance(error, WorkerLostError) else 1
+            await asyncio.sleep(delay)
+            left = max(end - time.monotonic(), 0.0)
+
+
+async def _named(
+    requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
+) -> AsyncIterator[tuple[str, StreamRequest]]:
+    """The requests with their own names, or their numbers from 0."""
+    number = 0
+    if isinstance(requests, AsyncIterable):
+        async for request in requests:
+            yield request.request_id or str(number), request
+            number += 1
+    else:
+        for number, request in enumerate(requests):
+            yield request.request_id or str(number), request
+
+
+# The synchronous client
 
 
 def _waiting(

@@ -1,7 +1,6 @@
 """How a client knows its server and when it asks again; and a server of one's own."""
 
 import random
-import ssl
 import subprocess
 import sysconfig
 from collections.abc import Iterator, Sequence
@@ -10,23 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import grpc
-
 from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, invalid
 
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 HTTP_OVER_UNIX = "http+unix:"
-
-CHANNEL_OPTIONS = (
-    ("grpc.max_receive_message_length", -1),
-    ("grpc.max_send_message_length", -1),
-    ("grpc.lb_policy_name", "round_robin"),  # of all servers that a name stands for
-    ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
-    ("grpc.max_reconnect_backoff_ms", 1000),
-    # A server that vanished without a word is found out, and streams to it end.
-    ("grpc.keepalive_time_ms", 30_000),
-    ("grpc.keepalive_timeout_ms", 10_000),
-)
 
 RETRIES = 4  # of a call to a server that is away; a busy one is asked until the timeout
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
@@ -64,30 +50,6 @@ def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
     return jittered if attempt < RETRIES else None
 
 
-def channel_credentials(tls: Tls) -> grpc.ChannelCredentials:
-    """For a gRPC channel; raises InvalidRequestError for files that cannot be read."""
-    return grpc.ssl_channel_credentials(
-        root_certificates=_read("tls.ca", tls.ca),
-        private_key=_read("tls.key", tls.key),
-        certificate_chain=_read("tls.certificate", tls.certificate),
-    )
-
-
-def ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
-    """For httpx; raises InvalidRequestError for files that cannot be used."""
-    if tls is None:
-        return True
-    for name in ("ca", "certificate", "key"):
-        _read(f"tls.{name}", getattr(tls, name))
-    try:
-        context = ssl.create_default_context(cafile=tls.ca)
-        if tls.certificate is not None:
-            context.load_cert_chain(tls.certificate, tls.key)
-    except ssl.SSLError as error:
-        raise invalid("tls", f"files that do not hold it ({error})", "Give PEM files.") from None
-    return context
-
-
 def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
     """What carries a token, in metadata and headers; raises InvalidRequestError if none can."""
     if token is None:
@@ -95,6 +57,16 @@ def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
     if not (token.isascii() and token.isprintable() and token and " " not in token):
         raise invalid("token", f"{len(token)} letters", "Give printable ASCII without spaces.")
     return (("authorization", f"Bearer {token}"),)
+
+
+def read_pem(name: str, path: str | Path | None) -> bytes | None:
+    """What is in a file of a Tls; raises InvalidRequestError if it cannot be read."""
+    if path is None:
+        return None
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise invalid(name, repr(str(path)), f"{error.strerror}.") from None
 
 
 class Addresses(NamedTuple):
@@ -138,12 +110,3 @@ def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses
                 server.wait(STOP_SECONDS)
             except subprocess.TimeoutExpired:
                 server.kill()
-
-
-def _read(name: str, path: str | Path | None) -> bytes | None:
-    if path is None:
-        return None
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise invalid(name, repr(str(path)), f"{error.strerror}.") from None

@@ -1,22 +1,116 @@
-"""What a caller asks, checked as far as it can be without the server.
+"""What a caller asks: checked as far as it can be without the server, in the forms of the wire.
 
 Also what makes a request of a segmenter's mask, or of an object's cloud and its scene's.
 """
 
-from collections.abc import AsyncIterable, AsyncIterator, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, cast
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from typing_extensions import Unpack
+from typing_extensions import NotRequired, TypedDict, Unpack
 
 from edgegrasp_camera.arrays import Array, Float32
-from edgegrasp_client.clouds import Cloud, DepthImage
+from edgegrasp_camera.clouds import PointCloud2
+from edgegrasp_camera.depth import intrinsics_of
+from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_client.errors import invalid
 from edgegrasp_client.options import DetectOptions
 
 SAME_POINT = 0.005  # metres: the side of a cell in which the scene repeats the object
+DEPTH_ENCODINGS = {"float32": "32FC1", "float64": "64FC1", "uint16": "16UC1"}
+
+
+class Intrinsics(TypedDict):
+    """A pinhole camera without distortion, pixels. The centre of the top left pixel is (0, 0)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class DepthImage(TypedDict):
+    """What a camera saw. Camera frame: x right, y down, z forward."""
+
+    # (H, W), 0 or NaN where there is no reading: metres as float32 or float64, millimetres as
+    # uint16. Or the path of a file that holds it: .npy, or .png of 16 bits.
+    depth: Array | str | PathLike[str]
+    # Or fx, fy, cx, cy; or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    intrinsics: Intrinsics | Sequence[float] | Array
+    # (4, 4) camera to cloud, metres; left out: the cloud's frame is the camera's.
+    T_cloud_camera: NotRequired[Array | Sequence[Sequence[float]]]
+    # Metres that one unit of the depth is worth; left out: 0.001 of whole numbers, 1 of floats.
+    depth_scale: NotRequired[float]
+
+
+Cloud = Array | str | PathLike[str] | PointCloud2
+BESIDE = ("normals", "colors", "segment_ids", "view_ids")
+TO_SCORE = ("edges", "hand_poses")
+Fits = Callable[[tuple[int, ...]], bool]
+VECTORS: tuple[str, Fits, str] = (
+    "iuf",
+    lambda shape: shape[-1:] == (3,),
+    "an array of numbers, three for each row of the cloud",
+)
+INTEGERS: tuple[str, Fits, str] = (
+    "iu",
+    lambda shape: True,
+    "an array of integers, one for each row of the cloud, within 32 bits",
+)
+ARRAYS: dict[str, tuple[str, Fits, str]] = {  # kinds of dtype, shapes that fit, in words
+    "normals": VECTORS,
+    "colors": VECTORS,
+    "segment_ids": INTEGERS,
+    "view_ids": INTEGERS,
+    "edges": ("iu", lambda s: s[1:] == (2,), "an array (M, 2) of rows of the cloud"),
+    "hand_poses": ("f", lambda s: s[1:] == (4, 4), "an array (M, 4, 4) of T_cloud_hand"),
+}
+
+
+class Request:
+    """A cloud or depth images, options, and the arrays that come with them.
+
+    Args:
+        cloud: As of `GraspClient.detect`, as the next two.
+        depth_images: Views in place of a cloud.
+        options: Of the detection.
+        beside: Arrays in the order of BESIDE.
+        to_score: Edges and hand poses, of which one is None; empty: grasps are asked for.
+
+    Attributes:
+        options: As of `plain_options`.
+        arrays: Those that are given, as they are sent: (N, 3) float32 or (N,) int32; edges (M, 2)
+            and hand poses (M, 4, 4) as they are.
+        scores: Whether there is something to score.
+
+    Raises:
+        InvalidRequestError: There is no cloud, or more than one; an array or an option is wrong.
+    """
+
+    def __init__(
+        self,
+        cloud: Cloud | None,
+        depth_images: Sequence[DepthImage] | None,
+        options: Mapping[str, Any],
+        beside: Sequence[Array | None] = (),
+        to_score: Sequence[Array | None] = (),
+    ) -> None:
+        self.cloud, self.depth_images = cloud, depth_images
+        self.options = plain_options(options)
+        if (cloud is None) == (depth_images is None):
+            value = "nothing" if cloud is None else "a cloud beside depth_images"
+            raise invalid("cloud", value, "Give a cloud or depth_images.")
+        self.scores = bool(to_score)
+        if to_score and (to_score[0] is None) == (to_score[1] is None):
+            value = "nothing" if to_score[0] is None else "edges beside hand_poses"
+            raise invalid("edges", value, "Give edges or hand_poses.")
+        given = (*zip(BESIDE, beside, strict=False), *zip(TO_SCORE, to_score, strict=False))
+        self.arrays = {name: _sent(name, array) for name, array in given if array is not None}
 
 
 class StreamRequest:
@@ -44,66 +138,10 @@ class StreamRequest:
         view_ids: Array | None = None,
         **options: Unpack[DetectOptions],
     ) -> None:
-        plain = plain_options(options)
-        arrays = (normals, colors, segment_ids, view_ids)
-        self.request = Request(cloud, depth_images, *arrays, options=plain)
+        beside = (normals, colors, segment_ids, view_ids)
+        self.request = Request(cloud, depth_images, options, beside)
         self.request_id = request_id
         self.timeout = timeout
-
-    def name(self, number: int) -> str:
-        """Its own name, or its number in the stream."""
-        return self.request_id or str(number)
-
-
-@dataclass(frozen=True)
-class Request:
-    """A cloud or depth images, arrays with an entry for each row of the cloud, and options.
-
-    Raises:
-        InvalidRequestError: There is no cloud, or more than one; an array is of a wrong kind.
-    """
-
-    cloud: Cloud | None = None
-    depth_images: Sequence[DepthImage] | None = None
-    normals: Array | None = None
-    colors: Array | None = None
-    segment_ids: Array | None = None
-    view_ids: Array | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)  # as of `plain_options`
-
-    def __post_init__(self) -> None:
-        if (self.cloud is None) == (self.depth_images is None):
-            value = "nothing" if self.cloud is None else "a cloud beside depth_images"
-            raise invalid("cloud", value, "Give a cloud or depth_images.")
-        self.row_arrays()
-
-    def row_arrays(self) -> dict[str, Array]:
-        """The arrays beside the cloud: (N, 3) float32 or (N,) int32."""
-        vectors = {"normals": self.normals, "colors": self.colors}
-        integers = {"segment_ids": self.segment_ids, "view_ids": self.view_ids}
-        return {
-            **{name: _vectors(name, a) for name, a in vectors.items() if a is not None},
-            **{name: _integers(name, a) for name, a in integers.items() if a is not None},
-        }
-
-
-@dataclass(frozen=True)
-class ScoreRequest(Request):
-    """A request, and the edges (M, 2) or hand poses (M, 4, 4) to score in its cloud."""
-
-    edges: Array | None = None
-    hand_poses: Array | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.edges is None) == (self.hand_poses is None):
-            value = "nothing" if self.edges is None else "edges beside hand_poses"
-            raise invalid("edges", value, "Give edges or hand_poses.")
-        rows, poses = "an array (M, 2) of rows of the cloud", "an array (M, 4, 4) of T_cloud_hand"
-        if self.edges is not None:
-            _check("edges", self.edges, "iu", lambda shape: shape[1:] == (2,), rows)
-        else:
-            _check("hand_poses", self.hand_poses, "f", lambda shape: shape[1:] == (4, 4), poses)
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -170,18 +208,148 @@ def object_in_scene(
     return np.concatenate([wanted, rest]), segment_ids
 
 
-async def async_enumerate(
-    requests: AsyncIterable[StreamRequest] | Iterable[StreamRequest],
-) -> AsyncIterator[tuple[int, StreamRequest]]:
-    """The requests with their numbers, from 0."""
-    if isinstance(requests, AsyncIterable):
-        number = 0
-        async for request in requests:
-            yield number, request
-            number += 1
-    else:
-        for numbered in enumerate(requests):
-            yield numbered
+# The forms of the wire
+
+
+@dataclass(frozen=True)
+class CloudFile:
+    """A point cloud file."""
+
+    format: str  # one of FILE_FORMATS
+    data: bytes
+
+
+def float32_points(cloud: Cloud) -> Float32 | None:
+    """The cloud as (N, 3) float32 if it is an array of N points; None if it is not."""
+    if not isinstance(cloud, np.ndarray) or cloud.dtype not in (np.float32, np.float64):
+        return None
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        return None
+    with np.errstate(over="ignore"):  # the server refuses infinity
+        return np.ascontiguousarray(cloud, dtype=np.float32)
+
+
+def cloud_file(cloud: Cloud) -> CloudFile:
+    """The cloud as a file; an array of a wrong shape is sent as it is, for the server to refuse.
+
+    Raises:
+        InvalidRequestError: It is neither an array of numbers nor a readable file of a known
+            format.
+    """
+    if isinstance(cloud, np.ndarray):
+        points = float32_points(cloud)
+        try:
+            return CloudFile("npy", npy_bytes(cloud if points is None else points))
+        except ValueError:
+            fix = "Send float32 or float64 metres."
+            raise invalid("cloud", f"dtype {cloud.dtype}", fix) from None
+    if not isinstance(cloud, str | PathLike):
+        fix = "Give an (N, 3) array in metres, a file's path, or a PointCloud2."
+        raise invalid("cloud", f"a {type(cloud).__name__}", fix)
+    path = Path(cloud)
+    file_format = path.suffix[1:].lower()
+    if file_format not in FILE_FORMATS:
+        fix = f"Give one of: {', '.join(FILE_FORMATS)}; a depth image as one of depth_images."
+        raise invalid("cloud", repr(path.name), fix)
+    try:
+        return CloudFile(file_format, path.read_bytes())
+    except OSError as error:
+        raise invalid("cloud", f"{path} ({error.strerror})", "Give a readable file.") from None
+
+
+def npy_bytes(array: Array) -> bytes:
+    """An array as an .npy file; raises ValueError for one of objects."""
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def is_point_cloud2(cloud: object) -> TypeGuard[PointCloud2]:
+    """Whether an object has the attributes of sensor_msgs/PointCloud2."""
+    return all(hasattr(cloud, name) for name in PointCloud2.__annotations__)
+
+
+def point_cloud2_fields(cloud: PointCloud2) -> dict[str, Any]:
+    """The fields of edgegrasp.v1.PointCloud2; `data` as bytes."""
+    data = cloud.data
+    if not isinstance(data, bytes):
+        data = np.asarray(data, dtype=np.uint8).tobytes()
+    own = {"height": int, "width": int, "is_bigendian": bool, "point_step": int, "row_step": int}
+    of_field = {"name": str, "offset": int, "datatype": int, "count": int}
+    return {
+        **{name: kind(getattr(cloud, name)) for name, kind in own.items()},
+        "fields": [
+            {name: kind(getattr(field, name)) for name, kind in of_field.items()}
+            for field in cloud.fields
+        ],
+        "data": data,
+    }
+
+
+def depth_image_fields(image: DepthImage, number: int) -> dict[str, Any]:
+    """The fields of edgegrasp.v1.DepthImage; `data` as bytes, the pose as a (4, 4) list.
+
+    Args:
+        image: The image.
+        number: Which of the images it is, for errors.
+
+    Raises:
+        InvalidRequestError: A field is missing, unknown, or of a wrong type or shape.
+    """
+    path = f"depth_images.{number}"
+    needed, known = DepthImage.__required_keys__, DepthImage.__annotations__
+    if not isinstance(image, Mapping) or not needed <= set(image) <= set(known):
+        found = ", ".join(map(str, image)) if isinstance(image, Mapping) else type(image).__name__
+        fix = "Give a mapping with depth and intrinsics, T_cloud_camera and depth_scale or not."
+        raise invalid(path, found[:80], fix)
+    pose = np.asarray(image.get("T_cloud_camera", np.eye(4)))
+    if pose.shape != (4, 4) or pose.dtype.kind not in "iuf":
+        value = f"shape {pose.shape}, dtype {pose.dtype}"
+        raise invalid(f"{path}.T_cloud_camera", value, "Give a 4 x 4 matrix.")
+    scale = {name: image[name] for name in ("depth_scale",) if name in image}
+    return {
+        "depth": _depth_fields(image["depth"], f"{path}.depth"),
+        "intrinsics": _intrinsics_fields(image["intrinsics"], f"{path}.intrinsics"),
+        "T_cloud_camera": pose.astype(np.float64).tolist(),
+        **scale,
+    }
+
+
+def _intrinsics_fields(intrinsics: object, path: str) -> dict[str, float]:
+    """fx, fy, cx and cy of a mapping, of four numbers or of a matrix (3, 3) or (9,)."""
+    try:
+        numbers = intrinsics_of(intrinsics)._asdict()
+        return {name: float(number) for name, number in numbers.items()}
+    except (TypeError, ValueError):
+        pass
+    fix = "Give fx, fy, cx, cy in pixels, or the matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."
+    raise invalid(path, repr(intrinsics)[:80], fix)
+
+
+def _depth_fields(depth: object, path: str) -> dict[str, Any]:
+    """The fields of edgegrasp.v1.Depth; a .png file is sent as it is."""
+    fix = f"Give an (H, W) array of {', '.join(DEPTH_ENCODINGS)}, or a .png or .npy file of one."
+    if isinstance(depth, str | PathLike):
+        file = Path(depth)
+        try:
+            if file.suffix.lower() == ".png":
+                return {"encoding": "png", "data": file.read_bytes()}
+            depth = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise invalid(path, f"{file} ({error})", fix) from None
+    if not isinstance(depth, np.ndarray):
+        raise invalid(path, f"a {type(depth).__name__}", fix)
+    if depth.ndim == 3 and depth.shape[2] == 1:
+        depth = depth[..., 0]
+    if depth.ndim != 2 or depth.dtype.name not in DEPTH_ENCODINGS:
+        raise invalid(path, f"shape {depth.shape}, dtype {depth.dtype}", fix)
+    little_endian = depth.dtype.newbyteorder("<")
+    return {
+        "height": depth.shape[0],
+        "width": depth.shape[1],
+        "encoding": DEPTH_ENCODINGS[depth.dtype.name],
+        "data": np.ascontiguousarray(depth, dtype=little_endian).tobytes(),
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -196,27 +364,19 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _vectors(name: str, array: Array) -> Array:
-    rows = "an array of numbers, three for each row of the cloud"
-    _check(name, array, "iuf", lambda shape: shape[-1:] == (3,), rows)
-    return np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32)
-
-
-def _integers(name: str, array: Array) -> Array:
-    rows = "an array of integers, one for each row of the cloud, within 32 bits"
-    _check(name, array, "iu", lambda _: True, rows)
-    if array.size and (array.max() >= 2**31 or array.min() < -(2**31)):
-        raise invalid(name, f"values from {array.min()} to {array.max()}", f"Give {rows}.")
-    return np.ascontiguousarray(array.reshape(-1), dtype=np.int32)
-
-
-def _check(
-    name: str, array: object, kinds: str, fits: Callable[[tuple[int, ...]], bool], wanted: str
-) -> None:
-    """Raise InvalidRequestError unless it is an array of such dtype kinds and a shape that fits."""
+def _sent(name: str, array: object) -> Array:
+    """An array of the request as it is sent; raises InvalidRequestError where it is none."""
+    kinds, fits, wanted = ARRAYS[name]
     if not isinstance(array, np.ndarray):
         raise invalid(name, f"a {type(array).__name__}", f"Give {wanted}.")
     if array.dtype.kind not in kinds:
         raise invalid(name, f"dtype {array.dtype}", f"Give {wanted}.")
     if not fits(array.shape):
         raise invalid(name, f"shape {array.shape}", f"Give {wanted}.")
+    if name in TO_SCORE:
+        return array
+    if kinds == "iuf":
+        return np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32)
+    if array.size and (array.max() >= 2**31 or array.min() < -(2**31)):
+        raise invalid(name, f"values from {array.min()} to {array.max()}", f"Give {wanted}.")
+    return np.ascontiguousarray(array.reshape(-1), dtype=np.int32)

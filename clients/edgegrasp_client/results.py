@@ -1,13 +1,15 @@
 """What a server answers, as typed values, and how they are read from either transport."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass, is_dataclass
+from functools import lru_cache, partial
+from types import NoneType
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edgegrasp_camera.arrays import Array, Float32, Float64
+from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_client.errors import GraspClientError
 
 Int32 = NDArray[np.int32]
@@ -43,8 +45,10 @@ class Grasp:
     """One grasp: move to `T_cloud_hand` along `approach_direction`, then close."""
 
     score: float  # probability that the grasp holds
-    T_cloud_hand: Float32  # (4, 4) hand link frame: z out of the palm, y the closing direction
-    T_cloud_tcp: Float32  # (4, 4) tool centre point, same axes
+    T_cloud_hand: Annotated[
+        Float32, (4, 4)
+    ]  # hand link frame: z out of the palm, y the closing direction
+    T_cloud_tcp: Annotated[Float32, (4, 4)]  # tool centre point, same axes
     width: float  # metres to open to before the approach; the maximum where an end is hidden
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
@@ -106,7 +110,8 @@ class DetectedObject:
     # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
     # nobody can say.
     reason: str | None
-    surface: Float32 | None = None  # (3 K,) points by which it is found again; with `previous`
+    # (3 K,) points by which it is found again; with `previous`
+    surface: Annotated[Float32, (-1,)] | None = None
 
 
 @dataclass(frozen=True)
@@ -121,11 +126,11 @@ class Tracking:
 class DebugInfo:
     """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
 
-    points: Float32  # (V, 3) metres, cloud frame
-    normals: Float32  # (V, 3) unit
+    points: Annotated[Float32, (-1, 3)]  # (V, 3) metres, cloud frame
+    normals: Annotated[Float32, (-1, 3)]  # (V, 3) unit
     approach_index: Int32  # (E,) p_a, rows of `points`
     contact_index: Int32  # (E,) p_c, rows of `points`
-    T_cloud_hand: Float32  # (E, 4, 4)
+    T_cloud_hand: Annotated[Float32, (-1, 4, 4)]  # (E, 4, 4)
     score: Float32  # (E,) NaN where it was not scored
     outcome: list[str]  # E of them: "returned", or what became of it
     support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
@@ -192,6 +197,13 @@ class Model:
 
 
 @dataclass(frozen=True, eq=False)
+class Models:
+    """All weights that a server has loaded."""
+
+    models: list[Model]
+
+
+@dataclass(frozen=True, eq=False)
 class StreamAnswer:
     """The answer to one request of a stream: a detection or an error."""
 
@@ -217,112 +229,41 @@ _STAGES = (
 )
 
 
-Record = TypeVar("Record", Model, FoundSupport, GripperOutline, DetectedObject, Grasp, Tracking)
+Record = TypeVar("Record")
 Read = Callable[[Any, str], Any]
 """read(answer, name): the field of that name of an object in an answer; None if it is absent."""
 
-
-def detection_from(answer: Any, read: Read) -> Detection:
-    """The answer to a request for grasps."""
-    debug, support = read(answer, "debug"), read(answer, "support")
-    tracking = read(answer, "tracking")
-    return Detection(
-        grasps=[_grasp(grasp, read) for grasp in read(answer, "grasps")],
-        up=_array(read(answer, "up")),
-        support=None if support is None else _record(FoundSupport, support, read),
-        objects=[_record(DetectedObject, thing, read) for thing in read(answer, "objects")],
-        gripper=_record(GripperOutline, read(answer, "gripper"), read),
-        debug=None if debug is None else _debug(debug, read),
-        tracking=None if tracking is None else _record(Tracking, tracking, read),
-        **_common(answer, read),
-    )
+_hints = lru_cache(partial(get_type_hints, include_extras=True))
 
 
-def scoring_from(answer: Any, read: Read) -> Scoring:
-    """The answer to a request to score."""
-    return Scoring(
-        evaluations=[_evaluation(each, read) for each in read(answer, "evaluations")],
-        **_common(answer, read),
-    )
+def read_as(kind: type[Record], answer: Any, read: Read) -> Record:
+    """An answer, or an object in one, as one of the dataclasses above."""
+    if not is_dataclass(kind):  # an answer that says nothing
+        return kind()
+    values = {name: _value(hint, read(answer, name), read) for name, hint in _hints(kind).items()}
+    if kind is ArmTrajectory:  # gRPC has rows one behind the other
+        for name in ("positions", "velocities"):
+            values[name] = values[name].reshape(-1, len(values["joint_names"]))
+    return cast("Callable[..., Record]", kind)(**values)
 
 
-def models_from(answer: Any, read: Read) -> list[Model]:
-    """The answer to a listing."""
-    return [_record(Model, model, read) for model in read(answer, "models")]
-
-
-def _record(kind: type[Record], answer: Any, read: Read) -> Record:
-    """An object whose fields are read as they are, lists of numbers as arrays, poses (4, 4)."""
-    plain = (str, int, float, type(None))
-    names = [one.name for one in fields(kind) if one.name != "arm"]
-    values: dict[str, Any] = {name: read(answer, name) for name in names}
-    for name, value in values.items():
-        if not isinstance(value, plain):
-            values[name] = _array(value).reshape((4, 4) if name.startswith("T_") else -1)
-    return kind(**values)
-
-
-def _grasp(answer: Any, read: Read) -> Grasp:
-    arm = read(answer, "arm")
-    return replace(_record(Grasp, answer, read), arm=None if arm is None else _arm(arm, read))
-
-
-def _arm(answer: Any, read: Read) -> ArmPlan:
-    def joints(name: str) -> Float64 | None:
-        sent = read(answer, name)
-        return np.array(sent, dtype=np.float64) if sent else None  # gRPC: none are sent
-
-    motion, trajectory = read(answer, "trajectory"), None
-    if motion is not None:
-        names = list(read(motion, "joint_names"))
-        times = np.array(read(motion, "times"), dtype=np.float64)
-        positions, velocities = (
-            np.array(read(motion, name), dtype=np.float64).reshape(-1, len(names))
-            for name in ("positions", "velocities")
-        )
-        ends = read(motion, "pregrasp_row"), read(motion, "grasp_row")
-        trajectory = ArmTrajectory(names, times, positions, velocities, *ends)
-    reachable, before = read(answer, "reachable"), joints("pregrasp_joints")
-    return ArmPlan(reachable, before, joints("grasp_joints"), trajectory)
-
-
-def _array(numbers: Any) -> Float32:
-    return np.array(numbers, dtype=np.float32)
-
-
-def _common(answer: Any, read: Read) -> dict[str, Any]:
-    return {
-        "counts": _in_order(read(answer, "counts")),
-        "seconds": _in_order(read(answer, "seconds")),
-        "model": read(answer, "model"),
-        "warnings": list(read(answer, "warnings")),
-    }
-
-
-def _in_order(stages: Mapping[str, Any]) -> dict[str, Any]:
-    """By stage; stages of a newer server come last."""
-    return {name: stages[name] for name in (*_STAGES, *sorted(stages)) if name in stages}
-
-
-def _evaluation(answer: Any, read: Read) -> Evaluation:
-    grasp = read(answer, "grasp")
-    return Evaluation(None if grasp is None else _grasp(grasp, read), read(answer, "reason"))
-
-
-def _debug(answer: Any, read: Read) -> DebugInfo:
-    def array(name: str, dtype: type, *shape: int) -> Array:
-        return np.array(read(answer, name) or (), dtype=dtype).reshape(shape)
-
-    return DebugInfo(
-        points=array("points", np.float32, -1, 3),
-        normals=array("normals", np.float32, -1, 3),
-        approach_index=array("approach_index", np.int32, -1),
-        contact_index=array("contact_index", np.int32, -1),
-        T_cloud_hand=array("T_cloud_hand", np.float32, -1, 4, 4),
-        score=array("score", np.float32, -1),  # null in JSON becomes NaN
-        outcome=list(read(answer, "outcome")),
-        support_plane=array("support_plane", np.float32, 4)
-        if read(answer, "support_plane")
-        else None,
-        labels=array("labels", np.int32, -1),
-    )
+def _value(hint: Any, value: Any, read: Read) -> Any:
+    """A value as a field of such a type has it; arrays in the shape of the annotation."""
+    parts = [part for part in get_args(hint) if part is not NoneType]
+    if NoneType in get_args(hint):
+        scalar = parts[0] in (bool, float, int, str) or is_dataclass(parts[0])
+        absent = value is None or not (scalar or len(value))  # gRPC: none are sent
+        return None if absent else _value(parts[0], value, read)
+    if is_dataclass(hint):
+        return read_as(hint, value, read)
+    if get_origin(hint) is list:
+        inner = is_dataclass(parts[0])
+        return [read_as(parts[0], one, read) if inner else one for one in value]
+    if get_origin(hint) is dict:  # in the order of the stages; those of a newer server come last
+        return {name: value[name] for name in (*_STAGES, *sorted(value)) if name in value}
+    if get_origin(hint) is Annotated:
+        return _value(parts[0], value, read).reshape(hint.__metadata__[0])
+    if get_origin(hint) is np.ndarray:
+        (dtype,) = get_args(get_args(hint)[1])
+        return np.array(value, dtype=dtype)  # null in JSON becomes NaN
+    return value

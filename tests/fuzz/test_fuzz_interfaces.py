@@ -15,7 +15,7 @@ from mcp.server.mcpserver.exceptions import ToolError, UnexpectedToolError
 
 from edgegrasp.oip import open_inference_pb2 as messages
 from edgegrasp_cli import mcp, open_inference
-from edgegrasp_client.clouds import cloud_file, depth_image_fields
+from edgegrasp_client.requests import cloud_file, depth_image_fields
 
 from .conftest import POINTS, VALUES, changed, given, mutated
 

@@ -14,9 +14,9 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 from tests.robot.arms import BOXES, TURNED, scene_of
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client import grpc_wire
-from edgegrasp_client.requests import Request, plain_options
-from edgegrasp_client.results import detection_from
+from edgegrasp_client.over_grpc import message_of, read_field
+from edgegrasp_client.requests import Request
+from edgegrasp_client.results import Detection, read_as
 from edgegrasp_model.results import Pace
 from edgegrasp_robot import load_robots
 from edgegrasp_service.settings import Settings
@@ -57,9 +57,9 @@ def ask(robot, transport, settings=SETTINGS, remaining=60.0, **changes):
     """The answer to a request about the robot, and the catalogue that it went to."""
     catalogue = Catalogue(robot)
     asked = {"name": "fr3", "T_base_cloud": TURNED, "joints": robot.home} | changes
-    request = Request(catalogue.cloud, options=plain_options({"robot": asked}))
+    request = Request(catalogue.cloud, None, {"robot": asked})
     if transport == "grpc":
-        body = grpc_wire.detect_message(request).SerializeToString()
+        body = message_of(request).SerializeToString()
         return answer(Job("DetectGrasps", "grpc", body, remaining), catalogue, settings), catalogue
     text = {"points": catalogue.cloud.tolist(), "options": dict(request.options)}
     job = Job("DetectGrasps", "http", json.dumps(text).encode(), remaining, "application/json")
@@ -68,8 +68,9 @@ def ask(robot, transport, settings=SETTINGS, remaining=60.0, **changes):
 
 def read(transport, body):
     if transport == "grpc":
-        return detection_from(grasp_pb2.DetectGraspsResponse.FromString(body), grpc_wire.read_field)
-    return detection_from(json.loads(body), operator.getitem)
+        message = grasp_pb2.DetectGraspsResponse.FromString(body)
+        return read_as(Detection, message, read_field)
+    return read_as(Detection, json.loads(body), operator.getitem)
 
 
 @pytest.mark.parametrize("transport", ["grpc", "http"])

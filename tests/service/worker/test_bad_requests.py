@@ -11,7 +11,7 @@ import pytest
 from tests.cloud_files import npy
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.grpc_wire import fill
+from edgegrasp_client.over_grpc import fill
 
 from .conftest import GrpcAsker, RestAsker
 

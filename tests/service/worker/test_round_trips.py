@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.grpc_wire import fill
+from edgegrasp_client.over_grpc import fill
 from edgegrasp_client.requests import plain_options
 from edgegrasp_model.options import DetectOptions, parse_options
 from edgegrasp_service.worker.http_bodies import options_from_query

@@ -1,20 +1,14 @@
-"""Requests, answers and errors as gRPC carries them."""
+"""The gRPC transport: requests, answers and errors as messages."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
-import grpc
+import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
-from edgegrasp.v1 import grasp_pb2
-from edgegrasp_client.clouds import (
-    cloud_file,
-    depth_image_fields,
-    float32_points,
-    is_point_cloud2,
-    point_cloud2_fields,
-)
+from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client.connection import Tls, read_pem, token_metadata
 from edgegrasp_client.errors import (
     AccessDeniedError,
     DeadlineError,
@@ -27,14 +21,35 @@ from edgegrasp_client.errors import (
     error_of_kind,
     invalid,
 )
-from edgegrasp_client.requests import Request, ScoreRequest, StreamRequest
-from edgegrasp_client.results import StreamAnswer, detection_from
+from edgegrasp_client.requests import (
+    Request,
+    StreamRequest,
+    cloud_file,
+    depth_image_fields,
+    float32_points,
+    is_point_cloud2,
+    point_cloud2_fields,
+)
+from edgegrasp_client.results import Detection, Models, StreamAnswer, read_as
+
+Answer = TypeVar("Answer")
+
+CHANNEL_OPTIONS = (
+    ("grpc.max_receive_message_length", -1),
+    ("grpc.max_send_message_length", -1),
+    ("grpc.lb_policy_name", "round_robin"),  # of all servers that a name stands for
+    ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
+    ("grpc.max_reconnect_backoff_ms", 1000),
+    # A server that vanished without a word is found out, and streams to it end.
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+)
 
 # grpc.health.v1: an empty request asks about the whole server; field 1 = 1 means SERVING.
 HEALTH_CHECK = "/grpc.health.v1.Health/Check"
 SERVING = b"\x08\x01"
 
-_ERROR_METADATA = "edgegrasp-error-bin"
+ERROR_METADATA = "edgegrasp-error-bin"
 
 Filled = tuple[Message, object]  # a message, and the mapping of its fields that goes into it
 
@@ -51,36 +66,94 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
 }
 
 
-def detect_message(request: Request) -> grasp_pb2.DetectGraspsRequest:
-    """A request for grasps; raises InvalidRequestError for what no message can hold."""
-    message = grasp_pb2.DetectGraspsRequest()
-    _set_cloud_and_options(message, request)
-    return message
+class GrpcTransport:
+    """Calls over one channel; raises GraspClientErrors."""
+
+    def __init__(self, address: str, token: str | None, tls: Tls | None) -> None:
+        if tls is None:
+            self._channel = grpc.aio.insecure_channel(address, CHANNEL_OPTIONS)
+        else:
+            credentials = grpc.ssl_channel_credentials(
+                root_certificates=read_pem("tls.ca", tls.ca),
+                private_key=read_pem("tls.key", tls.key),
+                certificate_chain=read_pem("tls.certificate", tls.certificate),
+            )
+            self._channel = grpc.aio.secure_channel(address, credentials, CHANNEL_OPTIONS)
+        self._metadata = token_metadata(token)
+        self._stub = grasp_pb2_grpc.GraspServiceStub(self._channel)
+        self._check = self._channel.unary_unary(HEALTH_CHECK, bytes, bytes)
+
+    async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
+        """The answer to a request."""
+        method = self._stub.ScoreGrasps if request.scores else self._stub.DetectGrasps
+        return read_as(kind, await self._call(method, message_of(request), timeout), read_field)
+
+    async def models(self, timeout: float) -> Models:
+        """The weights that the server has loaded."""
+        answer = await self._call(self._stub.ListModels, grasp_pb2.ListModelsRequest(), timeout)
+        return read_as(Models, answer, read_field)
+
+    async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
+        """Refused: gRPC has no such call."""
+        raise invalid("address", "gRPC", "Outcomes are taken over REST: give http://host:port.")
+
+    async def detect_stream(
+        self, requests: AsyncIterator[tuple[str, StreamRequest]], timeout: float
+    ) -> AsyncGenerator[StreamAnswer, None]:
+        """An answer to each of the named requests."""
+        failed: list[Exception] = []
+
+        async def messages() -> AsyncIterator[grasp_pb2.DetectGraspsStreamRequest]:
+            try:
+                async for name, request in requests:
+                    yield grasp_pb2.DetectGraspsStreamRequest(
+                        request_id=name,
+                        request=message_of(request.request),
+                        timeout=timeout if request.timeout is None else request.timeout,
+                    )
+            except Exception as error:  # gRPC reads this elsewhere, and would only log it
+                failed.append(error)
+
+        call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
+        try:
+            async for answer in call:
+                if answer.HasField("detection"):
+                    detection = read_as(Detection, answer.detection, read_field)
+                    yield StreamAnswer(answer.request_id, detection)
+                else:
+                    error = _described(answer.error.message, answer.error.detail)
+                    yield StreamAnswer(answer.request_id, error=error)
+        except grpc.RpcError as error:
+            raise _error_of(error) from None
+        finally:
+            call.cancel()
+        if failed:
+            raise failed[0]
+
+    async def ready(self, timeout: float) -> bool:
+        """Whether the server answers requests."""
+        try:
+            return bool(await self._check(b"", timeout=timeout) == SERVING)
+        except grpc.RpcError as error:
+            if error.code() != grpc.StatusCode.UNIMPLEMENTED:
+                return False
+        try:  # a server without gRPC's health service, such as Ray's, answers a request or not
+            return bool((await self.models(timeout)).models)
+        except GraspClientError:
+            return False
+
+    async def close(self) -> None:
+        """Close the channel."""
+        await self._channel.close(None)
+
+    async def _call(self, method: Any, message: Message, timeout: float) -> Any:
+        try:
+            return await method(message, timeout=timeout, metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise _error_of(error) from None
 
 
-def score_message(request: ScoreRequest) -> grasp_pb2.ScoreGraspsRequest:
-    """A request to score; raises InvalidRequestError for what no message can hold."""
-    message = grasp_pb2.ScoreGraspsRequest()
-    _set_cloud_and_options(message, request)
-    if request.edges is not None:
-        for approach, contact in request.edges.tolist():
-            edge = {"approach_index": approach, "contact_index": contact}
-            fill(message.edges.add(), edge, "edges")
-    if request.hand_poses is not None:
-        for pose in request.hand_poses:
-            message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
-    return message
-
-
-def stream_message(
-    request: StreamRequest, number: int, timeout: float
-) -> grasp_pb2.DetectGraspsStreamRequest:
-    """A request of a stream; raises InvalidRequestError for what no message can hold."""
-    return grasp_pb2.DetectGraspsStreamRequest(
-        request_id=request.name(number),
-        request=detect_message(request.request),
-        timeout=timeout if request.timeout is None else request.timeout,
-    )
+# Answers
 
 
 def read_field(message: Message, name: str) -> Any:
@@ -89,35 +162,33 @@ def read_field(message: Message, name: str) -> Any:
     return None if absent else getattr(message, name)
 
 
-def stream_answer(message: grasp_pb2.DetectGraspsStreamResponse) -> StreamAnswer:
-    """The answer to one request of a stream."""
-    if message.HasField("detection"):
-        return StreamAnswer(message.request_id, detection_from(message.detection, read_field))
-    error = _error(message.error.message, message.error.detail)
-    return StreamAnswer(message.request_id, error=error)
-
-
-def error_from_call(error: Any) -> GraspClientError:
+def _error_of(error: Any) -> GraspClientError:
     """The exception for a failed call, as the server describes it or by its status code."""
     code, message = error.code(), error.details() or ""
     for name, value in error.trailing_metadata() or ():
-        if name == _ERROR_METADATA:
+        if name == ERROR_METADATA:
             try:
                 detail = grasp_pb2.ErrorDetail.FromString(bytes(value))
             except DecodeError:
                 break
-            return _error(message, detail)
+            return _described(message, detail)
     return _BY_CODE.get(code, ProtocolError)(f"{code.name}: {message}")
 
 
-def _error(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
+def _described(message: str, detail: grasp_pb2.ErrorDetail) -> GraspClientError:
     retry_after = detail.retry_after if detail.HasField("retry_after") else None
     return error_of_kind(
         detail.kind, message, detail.field, detail.value, detail.fix, retry_after=retry_after
     )
 
 
-def _set_cloud_and_options(message: Any, request: Request) -> None:
+# Requests
+
+
+def message_of(request: Request) -> Any:
+    """The message of a request; raises InvalidRequestError for what no message can hold."""
+    kind = grasp_pb2.ScoreGraspsRequest if request.scores else grasp_pb2.DetectGraspsRequest
+    message: Any = kind()
     cloud = request.cloud
     if cloud is None:
         for which, image in enumerate(request.depth_images or ()):
@@ -129,11 +200,19 @@ def _set_cloud_and_options(message: Any, request: Request) -> None:
     elif (points := float32_points(cloud)) is not None:
         message.points = points.astype("<f4", copy=False).tobytes()
     else:
-        file = cloud_file(cloud)
-        message.encoded.format, message.encoded.data = file.format, file.data
-    for name, array in request.row_arrays().items():
-        setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
+        message.encoded.format, message.encoded.data = cloud_file(cloud)
+    for name, array in request.arrays.items():
+        if name == "edges":
+            for approach, contact in array.tolist():
+                edge = {"approach_index": approach, "contact_index": contact}
+                fill(message.edges.add(), edge, "edges")
+        elif name == "hand_poses":
+            for pose in array:
+                message.hand_poses.add(T_cloud_hand=pose.ravel().tolist())
+        else:
+            setattr(message, name, array.astype(array.dtype.newbyteorder("<")).tobytes())
     fill(message.options, request.options, "options")
+    return message
 
 
 def fill(message: Message, value: object, path: str) -> None:

@@ -1,0 +1,209 @@
+"""The REST transport: requests, answers and errors as HTTP carries them."""
+
+import base64
+import json
+import operator
+import ssl
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+from typing import Any, TypeVar
+
+import httpx
+import numpy as np
+
+from edgegrasp_client.connection import HTTP_OVER_UNIX, Tls, read_pem, token_metadata
+from edgegrasp_client.errors import (
+    DeadlineError,
+    GraspClientError,
+    OverloadedError,
+    PayloadTooLargeError,
+    ProtocolError,
+    ServerUnavailableError,
+    error_of_kind,
+    invalid,
+)
+from edgegrasp_client.requests import (
+    Request,
+    StreamRequest,
+    cloud_file,
+    depth_image_fields,
+    is_point_cloud2,
+    npy_bytes,
+    point_cloud2_fields,
+)
+from edgegrasp_client.results import Detection, Models, StreamAnswer, read_as
+
+MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
+KIND_PREFIX = "urn:edgegrasp:error:"
+
+Call = dict[str, Any]  # arguments of httpx's `request`
+Part = tuple[str | None, bytes, str]  # of a form: file name, content, media type
+Answer = TypeVar("Answer")
+
+
+class RestTransport:
+    """Posts over connections that are kept open; raises GraspClientErrors."""
+
+    def __init__(
+        self,
+        address: str,
+        token: str | None,
+        tls: Tls | None,
+        transport: httpx.AsyncBaseTransport | None,
+    ) -> None:
+        if address.startswith(HTTP_OVER_UNIX):
+            transport = httpx.AsyncHTTPTransport(uds=address.removeprefix(HTTP_OVER_UNIX))
+            address = "http://localhost"
+        self._http = httpx.AsyncClient(
+            base_url=address,
+            headers=dict(token_metadata(token)),
+            verify=_ssl_context(tls),
+            transport=transport,
+        )
+
+    async def ask(self, kind: type[Answer], request: Request, timeout: float) -> Answer:
+        """The answer to a request."""
+        return await self._call(kind, call_of(request), timeout)
+
+    async def models(self, timeout: float) -> Models:
+        """The weights that the server has loaded."""
+        return await self._call(Models, {"method": "GET", "url": "/v1/models"}, timeout)
+
+    async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
+        """Tell the server what became of a grasp."""
+        call = {"method": "POST", "url": "/v1/outcomes", "json": tried}
+        await self._call(dict, call, timeout)
+
+    async def detect_stream(
+        self, requests: AsyncIterator[tuple[str, StreamRequest]], timeout: float
+    ) -> AsyncGenerator[StreamAnswer, None]:
+        """An answer to each of the named requests, one after the other."""
+        async for name, request in requests:
+            call = call_of(request.request)
+            seconds = timeout if request.timeout is None else request.timeout
+            try:
+                yield StreamAnswer(name, await self._call(Detection, call, seconds))
+            except GraspClientError as error:
+                yield StreamAnswer(name, error=error)
+
+    async def ready(self, timeout: float) -> bool:
+        """Whether the server answers requests."""
+        try:
+            return (await self._http.get("/health/ready", timeout=timeout)).is_success
+        except httpx.HTTPError:
+            return False
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def _call(self, kind: type[Answer], call: Call, timeout: float) -> Answer:
+        """The answer to a call, which both sides give up after `timeout` seconds."""
+        headers = {**call.get("headers", {}), "x-request-timeout": f"{timeout:.6g}"}
+        try:
+            response = await self._http.request(**call | {"headers": headers}, timeout=timeout)
+        except httpx.TimeoutException as error:
+            raise DeadlineError(f"No answer in time ({type(error).__name__}).") from None
+        except httpx.HTTPError as error:
+            why = f"No connection: {error or type(error).__name__}"
+            raise ServerUnavailableError(why) from None
+        try:
+            body = response.json()
+        except ValueError:
+            body = None
+        if not isinstance(body, dict):
+            raise _foreign(response)
+        if not response.is_success:
+            raise _described(body, response)
+        try:
+            return read_as(kind, body, operator.getitem)
+        except (KeyError, TypeError, ValueError) as error:
+            raise _foreign(response) from error
+
+
+def call_of(request: Request) -> Call:
+    """The call of a request; raises InvalidRequestError for what HTTP cannot carry.
+
+    A point cloud file as body and options as query parameters, or a form where there is more.
+    """
+    cloud = request.cloud
+    query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
+    short = sum(map(len, query.values())) < MAX_QUERY
+    if short and not (cloud is None or is_point_cloud2(cloud) or request.arrays):
+        file = cloud_file(cloud)
+        headers = {"content-type": f"application/x-{file.format}"}
+        post = {"method": "POST", "url": "/v1/grasps", "headers": headers}
+        return {**post, "params": query, "content": file.data}
+    parts: dict[str, Part] = {"options": _json_part("options", request.options)}
+    if cloud is None:
+        images = enumerate(request.depth_images or ())
+        fields = [depth_image_fields(image, number) for number, image in images]
+        parts["depth_images"] = _json_part("depth_images", fields)
+    elif is_point_cloud2(cloud):
+        parts["point_cloud2"] = _json_part("point_cloud2", point_cloud2_fields(cloud))
+    else:
+        file = cloud_file(cloud)
+        parts["cloud"] = (f"cloud.{file.format}", file.data, f"application/x-{file.format}")
+    for name, array in request.arrays.items():
+        parts[name] = (f"{name}.npy", npy_bytes(array), "application/x-npy")
+    path = "/v1/grasps:score" if request.scores else "/v1/grasps"
+    return {"method": "POST", "url": path, "files": parts}
+
+
+def _json_part(name: str, value: object) -> Part:
+    return None, _text(name, value).encode(), "application/json"
+
+
+def _text(name: str, value: object) -> str:
+    if isinstance(value, str):
+        return value
+    try:
+        return json.dumps(value, default=_base64)
+    except (TypeError, ValueError) as error:
+        raise invalid(name, repr(value)[:80], f"{error}.") from None
+
+
+def _base64(value: object) -> str:
+    if isinstance(value, np.ndarray):  # a mask
+        value = value.tobytes()
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    raise TypeError(f"a {type(value).__name__} is no JSON value")
+
+
+def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspClientError:
+    """The exception for an error the server describes."""
+    kind = str(problem.get("type", ""))
+    if not kind.startswith(KIND_PREFIX):
+        return _foreign(response)
+    said = [str(problem.get(name, "")) for name in ("detail", "field", "value", "fix")]
+    kind = kind.removeprefix(KIND_PREFIX)
+    return error_of_kind(kind, *said, retry_after=problem.get("retry_after"))
+
+
+def _foreign(response: httpx.Response) -> GraspClientError:
+    """The exception for an answer of something else, such as a proxy in between."""
+    status = response.status_code
+    what = f"{response.request.url} answered {status} {response.reason_phrase}"
+    if status == httpx.codes.REQUEST_ENTITY_TOO_LARGE:
+        return PayloadTooLargeError(f"{what}.")
+    retry_after = response.headers.get("retry-after", "")  # may also be a date, which is not read
+    if status == httpx.codes.TOO_MANY_REQUESTS or (status == 503 and retry_after.isdecimal()):
+        return OverloadedError(f"{what}.", float(retry_after) if retry_after.isdecimal() else 1.0)
+    if status in (500, 502, 503, 504):
+        return ServerUnavailableError(f"{what}.")
+    return ProtocolError(f"{what}, which is not the answer of a grasp service.")
+
+
+def _ssl_context(tls: Tls | None) -> ssl.SSLContext | bool:
+    """For httpx; raises InvalidRequestError for files that cannot be used."""
+    if tls is None:
+        return True
+    for name in ("ca", "certificate", "key"):
+        read_pem(f"tls.{name}", getattr(tls, name))
+    try:
+        context = ssl.create_default_context(cafile=tls.ca)
+        if tls.certificate is not None:
+            context.load_cert_chain(tls.certificate, tls.key)
+    except ssl.SSLError as error:
+        raise invalid("tls", f"files that do not hold it ({error})", "Give PEM files.") from None
+    return context
