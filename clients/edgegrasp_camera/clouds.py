@@ -8,8 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from edgegrasp_camera import InvalidRequest, PayloadTooLarge
 from edgegrasp_camera.arrays import Array
-from edgegrasp_camera.errors import InvalidRequest, PayloadTooLarge
 
 Records = NDArray[np.void]
 

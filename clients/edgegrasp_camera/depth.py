@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from edgegrasp_camera import InvalidRequest
 from edgegrasp_camera.arrays import Array, Float32, Float64
 from edgegrasp_camera.clouds import CloudInput
-from edgegrasp_camera.errors import InvalidRequest
 
 Position = tuple[float, float, float]  # metres
 

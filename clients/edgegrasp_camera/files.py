@@ -8,25 +8,27 @@ import io
 import math
 import re
 import struct
+import sys
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
-from edgegrasp_camera.arrays import Array, Float64
-from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_records, too_many
-from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
-from edgegrasp_camera.errors import (
+from edgegrasp_camera import (
     EdgeGraspError,
     InvalidRequest,
     PayloadTooLarge,
     UnsupportedMediaType,
 )
+from edgegrasp_camera.arrays import Array, Float64
+from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_records, too_many
+from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
 MAX_NPY_HEADER = 1024  # bytes; Python's parser runs out of memory where brackets or signs nest
@@ -67,6 +69,28 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
         raise UnsupportedMediaType("format", repr(file_format), fix)
     with _reading("cloud", file_format, len(data), FIXES[file_format]):
         return _READERS[file_format](data, max_points)
+
+
+def pixels(file: Path) -> Array:
+    """The values of an image file, .png or .npy: (H, W), or (H, W, C) of several channels."""
+    read = read_png if file.suffix.lower() == ".png" else read_npy
+    return read(file.read_bytes(), sys.maxsize, file.name)
+
+
+def sent_cloud(file: Path | None, images: Sequence[Any] | None) -> CloudInput:
+    """The cloud of a request: that of a file, or of depth images whose depths are files."""
+    if file is not None:
+        return read_file(file.suffix[1:].lower(), file.read_bytes(), sys.maxsize)
+    views = [
+        DepthView(
+            intrinsics_of(image["intrinsics"]),
+            image.get("T_cloud_camera", np.eye(4)),
+            image.get("depth_scale"),
+        )
+        for image in images or ()
+    ]
+    depths = [pixels(Path(str(image["depth"]))) for image in images or ()]
+    return fuse_depth_images(depths, views)[0]
 
 
 @contextmanager

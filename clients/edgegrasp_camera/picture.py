@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.clouds import CloudInput
 
 Points = Float64
 
@@ -23,6 +24,8 @@ STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes
 BAR = 0.005  # metres, thickness of a fork
 BARS = (2.0, 7.0)  # points that this is at least and at most
 BEHIND = 0.006  # metres behind the cloud from which on a fork is drawn as hidden
+DRAWN = 10  # grasps in a picture of a request
+AROUND = 0.4  # metres from these: what a picture of a cloud shows
 LABELLED = 5  # grasps that carry their rank
 SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
 SMALLEST = 0.25  # metres across, of what such a picture shows
@@ -275,6 +278,52 @@ def draw_grasps(
     """
     picture = Picture(View.of(cloud, camera_position), cloud, title=title)
     picture.grasps(grasps, palm_and_tip)
+    picture.save(path)
+
+
+def draw_detection(
+    path: Path | BinaryIO,
+    detection: Any,
+    sent: CloudInput,
+    options: Mapping[str, Any],
+    colors: Array | None = None,
+    from_above: bool = False,
+) -> None:
+    """Write a picture of a request and the best of its grasps.
+
+    What is organised as a camera's image is drawn as that camera saw it, in its colours where they
+    are given; another cloud from its viewpoint, or from above at a slant.
+
+    Args:
+        path: `.png` or `.jpg` file to write, or where to write a PNG.
+        detection: The answer, of a client or of a detector.
+        sent: The cloud of the request.
+        options: Of the request: its regions are drawn.
+        colors: As `CloudInput.colors`; None: those of the cloud, if any.
+        from_above: Whether to look from above, whatever the cloud.
+    """
+    points = np.asarray(sent.points)
+    flat, shown, image = points.reshape(-1, 3), detection.grasps[:DRAWN], None
+    given, shades = sent.colors if colors is None else colors, None
+    if given is not None:
+        shades = np.asarray(given).reshape(-1, 3)
+        shades = 255 * shades if shades.dtype.kind == "f" else shades
+    view = None if from_above or points.ndim != 3 else View.of_image(points)
+    if view is not None:
+        image = None if shades is None else shades.reshape(points.shape).astype(np.uint8)
+    else:
+        seen = flat[np.isfinite(flat).all(axis=1)]
+        middle = np.median([grasp.T_cloud_tcp[:3, 3] for grasp in shown] or seen, axis=0)
+        near = seen[np.linalg.norm(seen - middle, axis=1) < AROUND]
+        up = np.asarray(detection.up, dtype=np.float64)
+        aside = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+        given = None if from_above else options.get("viewpoint")
+        eye = middle + 0.6 * up - 0.5 * aside if given is None else np.ravel(given)[:3]
+        view = View.of(near if len(near) else seen, eye, up)
+    title = f"the {len(shown)} best of {len(detection.grasps)} grasps, {detection.model}"
+    picture = Picture(view, flat, shades, image, title)
+    picture.regions(options)
+    picture.grasps(shown, (detection.gripper.palm_z, detection.gripper.tip_z))
     picture.save(path)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import typer
 from pydantic import BaseModel, Field
 
-from edgegrasp_cli.drawing import draw, pixels, sent_cloud
+from edgegrasp_camera.files import pixels, sent_cloud
+from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import (
     CONNECTION,
     Server,
@@ -132,7 +133,7 @@ def detect(
     with waiting, open_client(asked.server, asked.timeout, connection, *own) as client:
         detection = client.detect(file, depth_images=images, colors=colors, **fields)
     if asked.picture is not None:
-        draw(asked.picture, detection, sent_cloud(file, images), fields, colors)
+        draw_detection(asked.picture, detection, sent_cloud(file, images), fields, colors)
     if asked.trajectory is not None:
         _write_trajectory(asked.trajectory, detection)
     if as_document:

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from pydantic import Field
 
-from edgegrasp_camera.errors import EdgeGraspError
-from edgegrasp_cli.drawing import draw, pixels, sent_cloud
+from edgegrasp_camera import EdgeGraspError
+from edgegrasp_camera.files import pixels, sent_cloud
+from edgegrasp_camera.picture import draw_detection
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 
 if TYPE_CHECKING:
@@ -174,7 +175,7 @@ class _Tools:
         sent, pictures = sent_cloud(file, images), []
         for from_above in (False, True):
             drawn = io.BytesIO()
-            draw(drawn, found, sent, {"viewpoint": eye, **asked}, from_above=from_above)
+            draw_detection(drawn, found, sent, {"viewpoint": eye, **asked}, from_above=from_above)
             pictures.append(Image(data=drawn.getvalue(), format="png"))
         return [text.strip(), *pictures]
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from edgegrasp_camera.errors import EdgeGraspError as EdgeGraspError
-from edgegrasp_camera.errors import InvalidRequest as InvalidRequest
+from edgegrasp_camera import EdgeGraspError as EdgeGraspError
+from edgegrasp_camera import InvalidRequest as InvalidRequest
 
 
 def invalid_fields(

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import orjson
 
-from edgegrasp_camera.errors import PayloadTooLarge as PayloadTooLarge
-from edgegrasp_camera.errors import UnsupportedMediaType as UnsupportedMediaType
+from edgegrasp_camera import PayloadTooLarge as PayloadTooLarge
+from edgegrasp_camera import UnsupportedMediaType as UnsupportedMediaType
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
 
 STOPPING = "The server is stopping. Try another one."  # the message of a NotReady

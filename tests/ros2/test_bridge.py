@@ -11,7 +11,7 @@ from tests.cloud_files import point_cloud2
 
 from edgegrasp_bridge import bridge
 from edgegrasp_bridge.bridge import Inbox, Scene, Settings
-from edgegrasp_camera.errors import InvalidRequest
+from edgegrasp_camera import InvalidRequest
 from edgegrasp_client import GraspClient, InvalidRequestError
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
