@@ -9,19 +9,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import grpc
 import numpy as np
 import typer
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 
+from edgegrasp.oip import open_inference_pb2 as messages
+from edgegrasp.oip.open_inference_pb2_grpc import (
+    GRPCInferenceServiceServicer,
+    add_GRPCInferenceServiceServicer_to_server,
+)
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
-
-if TYPE_CHECKING:
-    import grpc
-    from starlette.applications import Starlette
-
-    from edgegrasp_client import GraspClient
+from edgegrasp_client import GraspClient, errors
+from edgegrasp_client.requests import plain_options
 
 PLATFORM = "edgegrasp"
 VERSION = "1"  # of the tensors' names and meaning
@@ -37,6 +45,16 @@ OUTPUTS = {
 # Parameters of the protocol and of Triton's clients that say how to serve, not what to detect.
 NOT_OPTIONS = {"binary_data_output", "headers", "priority", "timeout"}
 NOT_OPTIONS |= {"sequence_id", "sequence_start", "sequence_end"}
+STATUS: tuple[tuple[type[Exception], str, int], ...] = (  # the first that fits
+    (errors.UnknownModelError, "NOT_FOUND", 404),
+    (errors.PayloadTooLargeError, "RESOURCE_EXHAUSTED", 413),
+    (errors.InvalidRequestError, "INVALID_ARGUMENT", 400),
+    (errors.AccessDeniedError, "PERMISSION_DENIED", 403),
+    (errors.OverloadedError, "RESOURCE_EXHAUSTED", 429),
+    (errors.ServerUnavailableError, "UNAVAILABLE", 503),
+    (errors.DeadlineError, "DEADLINE_EXCEEDED", 504),
+    (errors.GraspClientError, "INTERNAL", 500),
+)
 PARALLEL_CALLS = 32
 MAX_SHORT_LISTS = 20_000  # in JSON; most lists hold numbers
 
@@ -64,8 +82,6 @@ def open_inference(
 
     It asks for no token: let the gateway in front of it do that.
     """
-    import uvicorn
-
     with connect(server, timeout, **connection) as client:
         models = Models(client, name, timeout)
         with grpc_server(models, f"{host}:{grpc_port}", max_body_bytes):
@@ -94,7 +110,7 @@ class Models:
     `default` names the server's default weights, beside their own name.
     """
 
-    def __init__(self, client: "GraspClient", default: str, timeout: float) -> None:
+    def __init__(self, client: GraspClient, default: str, timeout: float) -> None:
         self._client, self._default, self._timeout = client, default, timeout
 
     def ready(self) -> bool:
@@ -128,8 +144,6 @@ class Models:
 
         `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
         """
-        from edgegrasp_client.requests import plain_options
-
         asked = {key: _option(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
         if name != self._default:
@@ -169,22 +183,10 @@ class Models:
 @contextmanager
 def _refusing() -> Iterator[None]:
     """Errors of the client as those of the protocol."""
-    from edgegrasp_client import errors
-
-    table = [  # the first that fits
-        (errors.UnknownModelError, "NOT_FOUND", 404),
-        (errors.PayloadTooLargeError, "RESOURCE_EXHAUSTED", 413),
-        (errors.InvalidRequestError, "INVALID_ARGUMENT", 400),
-        (errors.AccessDeniedError, "PERMISSION_DENIED", 403),
-        (errors.OverloadedError, "RESOURCE_EXHAUSTED", 429),
-        (errors.ServerUnavailableError, "UNAVAILABLE", 503),
-        (errors.DeadlineError, "DEADLINE_EXCEEDED", 504),
-        (errors.GraspClientError, "INTERNAL", 500),
-    ]
     try:
         yield
     except errors.GraspClientError as error:
-        code, status = next(row[1:] for row in table if isinstance(error, row[0]))
+        code, status = next(row[1:] for row in STATUS if isinstance(error, row[0]))
         raise RefusedError(code, status, str(error)) from error
 
 
@@ -220,50 +222,9 @@ def _metadata(name: str) -> dict[str, Any]:
 @contextmanager
 def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[int]:
     """Serve `inference.GRPCInferenceService` while the context lasts; gives its port."""
-    import grpc
-
-    from edgegrasp.oip import open_inference_pb2 as messages
-    from edgegrasp.oip.open_inference_pb2_grpc import (
-        GRPCInferenceServiceServicer,
-        add_GRPCInferenceServiceServicer_to_server,
-    )
-
-    class Servicer(GRPCInferenceServiceServicer):
-        def ServerLive(self, request: Any, context: Any) -> Any:  # noqa: N802
-            return messages.ServerLiveResponse(live=True)
-
-        def ServerReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-            return messages.ServerReadyResponse(ready=models.ready())
-
-        def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
-            _or_abort(context, lambda: models.check(request.name, request.version))
-            return messages.ModelReadyResponse(ready=True)
-
-        def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-            return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
-
-        def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
-            _or_abort(context, lambda: models.check(request.name, request.version))
-            return messages.ModelMetadataResponse(**_metadata(request.name))
-
-        def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
-            def infer() -> Answer:
-                tensors, parameters = _grpc_inputs(request), _grpc_parameters(request.parameters)
-                seconds, wanted = context.time_remaining(), [each.name for each in request.outputs]
-                if request.model_version:
-                    models.check(request.model_name, request.model_version)
-                return models.infer(request.model_name, tensors, parameters, seconds, wanted)
-
-            return messages.ModelInferResponse(
-                model_name=request.model_name,
-                model_version=VERSION,
-                id=request.id,
-                **_grpc_answer(_or_abort(context, infer)),
-            )
-
     options = [("grpc.max_receive_message_length", max_body_bytes)]
     server = grpc.server(ThreadPoolExecutor(PARALLEL_CALLS), options=options)
-    add_GRPCInferenceServiceServicer_to_server(Servicer(), server)
+    add_GRPCInferenceServiceServicer_to_server(_Servicer(models), server)
     port = server.add_insecure_port(address)
     server.start()
     try:
@@ -272,9 +233,51 @@ def grpc_server(models: Models, address: str, max_body_bytes: int) -> Iterator[i
         server.stop(grace=5.0).wait()
 
 
-def _or_abort(context: "grpc.ServicerContext", call: Callable[[], Any]) -> Any:
-    import grpc
+class _Servicer(GRPCInferenceServiceServicer):
+    def __init__(self, models: Models) -> None:
+        self._models = models
 
+    def ServerLive(self, request: Any, context: Any) -> Any:  # noqa: N802
+        return messages.ServerLiveResponse(live=True)
+
+    def ServerReady(self, request: Any, context: Any) -> Any:  # noqa: N802
+        return messages.ServerReadyResponse(ready=self._models.ready())
+
+    def ModelReady(self, request: Any, context: Any) -> Any:  # noqa: N802
+        _or_abort(context, lambda: self._models.check(request.name, request.version))
+        return messages.ModelReadyResponse(ready=True)
+
+    def ServerMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
+        return messages.ServerMetadataResponse(name=PLATFORM, version=VERSION)
+
+    def ModelMetadata(self, request: Any, context: Any) -> Any:  # noqa: N802
+        _or_abort(context, lambda: self._models.check(request.name, request.version))
+        return messages.ModelMetadataResponse(**_metadata(request.name))
+
+    def ModelInfer(self, request: Any, context: Any) -> Any:  # noqa: N802
+        def infer() -> Answer:
+            tensors, parameters = _grpc_inputs(request), _grpc_parameters(request.parameters)
+            seconds, wanted = context.time_remaining(), [each.name for each in request.outputs]
+            if request.model_version:
+                self._models.check(request.model_name, request.model_version)
+            return self._models.infer(request.model_name, tensors, parameters, seconds, wanted)
+
+        answer = _or_abort(context, infer)
+        outputs = [
+            {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
+            for name, array in answer.outputs.items()
+        ]
+        return messages.ModelInferResponse(
+            model_name=request.model_name,
+            model_version=VERSION,
+            id=request.id,
+            parameters={name: {"string_param": text} for name, text in answer.parameters.items()},
+            outputs=outputs,
+            raw_output_contents=[array.tobytes() for array in answer.outputs.values()],
+        )
+
+
+def _or_abort(context: grpc.ServicerContext, call: Callable[[], Any]) -> Any:
     try:
         return call()
     except RefusedError as refused:
@@ -302,24 +305,8 @@ def _grpc_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _grpc_answer(answer: Answer) -> dict[str, Any]:
-    """Fields of a ModelInferResponse."""
-    parameters = {name: {"string_param": text} for name, text in answer.parameters.items()}
-    outputs = [
-        {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
-        for name, array in answer.outputs.items()
-    ]
-    raw = [array.tobytes() for array in answer.outputs.values()]
-    return {"parameters": parameters, "outputs": outputs, "raw_output_contents": raw}
-
-
-def http_app(models: Models, max_body_bytes: int) -> "Starlette":
+def http_app(models: Models, max_body_bytes: int) -> Starlette:
     """The REST paths of the protocol."""
-    from starlette.applications import Starlette
-    from starlette.concurrency import run_in_threadpool
-    from starlette.requests import Request
-    from starlette.responses import JSONResponse, Response
-    from starlette.routing import Route
 
     def live(request: Request) -> Response:
         return JSONResponse({"live": True})

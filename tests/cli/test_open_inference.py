@@ -15,10 +15,12 @@ import httpx
 import numpy as np
 import pytest
 
+pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
+
+import uvicorn
+
 from edgegrasp_cli.open_inference import Models, RefusedError, grpc_server, http_app
 from edgegrasp_client import GraspClient
-
-uvicorn = pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
 
 LIMIT = 200_000  # bytes
 

@@ -14,13 +14,19 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
-from edgegrasp_model.options import DetectOptions, parse_options
+from edgegrasp_model.options import DetectOptions, parse, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
-from edgegrasp_service.errors import DeadlineExceeded, PayloadTooLarge, report
+from edgegrasp_service import recording
+from edgegrasp_service.errors import (
+    DeadlineExceeded,
+    PayloadTooLarge,
+    UnsupportedMediaType,
+    report,
+)
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker import http_bodies, messages, outcomes
+from edgegrasp_service.worker import http_bodies, messages
 from edgegrasp_service.worker.job import Answer, Facts, Job
 from edgegrasp_service.worker.process import limited_memory
 
@@ -104,13 +110,23 @@ class _Work:
         if self._job.method == "Beat":
             return b"{}"
         if self._job.method == "RecordOutcome":
-            return outcomes.append(self._job, self._catalogue, self._settings.outcomes_file)
+            self._record_outcome()
+            return b"{}"
         result = self._detect() if self._job.method == "DetectGrasps" else self._score()
         self.facts.model = result.model
         self.facts.counts = dict(result.counts)
         with self._stage("encode"):
             body: bytes = self._encoding.write(result)
         return body
+
+    def _record_outcome(self) -> None:
+        kind, path = self._job.content_type, self._settings.outcomes_file
+        if not kind.lower().startswith(http_bodies.JSON):  # which no foreign web page can send
+            fix = f"Send {http_bodies.JSON}."
+            raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
+        assert path is not None
+        fields = http_bodies.read_json("body", self._job.body)
+        recording.append_outcome(parse(recording.TriedGrasp, fields, "body"), self._catalogue, path)
 
     def _detect(self) -> Detection:
         with self._stage("decode"):
