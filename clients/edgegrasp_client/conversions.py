@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from edgegrasp_camera.arrays import Float64
+from edgegrasp_camera.arrays import Array, Float64
 from edgegrasp_client.results import Grasp
 
 Message = dict[str, Any]
@@ -155,7 +155,7 @@ def moveit_grasp(
         "grasp_posture": _posture(joints, 0.0, header),
         "grasp_pose": {
             "header": header,
-            "pose": _pose(T_cloud_link),
+            "pose": pose_fields(T_cloud_link),
         },
         "grasp_quality": float(grasp.score),
         "pre_grasp_approach": _translation(approach, approach_distance, header),
@@ -303,9 +303,10 @@ def _matrix(pose: ArrayLike | None) -> Float64:
     return np.eye(4) if pose is None else np.asarray(pose, dtype=np.float64)
 
 
-def _pose(T: Float64) -> Message:
+def pose_fields(T: Array) -> Message:
+    """A (4, 4) transform as the fields of `geometry_msgs/Pose`."""
     return {
-        "position": _xyz(T[:3, 3]),
+        "position": xyz_fields(T[:3, 3]),
         "orientation": dict(zip("xyzw", quaternion_from_matrix(T[:3, :3]).tolist(), strict=True)),
     }
 
@@ -328,18 +329,19 @@ def _posture(joints: FingerJoints, opening: float, header: Message) -> Message:
 def _translation(direction: Float64, distance: float, header: Message) -> Message:
     unit = direction / np.linalg.norm(direction)
     return {
-        "direction": {"header": header, "vector": _xyz(unit)},
+        "direction": {"header": header, "vector": xyz_fields(unit)},
         "desired_distance": float(distance),
         "min_distance": float(distance),
     }
 
 
-def _xyz(vector: Float64) -> Message:
-    return dict(zip("xyz", vector.tolist(), strict=True))
+def xyz_fields(vector: Array) -> Message:
+    """A vector (3,) as the fields x, y, z."""
+    return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
 
 
 def _isaac_fields(grasp: Grasp, T_object_gripper: Float64, joints: FingerJoints) -> Message:
-    pose = _pose(T_object_gripper)
+    pose = pose_fields(T_object_gripper)
     w, *xyz = (pose["orientation"][axis] for axis in "wxyz")
     return {
         "confidence": float(grasp.score),

@@ -23,7 +23,8 @@ from edgegrasp_client.conversions import (
     FingerJoints,
     matrix_from_quaternion,
     moveit_grasp,
-    quaternion_from_matrix,
+    pose_fields,
+    xyz_fields,
 )
 from edgegrasp_client.options import DetectOptions
 
@@ -237,7 +238,10 @@ def detect(
 
 def pose_array(found: Found, back: float = 0.0) -> Message:
     """geometry_msgs/PoseArray of the hand's frame, best first; `back`: metres before the grasp."""
-    return {"header": found.header, "poses": [_pose(each.pregrasp(back)) for each in found.grasps]}
+    return {
+        "header": found.header,
+        "poses": [pose_fields(each.pregrasp(back)) for each in found.grasps],
+    }
 
 
 def marker_array(found: Found) -> Message:
@@ -255,7 +259,7 @@ def marker_array(found: Found) -> Message:
             "type": LINE_LIST,
             "scale": {"x": LINE_WIDTH, "y": 0.0, "z": 0.0},
             "color": {"r": 1.0 - score, "g": score, "b": 0.0, "a": 1.0},
-            "points": [_xyz(end) for end in ends],
+            "points": [xyz_fields(end) for end in ends],
         }
         markers.append(marker)
     return {"markers": markers}
@@ -313,11 +317,11 @@ def _object_result(
     stages = ", ".join(f"{count} {stage}" for stage, count in found.detection.counts.items())
     candidates = [
         {
-            "pose": {"header": found.header, "pose": _pose(grasp.T_cloud_hand)},
+            "pose": {"header": found.header, "pose": pose_fields(grasp.T_cloud_hand)},
             "confidence": min(max(float(grasp.score), 0.0), 1.0),
             "width": float(grasp.width),
-            "pregrasp": _pose(grasp.pregrasp(settings.approach_distance)),
-            "retreat": _pose(grasp.retreat(settings.retreat_distance)),
+            "pregrasp": pose_fields(grasp.pregrasp(settings.approach_distance)),
+            "retreat": pose_fields(grasp.retreat(settings.retreat_distance)),
         }
         for grasp in (grasps[:most] if most else grasps)
     ]
@@ -420,21 +424,8 @@ def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
     )
 
 
-def _pose(T: Array) -> Message:
-    """geometry_msgs/Pose; the orientation's fields are x, y, z, w."""
-    orientation = quaternion_from_matrix(T[:3, :3]).tolist()
-    return {
-        "position": _xyz(T[:3, 3]),
-        "orientation": dict(zip("xyzw", orientation, strict=True)),
-    }
-
-
 def _seconds(stamp: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
-
-
-def _xyz(vector: Array) -> Message:
-    return {axis: float(value) for axis, value in zip("xyz", vector, strict=True)}
 
 
 def _value(value: Any) -> Any:
