@@ -263,18 +263,16 @@ class _Servicer(GRPCInferenceServiceServicer):
             return self._models.infer(request.model_name, tensors, parameters, seconds, wanted)
 
         answer = _or_abort(context, infer)
-        outputs = [
-            {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
-            for name, array in answer.outputs.items()
-        ]
-        return messages.ModelInferResponse(
-            model_name=request.model_name,
-            model_version=VERSION,
-            id=request.id,
-            parameters={name: {"string_param": text} for name, text in answer.parameters.items()},
-            outputs=outputs,
-            raw_output_contents=[array.tobytes() for array in answer.outputs.values()],
-        )
+        fields: dict[str, Any] = {
+            "parameters": {name: {"string_param": t} for name, t in answer.parameters.items()},
+            "outputs": [
+                {"name": name, "datatype": OUTPUTS[name][0], "shape": array.shape}
+                for name, array in answer.outputs.items()
+            ],
+            "raw_output_contents": [array.tobytes() for array in answer.outputs.values()],
+        }
+        named = {"model_name": request.model_name, "model_version": VERSION, "id": request.id}
+        return messages.ModelInferResponse(**named, **fields)
 
 
 def _or_abort(context: grpc.ServicerContext, call: Callable[[], Any]) -> Any:

@@ -5,10 +5,9 @@ Also what makes a request of a segmenter's mask, or of an object's cloud and its
 
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeGuard, cast
+from typing import Any, NamedTuple, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -211,8 +210,7 @@ def object_in_scene(
 # The forms of the wire
 
 
-@dataclass(frozen=True)
-class CloudFile:
+class CloudFile(NamedTuple):
     """A point cloud file."""
 
     format: str  # one of FILE_FORMATS

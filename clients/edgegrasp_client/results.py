@@ -255,7 +255,7 @@ def _value(hint: Any, value: Any, read: Read) -> Any:
         absent = value is None or not (scalar or len(value))  # gRPC: none are sent
         return None if absent else _value(parts[0], value, read)
     if is_dataclass(hint):
-        return read_as(hint, value, read)
+        return read_as(cast("type[Any]", hint), value, read)
     if get_origin(hint) is list:
         inner = is_dataclass(parts[0])
         return [read_as(parts[0], one, read) if inner else one for one in value]
