@@ -57,9 +57,9 @@ class AsyncGraspClient:
             for each of connecting, sending and waiting.
         retry: Whether to try again, after short random delays, where the server is away or busy
             or lost the worker of the request. Requests of a stream are sent once.
-        token: For a server that asks for one; over TLS, or everyone on the way can read it.
-        tls: How to know the server; None: gRPC is not encrypted, and "https://..." trusts the
-            authorities that httpx knows.
+        token: For a server that requires one; send it over TLS only.
+        tls: How to verify the server; None: gRPC is not encrypted, and "https://..." trusts the
+            authorities that httpx trusts.
         http_transport: httpx transport to use instead of the network.
     """
 

@@ -1,4 +1,4 @@
-"""How a client knows its server and when it asks again; and a server of one's own."""
+"""Addresses, TLS, tokens and retries of a client; and a local server."""
 
 import random
 import subprocess
@@ -21,7 +21,7 @@ STOP_SECONDS = 15.0  # for a local server to drain
 
 @dataclass(frozen=True)
 class Tls:
-    """How to know the server, and what to show it; files in PEM."""
+    """How to verify the server, and the client's own certificate; files in PEM."""
 
     ca: str | Path | None = None  # authorities to trust; None: those of the machine
     certificate: str | Path | None = None  # one's own, for servers that ask for it

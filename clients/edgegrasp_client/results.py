@@ -53,8 +53,8 @@ class Grasp:
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
-    collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
-    clearance: float  # metres from the open hand at the grasp to the nearest thing; <= 0: within
+    collision_free: bool  # whether the open hand touches nothing at the grasp and on its way
+    clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
     object: int | None = None  # number of the object that the contact is on; None: of none
     arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
     id: int | None = None  # the same in every answer that follows it; None without `previous`
@@ -79,9 +79,9 @@ class Grasp:
 
 @dataclass(frozen=True, eq=False)
 class FoundSupport:
-    """The plane that things stand on: the points x with normal . x = offset; cloud frame."""
+    """The plane that objects rest on: the points x with normal . x = offset; cloud frame."""
 
-    normal: Float32  # (3,) unit, away from the table
+    normal: Float32  # (3,) unit, pointing up from the support
     offset: float  # metres
     residual: float | None  # metres, median distance of its points; None: none of it is seen
     share: float  # of the seen surface that lies in it

@@ -63,7 +63,9 @@ class Tokens:
         if not admin and not self.required:
             return None
         if admin and not any(token.is_admin for token in self._known.values()):
-            raise PermissionDenied(HEADER, "a call that this server takes from nobody", ADMIN_FIX)
+            raise PermissionDenied(
+                HEADER, "an administrator's call, which is disabled here", ADMIN_FIX
+            )
         if authorization is None:
             raise Unauthenticated(HEADER, "nothing", FIX)
         scheme, _, text = authorization.strip().partition(" ")

@@ -89,5 +89,5 @@ def receive(file: BinaryIO) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Of JSON, where it does not know a value: the fields of a message, and nothing of a body."""
+    """What JSON has in place of a value that it lacks: a message's fields; "" for a body."""
     return "" if isinstance(value, bytes) else vars(value)
