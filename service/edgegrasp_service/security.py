@@ -64,7 +64,7 @@ class Tokens:
             return None
         if admin and not any(token.is_admin for token in self._known.values()):
             raise PermissionDenied(
-                HEADER, "an administrator's call, which is disabled here", ADMIN_FIX
+                HEADER, "an administrator's call, disabled here", ADMIN_FIX
             )
         if authorization is None:
             raise Unauthenticated(HEADER, "nothing", FIX)
