@@ -135,9 +135,7 @@ def test_results_page_and_pictures(scene: Path, run, tmp_path: Path) -> None:
     assert "box" in (output / "index.html").read_text()
 
 
-def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(
-    scene: Path, run, tmp_path: Path
-) -> None:
+def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(scene, run, tmp_path):
     heap = tmp_path / "heap" / "heap.npz"
     heap.parent.mkdir()
     np.savez(heap, **{k: v for k, v in seen_box().items() if not k.startswith("support_")})
@@ -150,9 +148,7 @@ def test_of_a_heap_that_hides_its_support_no_plane_and_no_objects_are_judged(
     assert results["scenes"]["heap"]["segmentation"]["pixel_recall"] > 0.9
 
 
-def test_a_scene_that_is_refused_counts_as_one_without_grasps(
-    scene: Path, run, tmp_path: Path
-) -> None:
+def test_a_scene_that_is_refused_counts_as_one_without_grasps(scene, run, tmp_path) -> None:
     arrays, whole = seen_box(), load_scene(scene)
     row = np.flatnonzero(whole.labels == 2)[:10]  # fewer points than grasps are asked around
     few = {"points": whole.points[row], "labels": whole.labels[row]}

@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 import torch
@@ -31,21 +30,6 @@ OPTIONS = [
 def file(cloud: np.ndarray, tmp_path: Path) -> str:
     np.save(tmp_path / "cloud.npy", cloud)
     return str(tmp_path / "cloud.npy")
-
-
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
-def test_json_is_that_of_the_http_api(transport: str, file: str, dummy_server, run) -> None:
-    document = json.loads(
-        run("detect", file, "--server", dummy_server.address(transport), "--json")
-    )
-    answer = httpx.post(
-        f"{dummy_server.http_url}/v1/grasps",
-        content=Path(file).read_bytes(),
-        headers={"content-type": "application/x-npy"},
-    ).json()
-    assert list(document) == list(answer)
-    assert document["grasps"] == answer["grasps"]
-    assert document["counts"] == answer["counts"]
 
 
 def test_every_option_is_a_flag() -> None:
@@ -159,11 +143,6 @@ def test_a_file_with_a_depth_image_and_its_camera(dummy_server, run, tmp_path) -
     assert (np.abs(seen - (200, 30, 30)).max(axis=2) < 30).mean() > 0.4  # as the camera saw it
 
 
-def test_names_of_models_are_whole_in_80_columns(dummy_server, run, monkeypatch) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert "vn-edgegrasp" in run("models")
-
-
 def test_depth_images_that_cannot_be_read(camera_files, file, refused) -> None:
     depth, mask, *_ = camera_files
     for flags, sentence in (
@@ -200,9 +179,7 @@ def test_a_bad_option_is_named(options, sentence, file, dummy_server, refused) -
         ("cloud.npy", b"foreign", ("--top-k", "0"), "options.top_k: got 0."),
     ],
 )
-def test_bad_input_is_named_without_a_server(
-    name, content, flags, sentence, refused, tmp_path
-) -> None:
+def test_bad_input_is_named_without_a_server(name, content, flags, sentence, refused, tmp_path):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     assert sentence in refused("detect", tmp_path / name, *flags)

@@ -2,11 +2,11 @@
 
 import importlib.metadata
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from tests.programs import run as run_program
 from typer.testing import CliRunner
 
 from edgegrasp.v1 import grasp_pb2
@@ -36,9 +36,7 @@ def loaded_by(*commands: list[str]) -> tuple[str, set[str]]:
         "    except SystemExit as end: assert not end.code\n"
         "print('LOADED', *sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    shown, _, loaded = done.stdout.rpartition("LOADED")
+    shown, _, loaded = run_program(sys.executable, "-c", program).stdout.rpartition("LOADED")
     return shown, set(loaded.split())
 
 
@@ -91,9 +89,8 @@ def test_a_missing_package_names_the_extra(missing, words, extra, refused, monke
 
 def test_the_command_line_is_an_extra() -> None:
     program = "import sys; sys.modules['typer'] = None; import edgegrasp_cli.main"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install 'edgegrasp[cli]'" in done.stderr
+    said = run_program(sys.executable, "-c", program, code=1).stderr
+    assert "pip install 'edgegrasp[cli]'" in said
 
 
 @pytest.mark.parametrize("transport", ["http", "grpc"])

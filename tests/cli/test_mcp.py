@@ -17,13 +17,14 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from tests.programs import EDGEGRASP, run
 
 from edgegrasp_client import GraspClient
 
 mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
 image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
-PROGRAM = ["-c", "from edgegrasp_cli.main import main; main()", "mcp"]
+PROGRAM = [*EDGEGRASP[1:], "mcp"]
 CAMERA = [60.0, 60.0, 15.5, 11.5]
 
 
@@ -132,9 +133,7 @@ async def test_a_file_with_a_depth_image_and_its_camera(dummy_server, folder: Pa
 
 
 def test_a_folder_that_is_not_there_is_refused() -> None:
-    words = [sys.executable, *PROGRAM, "--folder", "/nonexistent"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    done = run(sys.executable, *PROGRAM, "--folder", "/nonexistent", code=1)
     assert "/nonexistent is no folder" in done.stderr
 
 
@@ -173,9 +172,7 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
         ),
     ],
 )
-async def test_what_is_wrong_reaches_the_agent(
-    dummy_server, folder: Path, tool: str, arguments: dict, told: str
-) -> None:
+async def test_what_is_wrong_reaches_the_agent(dummy_server, folder, tool, arguments, told) -> None:
     async with agent(dummy_server.grpc_address, folder) as client:
         result = await client.call_tool(tool, arguments)
         assert result.is_error

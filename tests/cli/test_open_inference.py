@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from tests.programs import EDGEGRASP, run
 
 pytest.importorskip("uvicorn", reason="the extra `open-inference` is not installed")
 
@@ -67,9 +68,7 @@ KSERVE_PYTHON = os.environ.get("KSERVE_PYTHON", "")
 @pytest.mark.parametrize("transport", ["http", "grpc"])
 @pytest.mark.parametrize("kind", ["points", "depth"])
 @pytest.mark.parametrize("client", ["triton", "kserve"])
-def test_others_clients_get_grasps(
-    gateway, client, transport, kind, cloud, tmp_path, dummy_server
-) -> None:
+def test_others_clients_get_grasps(gateway, client, transport, kind, cloud, tmp_path, dummy_server):
     if client == "kserve" and not KSERVE_PYTHON:
         pytest.skip("kserve wants older packages than ours: name a Python with it, KSERVE_PYTHON")
     for module in ("tritonclient", "geventhttpclient") if client == "triton" else ():
@@ -83,9 +82,7 @@ def test_others_clients_get_grasps(
     python = KSERVE_PYTHON if client == "kserve" else sys.executable
     script = Path(__file__).with_name(f"{client}_client.py")
     command = [python, "-P", script, transport, gateway[transport], "grasps", file]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+    told = json.loads(run(*command).stdout)
     assert told["health"] == [True, True, True]
     if client == "triton":  # KServe's has no call for metadata
         assert told["alone"] == [True, True]
@@ -166,8 +163,7 @@ def test_the_command_serves_both_transports(dummy_server) -> None:
         "--grpc-port",
         ports[1],
     ]
-    program = "from edgegrasp_cli.main import main; main()"
-    with subprocess.Popen([sys.executable, "-c", program, "open-inference", *flags]) as process:
+    with subprocess.Popen([*EDGEGRASP, "open-inference", *flags]) as process:
         try:
             with httpx.Client(transport=httpx.HTTPTransport(retries=10)) as http:
                 ready = http.get(f"http://127.0.0.1:{ports[0]}/v2/health/ready", timeout=60)

@@ -18,6 +18,7 @@ import psutil
 import pytest
 from benchmarks.load import OPTIONS
 from benchmarks.load import cloud as table
+from tests.programs import EDGEGRASP
 
 from edgegrasp_client import (
     GraspClient,
@@ -32,7 +33,6 @@ from edgegrasp_training.generation import generate
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.views import find_views
 
-EDGEGRASP = "-c", "from edgegrasp_cli.main import main; main()"
 ROOT = Path(__file__).parents[2]
 DATA = ["generate-data", "--scenes=6", "--views-per-scene=1", "--grasps-per-view=8", "--seed=5"]
 AGENTS = ("dashboard-agent-grpc", "dashboard-agent-listen", "metrics-export", "runtime-env-agent")
@@ -150,13 +150,11 @@ def until(condition: Callable[[], Any], process: psutil.Popen) -> Any:
     return found
 
 
-def test_data_are_those_of_one_process_though_a_node_is_lost(
-    cluster: Cluster, tmp_path: Path
-) -> None:
+def test_data_are_those_of_one_process_though_a_node_is_lost(cluster, tmp_path) -> None:
     alone, there = tmp_path / "alone", tmp_path / "there"
     few = {"scenes": 6, "views_per_scene": 1, "grasps_per_view": 8, "seed": 5}
     list(generate(alone, None, GenerationOptions(**few)))
-    making = cluster.start(*EDGEGRASP, *DATA, str(there), f"--ray={cluster.address}")
+    making = cluster.start(*EDGEGRASP[1:], *DATA, str(there), f"--ray={cluster.address}")
     until(lambda: cluster.at_work("_run") and list(there.glob("*.npz")), making)
     cluster.kill(cluster.second)
     assert making.wait(PATIENCE) == 0

@@ -63,7 +63,6 @@ def test_generate_train_serve_and_benchmark_one_after_the_other(data, run, tmp_p
         (("benchmark", "--rounds", "0"), "rounds is 0"),
         (("benchmark", "--protocol", "paper"), "choose one of bin, bin-full, edgegrasp"),
         (("benchmark", "--collision", "dodge"), "options.collision: got 'dodge'"),
-        (("benchmark", "--planner", "guess"), "in-process"),
         (("benchmark", "--planner", "no_such:planner"), "cannot be loaded"),
         (("benchmark", "--ray", "10.0.0.1:6379"), "pass --server"),
         (("benchmark", "--model", "absent.safetensors"), "no such file"),

@@ -2,20 +2,19 @@
 
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
+from tests.programs import EDGEGRASP
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_a_scene_is_served_until_it_is_told_to_end(end: signal.Signals, tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", np.full((4, 6), 500, np.uint16))
-    program = "from edgegrasp_cli.main import main; main()"
     flags = ("--depth", tmp_path / "depth.npy", "--intrinsics", "30,30,3,2", "--no-browser")
-    command = [sys.executable, "-c", program, "view", *map(str, flags)]
+    command = [*EDGEGRASP, "view", *map(str, flags)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
         assert viewer.stdout is not None
         address = viewer.stdout.readline().split()[0]

@@ -125,9 +125,7 @@ def test_models_and_readiness(client) -> None:
     client.wait_until_ready(5)
 
 
-async def test_concurrent_requests_of_the_async_client_get_their_own_answers(
-    dummy_server, cloud
-) -> None:
+async def test_concurrent_requests_of_the_async_client_get_their_own_answers(dummy_server, cloud):
     import asyncio
 
     for address in (dummy_server.grpc_address, dummy_server.http_url):

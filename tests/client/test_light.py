@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.programs import run
 
 ROOT = Path(__file__).parents[2]
 IMPORT = """
@@ -34,11 +35,5 @@ def test_the_client_imports_with_its_own_requirements_alone(python: str) -> None
     if program is None or subprocess.run(probe, capture_output=True, check=False).returncode:
         pytest.skip(f"{python} is not here, or has not what the client requires")
     path = f"{ROOT / 'clients'}:{ROOT / 'proto'}"
-    done = subprocess.run(
-        [program, "-W", "error", "-c", IMPORT, *ABSENT],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": path},
-    )
-    assert done.returncode == 0, done.stderr
+    words = ("-W", "error", "-c", IMPORT, *ABSENT)
+    run(program, *words, env=os.environ | {"PYTHONPATH": path})

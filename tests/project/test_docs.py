@@ -10,7 +10,6 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from tests.cloud_files import ply
+from tests.programs import EDGEGRASP, run
 
 from edgegrasp_cli.flags import TOKEN_VARIABLE
 from edgegrasp_cli.main import load_command
@@ -167,9 +167,8 @@ def test_the_requests_by_curl_are_answered(dummy_server, tmp_path: Path) -> None
     for line in lines:
         asked = re.sub(r"--unix-socket \S+ http://localhost", dummy_server.http_url, line)
         asked = asked.replace("http://127.0.0.1:8000", dummy_server.http_url)
-        done = subprocess.run(["bash", "-c", asked], cwd=tmp_path, capture_output=True, text=True)
-        answer = json.loads(done.stdout)
-        assert {"grasps", "models"} & answer.keys(), line + done.stdout + done.stderr
+        said = run("bash", "-c", asked, cwd=tmp_path).stdout
+        assert {"grasps", "models"} & json.loads(said).keys(), line + said
 
 
 def write_what_commands_read(folder: Path) -> None:
@@ -192,10 +191,7 @@ def test_the_commands_of_the_start_pages_run_as_they_stand(tmp_path: Path) -> No
         for file in re.findall(r"(?<!picture )(?<![\w/])[\w/]+\.(?:png|ply|npz|npy)", shown):
             assert (tmp_path / file).exists(), f"{page}: nobody has {file}"
         if words[:2] == ["edgegrasp", "detect"]:
-            program = "from edgegrasp_cli.main import main; main()"
-            command = [sys.executable, "-P", "-c", program, *words[1:]]
-            done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-            assert done.returncode == 0, done.stderr
+            run(sys.executable, "-P", *EDGEGRASP[1:], *words[1:], cwd=tmp_path)
             with Image.open(tmp_path / words[words.index("--picture") + 1]) as picture:
                 assert min(picture.size) > 300
             detected.add(shown)
@@ -233,14 +229,8 @@ def test_json_and_toml_of_the_pages_can_be_read() -> None:
 
 def test_the_site_is_built_without_a_warning_and_asks_nobody(tmp_path: Path) -> None:
     pytest.importorskip("material", reason="the extra `docs` is not installed")
-    done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
-        cwd=ROOT,
-        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    build = (sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", tmp_path / "site")
+    run(*build, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
     pages = list((tmp_path / "site").rglob("*.html"))
     assert len(pages) > 15
     loaded = r"<(?:script|link|img|iframe|source)\b[^>]*\b(?:src|href)=\"?(?:https?:)?//[^>]*>"

@@ -6,30 +6,18 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from tests.programs import EDGEGRASP, run
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run(*command: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [str(word) for word in command],
-        env=env,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-
-
 def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_path: Path) -> None:
     done = run(sys.executable, EXAMPLES / "demo.py", "--output", tmp_path)
-    assert done.returncode == 0, done.stderr
     grpc_table, rest_table = re.split(r"\n\d+ grasps over ", done.stdout)[1:]
     ranked = re.compile(r"^ +(\d+)  (0\.\d+)  ", re.MULTILINE)
     assert len(ranked.findall(grpc_table)) >= 10
@@ -44,28 +32,24 @@ def test_demo_prints_ranked_grasps_of_both_transports_and_writes_a_picture(tmp_p
 
 def example(name: str, *words: object) -> str:
     """What an example prints."""
-    done = run(sys.executable, EXAMPLES / name, *words)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run(sys.executable, EXAMPLES / name, *words).stdout
 
 
 def test_cpp_example_is_built_and_prints_five_grasps(dummy_server, tmp_path: Path) -> None:
     for program in ("cmake", "c++", "protoc", "grpc_cpp_plugin", "pkg-config"):
         if shutil.which(program) is None:
             pytest.skip(f"{program} is not installed, see examples/cpp/CMakeLists.txt")
-    if run("pkg-config", "--exists", "grpc++").returncode:
+    if subprocess.run(["pkg-config", "--exists", "grpc++"]).returncode:
         pytest.skip("gRPC for C++ is not installed, see examples/cpp/CMakeLists.txt")
     build = tmp_path / "build"
-    made = run("cmake", "-S", EXAMPLES / "cpp", "-B", build)
-    made = made if made.returncode else run("cmake", "--build", build, "--parallel", 2)
-    assert made.returncode == 0, made.stdout + made.stderr
+    run("cmake", "-S", EXAMPLES / "cpp", "-B", build)
+    run("cmake", "--build", build, "--parallel", 2)
     depth = tmp_path / "depth.raw"
     depth.write_bytes(np.full((48, 64), 600, "<u2").tobytes())
     camera = (depth, 64, 48, 60, 60, 32, 24)
     done = run(build / "detect", *camera, dummy_server.grpc_address)
     assert done.stdout.count("score 0.") == 5, done.stderr
-    wrong = run(build / "detect", depth, 99, *camera[2:], dummy_server.grpc_address)
-    assert wrong.returncode == 1
+    wrong = run(build / "detect", depth, 99, *camera[2:], dummy_server.grpc_address, code=1)
     assert "error 3: depth_images.0" in wrong.stderr
 
 
@@ -119,12 +103,10 @@ def test_pick_and_place(start_server) -> None:
 
 
 def test_your_planner(tmp_path: Path) -> None:
-    program = "from edgegrasp_cli.main import main; main()"
     asked = ("benchmark", "--planner", "your_planner:plan", "--scene", "packed", "--rounds", "2")
     flags = ("--seed", "0", "--workers", "1", "--no-report", "--output", tmp_path)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([*sys.path, str(EXAMPLES)])}
-    done = run(sys.executable, "-c", program, *asked, *flags, env=environment)
-    assert done.returncode == 0, done.stderr
+    done = run(*EDGEGRASP, *asked, *flags, env=environment)
     assert "your_planner:plan: GSR" in done.stdout
     assert json.loads((tmp_path / "summary.json").read_text())["attempts"] > 0
 
@@ -141,7 +123,6 @@ def test_training_on_your_objects(tmp_path: Path) -> None:
     words = (tmp_path / "objects", tmp_path / "out", 2, 1)
     environment = os.environ | {"PATH": programs}
     done = run("bash", EXAMPLES / "train_on_your_objects.sh", *words, env=environment)
-    assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "run" / "edgegrasp-plus.safetensors").is_file()
     assert "GSR" in done.stdout
 

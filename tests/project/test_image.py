@@ -3,10 +3,10 @@
 import os
 import re
 import shlex
-import subprocess
 from pathlib import Path
 
 import pytest
+from tests.programs import run
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,9 +31,7 @@ def test_it_has_the_libraries_of_torch_and_not_those_of_open3d() -> None:
         ("x86_64", "flags : fpu", "of its own"),
     ],
 )
-def test_the_server_starts_with_the_loops_of_its_processor(
-    machine: str, flags: str, loops: str, tmp_path: Path
-) -> None:
+def test_the_server_starts_with_the_loops_of_its_processor(machine, flags, loops, tmp_path) -> None:
     programs = {
         "uname": f"echo {machine}",
         "grep": f"echo '{flags}'",
@@ -44,11 +42,6 @@ def test_the_server_starts_with_the_loops_of_its_processor(
         (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
         (tmp_path / name).chmod(0o755)
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CPU_NAME"}
-    started = subprocess.run(
-        ["/bin/sh", str(ROOT / "docker" / "start.sh"), "--workers", "2"],
-        env={**environment, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    here = {**environment, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    started = run("/bin/sh", ROOT / "docker" / "start.sh", "--workers", "2", env=here)
     assert started.stdout == f"{loops}: serve --workers 2\n"

@@ -1,12 +1,12 @@
 """scripts/system_packages.sh on machines that lack something, played by stand-in programs."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.programs import run
 
 INSTALL = Path(__file__).parents[2] / "scripts" / "install.py"
 SCRIPT = Path(__file__).parents[2] / "scripts" / "system_packages.sh"
@@ -33,12 +33,6 @@ def machine(folder: Path, *, lacks: str, user: int = 0, apt: bool = True) -> dic
     return {"PATH": str(folder), "HOME": os.devnull}
 
 
-def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["/bin/bash", SCRIPT], env=environment, capture_output=True, text=True, check=False
-    )
-
-
 @pytest.mark.parametrize(
     ("lacks", "machine_is", "code", "message"),
     [
@@ -54,8 +48,7 @@ def run(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
 def test_root_installs_missing_packages_and_others_get_the_command(
     tmp_path: Path, lacks: str, machine_is: dict[str, Any], code: int, message: str
 ) -> None:
-    done = run(machine(tmp_path, lacks=lacks, **machine_is))
-    assert done.returncode == code, done.stderr
+    done = run("/bin/bash", SCRIPT, code=code, env=machine(tmp_path, lacks=lacks, **machine_is))
     assert message in done.stdout + done.stderr
     installed = tmp_path / "apt.log"
     assert installed.exists() == (VENV_CHECK in lacks)
@@ -72,6 +65,4 @@ def test_an_install_says_whether_it_went_well(tmp_path: Path) -> None:
     constraints = INSTALL.parents[1] / "constraints.txt"
     for wanted, code in (("numpy", 0), (tmp_path / "absent", 1)):
         command = [sys.executable, INSTALL, constraints, "--dry-run", "--no-index", wanted]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == code, done.stderr
-        assert ("absent" in done.stderr) == (code != 0)
+        assert ("absent" in run(*command, code=code).stderr) == (code != 0)

@@ -13,6 +13,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+from tests.programs import run
 
 from edgegrasp_client import GraspClient
 
@@ -25,8 +26,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The sdist, and the wheel that is made of it."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run(*command)
     return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
 
 
@@ -84,14 +84,8 @@ def test_the_wheel_alone_serves(built: tuple[Path, Path], tmp_path: Path) -> Non
             server.terminate()
         assert server.wait(20) == 0
     assert "/v1/grasps" in document["paths"]
-    found = subprocess.run(
-        [str(new / "bin/python"), "-c", "import edgegrasp_service as s; print(s.__file__)"],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment,
-    )
-    assert found.stdout.startswith(str(new))
+    where = "import edgegrasp_service as s; print(s.__file__)"
+    assert run(new / "bin/python", "-c", where, env=environment).stdout.startswith(str(new))
 
 
 BARE = """
@@ -142,19 +136,10 @@ def test_the_base_install_alone_asks_a_server(built, dummy_server, tmp_path: Pat
     reached = subprocess.run([*pip, "numpy", *pinned], capture_output=True, text=True, check=False)
     if reached.returncode:
         pytest.skip(f"pip reaches no index: {reached.stderr.strip().splitlines()[-1]}")
-    done = subprocess.run(
-        [*pip, *pinned, str(built[1])], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    run(*pip, *pinned, built[1])
     addresses = [dummy_server.grpc_address, dummy_server.http_url]
-    ran = subprocess.run(
-        [python, "-W", "error", "-c", BARE, *addresses],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(ROOT / "clients" / "ros2")},
-    )
-    assert ran.returncode == 0, ran.stderr
+    there = {**os.environ, "PYTHONPATH": str(ROOT / "clients" / "ros2")}
+    ran = run(python, "-W", "error", "-c", BARE, *addresses, env=there)
     numpy, *names = ran.stdout.split()
     assert numpy.startswith("1.24.") or not lowest
     assert not {"scipy", "torch", "matplotlib", "typer"} & set(names)

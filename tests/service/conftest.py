@@ -224,9 +224,7 @@ def nursery(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, ...
 
 
 @pytest.fixture
-async def begin(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nursery: tuple[str, ...]
-) -> AsyncIterator[Serve]:
+async def begin(tmp_path, monkeypatch, nursery) -> AsyncIterator[Serve]:
     """Begins servers of controlled dummies in this event loop, on free ports."""
     monkeypatch.setattr("edgegrasp_service.server.NOTICE_SECONDS", 0.0)
     running: list[Running] = []

@@ -36,9 +36,7 @@ async def test_a_worker_that_goes_on_after_the_deadline_is_replaced(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_the_worker_itself_stops_after_the_deadline(
-    serve, transport, is_error, cloud
-) -> None:
+async def test_the_worker_itself_stops_after_the_deadline(serve, transport, is_error, cloud):
     running = await serve()
     client, before = running.connect(transport), running.server.pool.pids
     running.stages.shut("prepare")
@@ -62,9 +60,7 @@ async def test_a_request_whose_client_left_frees_its_worker(serve, transport, cl
     assert (await running.connect("grpc").detect(cloud)).fine
 
 
-async def test_a_client_that_left_while_it_waited_is_never_computed(
-    serve, transport, cloud
-) -> None:
+async def test_a_client_that_left_while_it_waited_is_never_computed(serve, transport, cloud):
     running = await serve()
     client = running.connect(transport)
     running.stages.shut("evaluate")
@@ -80,9 +76,7 @@ async def test_a_client_that_left_while_it_waited_is_never_computed(
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_the_servers_own_limit_holds_without_a_deadline(
-    serve, transport, is_error, cloud
-) -> None:
+async def test_the_servers_own_limit_holds_without_a_deadline(serve, transport, is_error, cloud):
     running = await serve(max_request_seconds=0.2)
     running.stages.shut("evaluate")
     assert is_error(await running.connect(transport).detect(cloud), "deadline-exceeded")

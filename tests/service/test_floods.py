@@ -23,6 +23,7 @@ from benchmarks.soak import connect, http2_frame, http2_headers, http2_opening
 from grpc import aio
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from tests.cloud_files import npy
+from tests.programs import run
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
@@ -486,15 +487,8 @@ def test_compressed_messages_are_refused(dummy_server) -> None:
 def test_a_short_soak(tmp_path: Path) -> None:
     """Beside attacks each request comes to something, none to another's; health is answered."""
     command = [sys.executable, "-m", "benchmarks.soak", "--minutes", "0.2", "--clients", "3"]
-    done = subprocess.run(
-        [*command, "--output", tmp_path],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env=os.environ | {"SOAK_PATIENCE": "10"},  # on a busy machine
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    patience = os.environ | {"SOAK_PATIENCE": "10"}  # on a busy machine
+    run(*command, "--output", tmp_path, cwd=ROOT, env=patience)
     found = json.loads((tmp_path / "soak.json").read_text())
     assert found["faults"] == []
     assert {"grpc good: answered", "stream good: answered", "rest good: answered"} <= {

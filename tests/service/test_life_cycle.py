@@ -242,9 +242,7 @@ async def test_sockets_of_a_folder(serve, transport: str, cloud: np.ndarray) -> 
             await running.serving
 
 
-async def test_a_name_with_several_addresses_has_all_of_them_asked(
-    serve, cloud: np.ndarray
-) -> None:
+async def test_a_name_with_several_addresses_has_all_of_them_asked(serve, cloud) -> None:
     servers = [await serve(), await serve()]
     name = "ipv4:" + ",".join(one.server.grpc_address for one in servers)
     async with AsyncGraspClient(name) as client:

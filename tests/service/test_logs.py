@@ -65,9 +65,7 @@ async def test_errors_and_streams_carry_the_request_id(serve) -> None:
         stream.cancel()
 
 
-async def test_json_lines_name_requests_and_no_secrets(
-    serve, cloud: np.ndarray, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_json_lines_name_requests_and_no_secrets(serve, cloud, tmp_path, caplog) -> None:
     caplog.set_level(logging.DEBUG, logger="edgegrasp_service")
     (tmp_path / "tokens").write_text(f"arm-1:{TOKEN}")
     running = await serve(token_file=tmp_path / "tokens", admin_tokens=[ADMIN])

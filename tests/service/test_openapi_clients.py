@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.programs import run
 
 from edgegrasp_service.front.http import DOCUMENT
 
@@ -56,28 +56,18 @@ def test_openapi_python_client_asks_a_server(dummy_server, cloud: np.ndarray, tm
     folder = tmp_path / "generated"
     words = [generator, "generate", "--path", str(FILE), "--output-path", str(folder)]
     environment = os.environ | {"PATH": f"{Path(generator).parent}:{os.environ['PATH']}"}
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
+    done = run(*words, env=environment)
     assert "will not be generated" not in done.stdout + done.stderr
     request = {"points": cloud.tolist(), "options": {"top_k": 3, "objects": {"include": [0]}}}
-    asked = subprocess.run(
-        [sys.executable, "-c", ASK, dummy_server.http_url],
-        input=json.dumps(request),
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONPATH": str(folder)},
-    )
+    words, there = [sys.executable, "-c", ASK, dummy_server.http_url], {"PYTHONPATH": str(folder)}
+    asked = run(*words, input=json.dumps(request), env=os.environ | there)
     assert asked.stdout.startswith("3 0."), asked.stderr
 
 
 def test_openapi_typescript_knows_what_may_be_left_out(tmp_path: Path) -> None:
     generator = program("OPENAPI_TYPESCRIPT", "openapi-typescript")
     types = tmp_path / "types.ts"
-    done = subprocess.run(
-        [generator, str(FILE), "-o", str(types)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    run(generator, FILE, "-o", types)
     text = types.read_text()
     for name in ("cones", "num_candidates", "max_object_size"):
         assert f" {name}?:" in text

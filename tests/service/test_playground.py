@@ -3,7 +3,6 @@
 import io
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from tests.programs import run
 
 from edgegrasp_client.conversions import read_isaac_grasps
 from edgegrasp_service import server
@@ -128,17 +128,14 @@ def test_grasps_of_the_sample_are_seen_and_asked_for_again_in_a_region(
 
     for text, command in (("#curl", ["bash", "-c"]), ("#python", [sys.executable, "-c"])):
         code = page.locator(text).text_content()
-        done = subprocess.run([*command, code], cwd=SAMPLES, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
+        done = run(*command, code, cwd=SAMPLES)
         if text == "#curl":
             assert json.loads(done.stdout)["grasps"] == answer["grasps"]
         else:
             assert done.stdout.count("[[") == len(contacts)
 
 
-def test_objects_and_points_are_asked_for_and_answers_saved(
-    real_server, open_page, tmp_path
-) -> None:
+def test_objects_and_points_are_asked_for_and_answers_saved(real_server, open_page, tmp_path):
     page = open_page(real_server.http_url)
     open_touching(page, real_server.http_url)
     number = int(page.locator("#grasps small").first.inner_text().removeprefix("object "))

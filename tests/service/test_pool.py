@@ -27,9 +27,7 @@ async def test_a_worker_that_dies_fails_its_own_request_only(
     assert "edgegrasp_workers_replaced_total 1.0" in running.metrics()
 
 
-async def test_a_request_that_workers_die_of_is_not_tried_again(
-    serve, transport, is_error, cloud
-) -> None:
+async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport, is_error, cloud):
     """A crash is enough; a worker that was killed may have been killed for something else."""
     running = await serve()
     client = running.connect(transport)

@@ -90,23 +90,11 @@ def first_method(file: File) -> Any:
 BREAKS = {
     "field removed": (remove(fields, "width"), "Grasp = 4 (name width"),
     "number used again": (reuse_number, "is now name opening"),
-    "field renamed": (change("Grasp.width", name="opening"), "is now name opening"),
-    "field renumbered": (change("Grasp.width", number=99), "Grasp = 4 (name width"),
     "type changed": (change("Grasp.width", type=Field.TYPE_DOUBLE), "type "),
-    "message type changed": (
-        change("DetectOptions.up", type_name=".edgegrasp.v1.Quaternion"), "type_name",
-    ),
     "no longer repeated": (
         change("DetectGraspsResponse.warnings", label=Field.LABEL_OPTIONAL), "label"
     ),
-    "no longer optional": (
-        change("DetectOptions.seed", proto3_optional=False), "proto3_optional"
-    ),
     "left its oneof": (leave_oneof, "in oneof cloud) is now"),
-    "oneof renamed": (
-        set_in(lambda file: message(file, "DetectGraspsRequest").oneof_decl[0], name="source"),
-        "in oneof source",
-    ),
     "message removed": (remove(lambda file: file.message_type, "Cone"), "message Cone () is gone"),
     "number no longer reserved": (unreserve, "DetectOptions reserves 10 () is gone"),
     "nested field removed": (
@@ -116,12 +104,6 @@ BREAKS = {
     "rpc removed": (
         remove(lambda file: file.service[0].method, "ScoreGrasps"),
         "rpc GraspService.ScoreGrasps (name",
-    ),
-    "service removed": (
-        remove(lambda file: file.service, "GraspService"), "rpc GraspService.DetectGrasps (name"
-    ),
-    "rpc answers otherwise": (
-        set_in(first_method, output_type=".edgegrasp.v1.ScoreGraspsResponse"), "output_type"
     ),
     "rpc streams": (set_in(first_method, server_streaming=True), "server_streaming True"),
     "package renamed": (
@@ -152,9 +134,7 @@ def test_additions_are_no_breaks() -> None:
     assert contract.breaks(COMMITTED, more) == []
 
 
-def test_a_break_is_not_written_into_the_contract(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_break_is_not_written_into_the_contract(tmp_path, monkeypatch) -> None:
     broken = contract.current()
     remove(fields, "width")(broken)
     monkeypatch.setattr(contract, "current", lambda: broken)

@@ -1,7 +1,6 @@
 """A real network behind the server: every way in gives the detector's own grasps."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -96,9 +95,7 @@ def as_lists(detection: Any) -> list[list[Any]]:
     ]
 
 
-def test_many_options_give_the_same_grasps_everywhere(
-    catalogue: ModelCatalogue, scene: dict[str, np.ndarray], real_server, tmp_path: Path
-) -> None:
+def test_many_options_give_the_same_grasps_everywhere(catalogue, scene, real_server, tmp_path):
     expected = catalogue.get().detect(CloudInput(**scene), parse_options(MANY))
     assert expected.grasps
     assert expected.debug is not None
@@ -147,9 +144,7 @@ def evaluated(scoring: Any) -> list[Any]:
     ]
 
 
-def test_scores_are_the_same_everywhere(
-    catalogue: ModelCatalogue, scene: dict[str, np.ndarray], real_server
-) -> None:
+def test_scores_are_the_same_everywhere(catalogue, scene, real_server) -> None:
     options: dict[str, Any] = {"seed": 3, "viewpoint": [0.3, 0.1, 0.6]}
     points, detector, parsed = scene["points"], catalogue.get(), parse_options(options)
     found = detector.detect(points, parsed).grasps
@@ -173,9 +168,7 @@ def test_scores_are_the_same_everywhere(
         (Pace(1e-6, 1e-6), "invalid-request", "20000"),
     ],
 )
-def test_clouds_that_take_too_long_are_refused(
-    catalogue: ModelCatalogue, monkeypatch: pytest.MonkeyPatch, pace: Pace, kind: str, named: str
-) -> None:
+def test_clouds_that_take_too_long_are_refused(catalogue, monkeypatch, pace, kind, named) -> None:
     monkeypatch.setattr(catalogue, "pace", pace)
     room = np.random.default_rng(0).random((50_000, 3), np.float32) * 4
     whole = "objects=off&support=null"

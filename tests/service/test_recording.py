@@ -19,9 +19,7 @@ from edgegrasp_service.worker import answer
 from edgegrasp_service.worker.job import Answer, Facts, Job
 
 
-async def test_recorded_requests_are_replayed(
-    serve, transport, cloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_recorded_requests_are_replayed(serve, transport, cloud, tmp_path, monkeypatch):
     running = await serve(record_folder=tmp_path / "recorded")
     client = running.connect(transport)
     assert (await client.detect(cloud, seed=3)).fine
@@ -55,9 +53,7 @@ async def test_the_oldest_are_deleted(serve, cloud, tmp_path: Path) -> None:
     assert sum(path.stat().st_size for path in (tmp_path / "recorded").iterdir()) <= 2**20
 
 
-async def test_what_is_there_already_counts_and_is_looked_at_once(
-    serve, cloud, tmp_path: Path
-) -> None:
+async def test_what_is_there_already_counts_and_is_looked_at_once(serve, cloud, tmp_path) -> None:
     for number in range(3):
         (tmp_path / f"20200101T00000{number}000000Z-old.job").write_bytes(bytes(500_000))
     (tmp_path / "notes.txt").write_text("mine")
@@ -73,9 +69,7 @@ async def test_what_is_there_already_counts_and_is_looked_at_once(
     assert running.server.service.admission.held_bytes == 0
 
 
-async def test_how_many_files_lie_there_costs_nothing_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_how_many_files_lie_there_costs_nothing_later(tmp_path, monkeypatch) -> None:
     for number in range(60_000):
         os.mknod(tmp_path / f"20200101T000000{number:06}Z-old.job")
     recorder = Recorder(tmp_path, 2**20, lambda size: True)

@@ -105,9 +105,7 @@ async def test_no_spelling_of_the_address_comes_around_the_token(serve) -> None:
     assert running.stages.begun["load"] == 1
 
 
-async def test_answers_keep_coming_while_weights_load(
-    serve, transport: str, cloud: np.ndarray
-) -> None:
+async def test_answers_keep_coming_while_weights_load(serve, transport, cloud) -> None:
     running = await serve(admin_tokens=[ADMIN])
     server = running.server
     async with (
@@ -176,9 +174,7 @@ async def test_tokens_are_read_anew(serve, tmp_path: Path, transport: str) -> No
             await client.models()
 
 
-def test_sighup_swaps_real_weights_and_survives_truncated_ones(
-    real_server, cloud: np.ndarray
-) -> None:
+def test_sighup_swaps_real_weights_and_survives_truncated_ones(real_server, cloud) -> None:
     """Under load: every answer is one, before, while and after weights are swapped."""
     file, stop = real_server.mine, threading.Event()
     data, other = (

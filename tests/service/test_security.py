@@ -91,9 +91,7 @@ async def test_mutual_tls(serve, server_tls, pem, transport: str, cloud: np.ndar
         assert isinstance(await refused(address, tls=tls), ServerUnavailableError)
 
 
-async def test_certificates_are_read_anew(
-    serve, pem, transport: str, cloud: np.ndarray, tmp_path: Path
-) -> None:
+async def test_certificates_are_read_anew(serve, pem, transport, cloud, tmp_path) -> None:
     """Server's and clients' alike; connections that are open stay, and bad files change nothing."""
     files = {name: tmp_path / f"{name}.pem" for name in ("server", "server_key", "ca")}
 
@@ -133,9 +131,7 @@ async def test_certificates_are_read_anew(
         ({"tls_client_ca": "text"}, "and tls_client_ca"),
     ],
 )
-def test_bad_certificates_are_named(
-    pem, server_tls, tmp_path: Path, changed: dict[str, str], sentence: str
-) -> None:
+def test_bad_certificates_are_named(pem, server_tls, tmp_path, changed, sentence) -> None:
     (tmp_path / "text").write_text("no certificate")
     files = {**pem, "text": tmp_path / "text"}
     given = server_tls | {name: files.get(value, value) for name, value in changed.items()}
@@ -237,13 +233,7 @@ async def test_the_health_check_reads_what_the_server_reads(
         ({"host": "robot.example", "token_file": "tokens"}, ["nothing is encrypted"]),
     ],
 )
-def test_a_server_that_others_can_reach_warns(
-    given: dict[str, Any],
-    warned: list[str],
-    caplog: pytest.LogCaptureFixture,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_server_that_others_can_reach_warns(given, warned, caplog, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("tokens").write_text(USER)
     warn(Settings(**given))
@@ -277,9 +267,7 @@ def test_a_folder_without_weights_warns(tmp_path: Path, caplog: pytest.LogCaptur
         ("Bearer \udcff\xff", False, Unauthenticated),
     ],
 )
-def test_check(
-    header: str | None, admin: bool, error: type[Exception] | None, tmp_path: Path
-) -> None:
+def test_check(header, admin, error, tmp_path) -> None:
     users, admins = tmp_path / "tokens", tmp_path / "admin_tokens"
     users.write_text(f"{USER}\n{SECOND}\n")
     admins.write_text(ADMIN)

@@ -31,9 +31,7 @@ def serve(*flags: str) -> Result:
     return CliRunner().invoke(main.app, ["serve", *flags])
 
 
-def test_each_source_wins_over_the_one_before(
-    monkeypatch: pytest.MonkeyPatch, config: Path
-) -> None:
+def test_each_source_wins_over_the_one_before(monkeypatch, config) -> None:
     config.write_text("http_port = 1\ngrpc_port = 1\nmax_points = 1\n")
     monkeypatch.setenv("EDGEGRASP_CONFIG", str(config))
     monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "2")
@@ -45,9 +43,7 @@ def test_each_source_wins_over_the_one_before(
 
 
 @pytest.mark.parametrize("source", ["a flag", "the environment", "server.toml"])
-def test_a_mistake_is_told_with_its_source(
-    monkeypatch: pytest.MonkeyPatch, config: Path, source: str
-) -> None:
+def test_a_mistake_is_told_with_its_source(monkeypatch, config, source) -> None:
     config.write_text("http_port = -1\n" if source == "server.toml" else "http_port = 1\n")
     monkeypatch.setenv("EDGEGRASP_HTTP_PORT", "-1" if source == "the environment" else "")
     with pytest.raises(InvalidSettings, match=f"http_port: got .*It comes from .*{source}"):

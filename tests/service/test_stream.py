@@ -32,26 +32,6 @@ async def streams() -> AsyncIterator[Any]:
         await channel.close(None)
 
 
-async def test_answers_come_in_order_and_are_those_of_single_calls(serve, streams, cloud) -> None:
-    running = await serve()
-    stream = streams(running)
-    await stream.write(request("cloud 0", cloud, seed=0))
-    answers = [await stream.read()]  # before the next request
-    for seed in range(1, 9):
-        await stream.write(request(f"cloud {seed}", cloud, seed=seed))
-    await stream.done_writing()
-    while (answer := await stream.read()) is not aio.EOF:
-        answers.append(answer)
-    assert [answer.request_id for answer in answers] == [f"cloud {seed}" for seed in range(9)]
-    assert await stream.code() is grpc.StatusCode.OK
-    async with aio.insecure_channel(running.server.grpc_address) as channel:
-        stub = grasp_pb2_grpc.GraspServiceStub(channel)
-        for seed, answer in enumerate(answers):
-            alone = await stub.DetectGrasps(request("", cloud, seed=seed).request)
-            assert answer.detection.grasps == alone.grasps
-    assert running.ended == [""] * 18
-
-
 async def test_an_error_is_an_answer_and_the_stream_goes_on(serve, streams, cloud) -> None:
     running = await serve()
     stream = streams(running)
@@ -171,9 +151,7 @@ async def test_a_stream_whose_client_left_ends(serve, streams, cloud) -> None:
     assert running.stages.begun["prepare"] == 1
 
 
-async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(
-    serve, streams, cloud
-) -> None:
+async def test_a_stopping_server_answers_what_it_read_and_ends_the_stream(serve, streams, cloud):
     running = await serve()
     stream, idle = streams(running), streams(running)
     running.stages.shut("evaluate")

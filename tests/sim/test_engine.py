@@ -1,12 +1,12 @@
 """The choice of an engine, and what both must agree on."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.programs import run
 
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
@@ -65,8 +65,7 @@ def test_mujoco_draws_where_it_was_imported_before() -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed")
     command = [sys.executable, "-c", DRAW_WHERE_MUJOCO_CAME_FIRST]
     usual = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run(command, env=usual, capture_output=True, text=True)
-    assert done.stdout == "1.0\n", done.stderr
+    assert run(*command, env=usual).stdout == "1.0\n"
 
 
 def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:

@@ -8,13 +8,6 @@ import pytest
 from edgegrasp_sim.protocol import FOLDER, load_protocol, protocol_from, protocol_names
 
 
-def test_a_variant_differs_from_the_paper_s_protocol_in_one_thing() -> None:
-    paper, thin = load_protocol("edgegrasp"), load_protocol("edgegrasp-thin")
-    scene = replace(thin.scene, table_thickness=paper.scene.table_thickness)
-    assert thin.scene.table_thickness == 0.012
-    assert replace(thin, name="edgegrasp", version=paper.version, scene=scene) == paper
-
-
 def test_a_protocol_comes_back_from_a_manifest() -> None:
     for name in protocol_names():
         protocol = load_protocol(name)
@@ -43,11 +36,3 @@ def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: st
     file.write_text((FOLDER / "edgegrasp.toml").read_text().replace(old, new))
     with pytest.raises(ValueError, match=message):
         load_protocol(str(file))
-
-
-def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(
-        FileNotFoundError,
-        match=r"choose one of bin, bin-full, edgegrasp, .*, vgn",
-    ):
-        load_protocol("paper")

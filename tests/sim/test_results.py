@@ -113,12 +113,6 @@ def test_results_of_two_engines_are_kept_apart(tmp_path: Path) -> None:
         below_gate(folders[1].finish(ROUNDS), gate)
 
 
-def test_wilson_intervals_are_the_known_ones() -> None:
-    assert wilson(8, 10) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
-    assert wilson(0, 10) == (0.0, pytest.approx(0.2775, abs=1e-4))
-    assert wilson(0, 0) is None
-
-
 def test_pairing_by_scene_finds_a_small_difference() -> None:
     rng = np.random.default_rng(0)
     hard = rng.random(200) < 0.5  # half of the scenes are hard for both

@@ -232,9 +232,7 @@ def test_noise_has_the_given_size(simulation: ClutterSimulation) -> None:
     assert not np.array_equal(top(0.001, 5), top(0.001, 6))
 
 
-def test_a_colour_image_shows_every_object_in_a_paint_of_its_own(
-    simulation: ClutterSimulation,
-) -> None:
+def test_a_colour_image_shows_every_object_in_a_paint_of_its_own(simulation) -> None:
     placed = simulation.reset("packed", np.random.default_rng(0), num_objects=4)
     pose = look_at(np.array([0.15, -0.3, 0.5]), np.array([0.15, 0.15, 0.08]))
     image = simulation.color_image(pose)

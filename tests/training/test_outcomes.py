@@ -35,9 +35,7 @@ def test_few_outcomes_change_little(held: float) -> None:
 
 
 @pytest.mark.parametrize("name", ["balls", "vn", "hands"])
-def test_the_new_weights_answer_the_fitted_probability(
-    name: str, networks, made_up_view, tmp_path: Path
-) -> None:
+def test_the_new_weights_answer_the_fitted_probability(name, networks, made_up_view, tmp_path):
     config, old = networks[name], tmp_path / "old.safetensors"
     metadata = CheckpointMetadata("old", config, 0.0045, "panda", temperature=1.5)
     network = build_network(config, torch.Generator().manual_seed(0))

@@ -110,9 +110,7 @@ def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_pa
     assert 0 < alike.sum() < len(factors)
 
 
-def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_folder(
-    tmp_path: Path,
-) -> None:
+def test_household_objects_are_hollow_in_the_engine_and_read_again_from_their_folder(tmp_path):
     drawn = household_objects(tmp_path, 40, np.random.default_rng(2))
     again = ObjectSet.from_folder(tmp_path, SceneKind.TABLE)
     assert sorted(model.name for model in drawn.models) == [model.name for model in again.models]

@@ -109,9 +109,7 @@ def test_a_run_may_start_where_another_ended(make_trainer, tmp_path, network) ->
     np.testing.assert_allclose(logit, first.evaluate().logit, atol=1e-4)
 
 
-def test_a_run_may_start_from_weights_that_were_told_less(
-    make_trainer, views, networks, tmp_path
-) -> None:
+def test_a_run_may_start_from_weights_that_were_told_less(make_trainer, views, networks, tmp_path):
     told_less = replace(networks["hands"], description_size=40)
     network = build_network(told_less)
     network.set_statistics(torch.linspace(-1, 1, 40), torch.linspace(0.1, 2, 40))

@@ -433,9 +433,7 @@ MANY = 200_000
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_many_empty_messages_are_counted_not_read(
-    field: str, body: dict[str, Any], grpc_: GrpcAsker
-) -> None:
+def test_many_empty_messages_are_counted_not_read(field, body, grpc_) -> None:
     """Two bytes each on the wire, and once half a kilobyte each in Python."""
     content = grasp_pb2.ScoreGraspsRequest(points=POINTS.tobytes(), **body).SerializeToString()
     method = "ScoreGrasps" if field in ("edges", "hand_poses") else "DetectGrasps"
