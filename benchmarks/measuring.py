@@ -84,14 +84,6 @@ class Served:
         """Resident memory, MiB; shared pages count once."""
         return sum(one.memory_full_info().pss for one in self._processes()) / MIB
 
-    def files(self) -> int:
-        """Open file descriptors, sockets among them."""
-        return sum(one.num_fds() for one in self._processes())
-
-    def threads(self) -> int:
-        """Threads."""
-        return sum(one.num_threads() for one in self._processes())
-
     def stop(self) -> int:
         """Send SIGTERM; returns the exit code."""
         self.process.terminate()

@@ -243,9 +243,9 @@ def write_object(name: str, surface: str, folder: Path) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.obj").write_text(surface)
-    urdf = folder / f"{name}.urdf"
-    urdf.write_text(_hull_urdf(name))
-    return urdf
+    mass = f'<mass value="{OBJECT_MASS}"/>'
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    return _write_urdf(folder, name, (mass, inertia), (name, name))
 
 
 def write_parts(
@@ -270,12 +270,18 @@ def write_parts(
         The URDF file.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for kind, meshes in (("visual", visible), ("collision", parts)):
-        text = as_obj(meshes, decimals=7, named=True)
-        (folder / f"{name}_{kind}.obj").write_text(text)
-    urdf = folder / f"{name}.urdf"
-    urdf.write_text(_parts_urdf(name, centre, inertia))
-    return urdf
+    meshes = {f"{name}_visual": visible, f"{name}_collision": parts}
+    for mesh, surfaces in meshes.items():
+        (folder / f"{mesh}.obj").write_text(as_obj(surfaces, decimals=7, named=True))
+    xyz = " ".join(f"{value:.7f}" for value in centre)
+    rows, columns = np.triu_indices(3)
+    moments = " ".join(
+        f'i{"xyz"[row]}{"xyz"[column]}="{inertia[row, column]:.9f}"'
+        for row, column in zip(rows, columns, strict=True)
+    )
+    inertial = f'<origin xyz="{xyz}"/>', f'<mass value="{OBJECT_MASS}"/>', f"<inertia {moments}/>"
+    contact = f'    <contact><lateral_friction value="{OBJECT_FRICTION}"/></contact>\n'
+    return _write_urdf(folder, name, inertial, meshes, contact)
 
 
 def as_obj(
@@ -450,40 +456,22 @@ def _convex_parts(surface: Any) -> list[Any]:
     return [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in parts]
 
 
-def _parts_urdf(name: str, centre: NDArray[np.float64], inertia: NDArray[np.float64]) -> str:
-    """The URDF file of an object with this centre of mass and inertia, metres and kg."""
-    xyz = " ".join(f"{value:.7f}" for value in centre)
-    names = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2),
-             ("izz", 2, 2))  # fmt: skip
-    moments = " ".join(f'{name}="{inertia[row, column]:.9f}"' for name, row, column in names)
-    return f"""<?xml version="1.0"?>
+def _write_urdf(
+    folder: Path, name: str, inertial: Iterable[str], meshes: Iterable[str], contact: str = ""
+) -> Path:
+    """The URDF file of an object: elements of its inertial, its visual and its collision mesh."""
+    elements = "\n".join(f"      {element}" for element in inertial)
+    visual, collision = (f'<geometry><mesh filename="{each}.obj"/></geometry>' for each in meshes)
+    urdf = folder / f"{name}.urdf"
+    urdf.write_text(f"""<?xml version="1.0"?>
 <robot name="{name}">
   <link name="base_link">
-    <contact><lateral_friction value="{OBJECT_FRICTION}"/></contact>
-    <inertial>
-      <origin xyz="{xyz}"/>
-      <mass value="{OBJECT_MASS}"/>
-      <inertia {moments}/>
+{contact}    <inertial>
+{elements}
     </inertial>
-    <visual><geometry><mesh filename="{name}_visual.obj"/></geometry></visual>
-    <collision><geometry><mesh filename="{name}_collision.obj"/></geometry></collision>
+    <visual>{visual}</visual>
+    <collision>{collision}</collision>
   </link>
 </robot>
-"""
-
-
-def _hull_urdf(name: str) -> str:
-    """The URDF file of the object whose surface is `<name>.obj`."""
-    shape = f'<mesh filename="{name}.obj"/>'
-    return f"""<?xml version="1.0"?>
-<robot name="{name}">
-  <link name="base_link">
-    <inertial>
-      <mass value="{OBJECT_MASS}"/>
-      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
-    </inertial>
-    <visual><geometry>{shape}</geometry></visual>
-    <collision><geometry>{shape}</geometry></collision>
-  </link>
-</robot>
-"""
+""")
+    return urdf

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Floats, Int64
 from edgegrasp_model.candidates.edge_grasps import Candidates
 from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.detector import GraspDetector
@@ -41,7 +41,7 @@ from edgegrasp_training.hands import hand_of_scene
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.recipes import CROP_RADIUS, VOXEL_SIZE
 from edgegrasp_training.shapes import household_objects, varied_objects
-from edgegrasp_training.views import LabelledView, engine_of, support_as_array
+from edgegrasp_training.views import LabelledView, different, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
 HOUSEHOLD_STREAM = 6
@@ -111,15 +111,6 @@ class Query(NamedTuple):
     request: DetectOptions
 
 
-class Chosen(NamedTuple):
-    """The grasps to try in a view, and what they were sampled from."""
-
-    selected: SelectedPoints
-    scene: Scene
-    candidates: Candidates
-    T_world_hand: Float32  # (E, 4, 4)
-
-
 def generate(
     folder: Path,
     objects: Path | None,
@@ -149,8 +140,7 @@ def generate(
         found["weights"] = options.weights.resolve()
     options = options.model_copy(update=found)
     objects = objects and objects.resolve()
-    known = {engine_of(path) for path in folder.glob("*.npz")}
-    if other := known - {options.engine}:
+    if other := different(folder.glob("*.npz"), "engine") - {options.engine}:
         raise ValueError(
             f"{folder} holds labels of {', '.join(other)}, not of {options.engine}; "
             "choose another folder"
@@ -390,7 +380,8 @@ def label(
     found = choose_grasps(query, options, rng, hard=hard)
     if found is None:
         return _empty(observation)
-    selected, scene, candidates, T_world_hand = found
+    selected, scene, candidates = found
+    T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
     # What is far from every grasp says nothing about any.
     behind = choose_gripper(query.request, load_gripper(), {}).tip_z - BEHIND_TIPS
@@ -414,14 +405,10 @@ def label(
 
 def choose_grasps(
     query: Query, options: GenerationOptions, rng: np.random.Generator, *, hard: bool
-) -> Chosen | None:
+) -> tuple[SelectedPoints, Scene, Candidates] | None:
     """Sample candidates of a view as the detector does and choose some; None without any.
 
-    Args:
-        query: A view and the request.
-        options: How many to choose, and the weights that guide the choice.
-        rng: Chooses among the candidates.
-        hard: See `label`.
+    See `label` for the arguments.
     """
     observation, request = query
     if len(observation.cloud) == 0:
@@ -443,7 +430,7 @@ def choose_grasps(
     if selected is None or scene is None or sample is None or len(sample.candidates) == 0:
         return None
     candidates = sample.candidates.take(_chosen(sample, score, options.grasps_per_view, rng, hard))
-    return Chosen(selected, scene, candidates, scene.frame.poses_in_cloud(candidates.T_cloud_hand))
+    return selected, scene, candidates
 
 
 @lru_cache(maxsize=1)

@@ -35,7 +35,7 @@ from edgegrasp_training.examples import (
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import in_metres, in_units, prepare_to_train, start_from
 from edgegrasp_training.teacher import Teacher
-from edgegrasp_training.views import hands_of, load_view
+from edgegrasp_training.views import different, load_view
 
 VIEWS_IN_MEMORY = 8000
 WEIGHT_DECAY = 1e-4
@@ -156,7 +156,7 @@ class Trainer:
         training = provenance | {
             "training_views": len(self.train_paths),
             "training_labels": sum(len(self._tried(p, True).label) for p in self.train_paths),
-            "training_hands": hands_of(self.train_paths),
+            "training_hands": len(different(self.train_paths, "gripper")),
             "validation_views": len(self.validation_paths),
             "validation_labels": len(evaluation.label),
             "steps": self.step,

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,19 +145,13 @@ def load_view(path: Path) -> LabelledView:
         )
 
 
-def engine_of(path: Path) -> str:
-    """The engine that simulated the labels of a view."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return str(arrays.get("engine", LabelledView.engine))
-
-
-def hands_of(paths: Iterable[Path]) -> int:
-    """How many different hands tried the grasps of some views."""
-    hands = set()
+def different(paths: Iterable[Path], name: Literal["engine", "gripper"]) -> set[str]:
+    """The engines that simulated some views, or the hands that tried grasps in them."""
+    found = set()
     for path in paths:
         with np.load(path, allow_pickle=False) as arrays:
-            hands.add(str(arrays.get("gripper", "")))
-    return len(hands)
+            found.add(str(arrays.get(name, getattr(LabelledView, name))))
+    return found
 
 
 def find_views(folders: list[Path]) -> list[Path]:

@@ -191,23 +191,6 @@ def test_what_is_just_behind_is_hidden_by_degrees() -> None:
     np.testing.assert_allclose(unseen(found), [0.0, 0.5, 1.0], atol=0.02)
 
 
-def test_between_its_fingertips_a_hand_with_long_fingers_sees_what_the_panda_does() -> None:
-    cloud, candidates = scene(2)
-    (((x, y, z), (far_x, far_y, _)),) = PANDA.finger_boxes
-    tip = PANDA.tip_z + 0.05
-    long = replace(PANDA, tip_z=tip, finger_boxes=(((x, y, z), (far_x, far_y, tip)),))
-    back = candidates.T_cloud_hand.copy()
-    back[:, :3, 3] -= 0.05 * back[:, :3, 2]
-    others = look(cloud, replace(candidates, T_cloud_hand=back), gripper=long)
-    panda = look(cloud, candidates)
-    between = slice(7, 36)
-    torch.testing.assert_close(
-        others.description[:, between], panda.description[:, between], atol=1e-4, rtol=1e-4
-    )
-    torch.testing.assert_close(others.points, panda.points, atol=1e-5, rtol=0.0)
-    assert (others.description[:, 72] - panda.description[:, 72]).numpy() == pytest.approx(0.05)
-
-
 def test_the_finger_behind_a_plate_is_unseen() -> None:
     # A hand from the side, its fingers above and below the plate: y, the closing direction, is up.
     hand = np.eye(4, dtype=np.float32)
@@ -228,57 +211,3 @@ def test_the_finger_behind_a_plate_is_unseen() -> None:
     both = DepthMap.of_each(plate(), np.stack([ABOVE, -ABOVE]), UP)
     seen = unseen_space(both, hand[None], met, PANDA)  # one camera above the plate, one below
     assert not np.any(seen.parts + seen.ways + seen.depths + seen.beyond)
-
-
-def blocks(gap: float) -> np.ndarray:
-    """The tops of two blocks of 2 by 6 cm with a gap between them along y, at z = 0.  # (N, 3)."""
-    x, y = np.meshgrid(np.arange(-0.03, 0.03, 0.003), np.arange(0.0, 0.0201, 0.002))
-    half = np.stack([x, y + gap / 2, np.zeros_like(x)], axis=-1).reshape(-1, 3)
-    return np.concatenate([half, half * (1.0, -1.0, 1.0)]).astype(np.float32)
-
-
-def test_two_objects_with_a_gap_between_them_are_not_one() -> None:
-    hand = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-    hand[2, 3] = PANDA.tip_z - 0.015  # the fingertips are 15 mm below the tops
-    index = np.array([0])
-    described = {}
-    for gap in (0.002, 0.03):
-        points = blocks(gap)
-        cloud = Cloud(points, np.broadcast_to(UP, points.shape).astype(np.float32))
-        still = np.zeros(1, dtype=np.float32)
-        grasp = Candidates(index, index, index, UP[None], still, hand[None])
-        around = Surroundings(cloud, UP, viewpoints=ABOVE[None])
-        described[gap] = describe_hands(around, grasp, PANDA)[0]
-    free, longest, first, second = described[0.002][67:71]
-    assert free == 0.0
-    np.testing.assert_allclose([longest, first, second], [0.002, 0.042, 0.042], atol=1e-5)
-    free, longest, first, second = described[0.03][67:71]
-    np.testing.assert_allclose([longest, first, second], [0.03, 0.02, 0.02], atol=1e-5)
-    assert 0.01 < free < 0.03
-
-
-def test_the_description_ends_with_how_far_the_object_goes_on_around_the_hand() -> None:
-    # An upright plate 0.2 m long along y and 0.06 m high beside a small object of its own number.
-    y, z = np.meshgrid(np.linspace(-0.05, 0.15, 41), np.linspace(0.0, 0.06, 13))
-    plate = np.stack([0.0 * y, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
-    other = plate[:20] * 0.1 + np.array([0.1, -0.3, 0.0], dtype=np.float32)
-    points = np.concatenate([plate, other])
-    numbers = np.repeat([4, 7], [len(plate), len(other)])
-    down = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)  # closes along -y, from above
-    down[2, 3] = 0.04 + PANDA.tip_z
-    rows = np.array([0, len(plate)])
-    hands = Candidates(rows, rows, rows, np.tile(UP, (2, 1)), 0.0 * rows, np.tile(down, (2, 1, 1)))
-    cloud = Cloud(points, np.zeros_like(points))
-    around = Surroundings(cloud, UP, object_of_point=numbers)
-    known = describe_hands(around, hands, PANDA)[:, -11:]
-    inner = PANDA.max_opening / 2
-    beyond = 0.05 - inner, 0.15 - inner
-    np.testing.assert_allclose(known[0, :4], [*beyond, *beyond], atol=1e-3)
-    np.testing.assert_allclose(known[0, 4:6], 0.0, atol=1e-3)
-    np.testing.assert_allclose(known[0, 6], 0.04, atol=1e-3)  # the plate reaches below the tips
-    np.testing.assert_allclose(known[0, 8:], [0.2, 0.0, 0.06], atol=0.02)
-    assert (known[1, 8:] < 0.05).all()  # the other object's own size
-    together = describe_hands(Surroundings(cloud, UP), hands, PANDA)[:, -11:]
-    assert (together[:, 8] > 0.2).all()
-    short = describe_hands(around, hands, PANDA, size=HAND_DESCRIPTION_SIZE - 11)
-    assert short.shape == (2, HAND_DESCRIPTION_SIZE - 11)  # what an older network reads

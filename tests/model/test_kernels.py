@@ -7,20 +7,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.candidates.edge_grasps import crop_balls
-from edgegrasp_model.gripper import load_gripper
 from edgegrasp_model.hand_kernels import (
-    any_point_in_boxes,
     non_max_suppression,
-    signed_distance_to_boxes,
 )
 from edgegrasp_model.kernels import nearest_in_groups
 from edgegrasp_model.networks.balls import nearest_in_ball
 
 from . import oracles
-from .scenes import PANDA, SEED, random_hands
-
-HANDS = random_hands(150, seed=0)
-grippers = pytest.mark.parametrize("name", ["panda", "robotiq-2f-85"])
+from .scenes import SEED, random_hands
 
 
 def cloud(seed: int, count: int = 700) -> np.ndarray:
@@ -47,30 +41,6 @@ def test_of_hands_that_are_near_each_other_the_first_is_kept() -> None:
     for row in range(60):
         earlier = kept[before[kept] < before[row]]
         assert (row in kept) == (len(earlier) == 0 or not near(row, earlier).any())
-
-
-@grippers
-@pytest.mark.parametrize("count", [30, 2000])
-def test_hands_hit_the_points_in_their_boxes_and_are_as_far_from_them(name, count) -> None:
-    gripper, points = load_gripper(name), cloud(1, count)
-    boxes = gripper.boxes(gripper.max_opening)
-    distance = oracles.signed_distance_to_boxes(points, HANDS, boxes)
-    found = signed_distance_to_boxes(points, HANDS, boxes)
-    np.testing.assert_allclose(found, distance, rtol=0, atol=1e-6)
-    sure = np.abs(distance) > 1e-6
-    hit = oracles.any_point_in_boxes(points, HANDS, boxes)
-    np.testing.assert_array_equal(any_point_in_boxes(points, HANDS, boxes)[sure], hit[sure])
-    assert hit.any()
-    assert not hit.all()
-
-
-def test_points_beyond_the_first_block_are_hit_too() -> None:
-    far = np.full((2000, 3), 3.0, dtype=np.float32)
-    far[-1] = 0.0
-    boxes = PANDA.boxes(PANDA.max_opening)
-    hit = oracles.any_point_in_boxes(far, HANDS, boxes)
-    np.testing.assert_array_equal(any_point_in_boxes(far, HANDS, boxes), hit)
-    assert hit.any()
 
 
 @pytest.mark.parametrize("seed", range(2))
