@@ -107,6 +107,11 @@ def dummy_server(start_dummy) -> Iterator[RunningServer]:
         yield server
 
 
+@pytest.fixture(params=["grpc", "rest"])
+def transport(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.fixture
 def cloud() -> np.ndarray:
     rng = np.random.default_rng(0)

@@ -19,13 +19,6 @@ from edgegrasp_sim.engine import choose_engine
 from .conftest import TOP_DOWN
 
 SMOKE_GATE = Path(__file__).parent / "smoke_gate.json"
-OWN_PLANNER = """
-from edgegrasp_sim.top_down import plan_top_down
-
-class MyPlanner:
-    def __call__(self, observation, seed):
-        return plan_top_down(observation, seed)
-"""
 
 
 def figures(folder: Path) -> dict:
@@ -35,14 +28,6 @@ def figures(folder: Path) -> dict:
 def attempts(folder: Path) -> list[dict[str, str]]:
     with (folder / "attempts.csv").open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def test_a_planner_of_one_s_own_needs_only_its_name(benchmark, tmp_path, monkeypatch) -> None:
-    (tmp_path / "my_planner.py").write_text(OWN_PLANNER)
-    monkeypatch.syspath_prepend(tmp_path)
-    as_class = benchmark(tmp_path / "class", "my_planner:MyPlanner", rounds=1)
-    as_function = benchmark(tmp_path / "function", TOP_DOWN, rounds=1)
-    assert as_class["attempts_digest"] == as_function["attempts_digest"]
 
 
 def test_the_shipped_weights_are_not_below_the_gate(benchmark: Callable, run, tmp_path) -> None:

@@ -36,7 +36,6 @@ def test_every_option_is_a_flag() -> None:
     assert [flag.name for flag in option_flags()] == list(DetectOptions.model_fields)
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
 def test_options_of_every_kind_are_flags(transport: str, file: str, dummy_server, run) -> None:
     address = dummy_server.address(transport)
     document = json.loads(run("detect", file, "--server", address, "--json", *OPTIONS))

@@ -12,6 +12,7 @@ from edgegrasp_training.recipes import recipe
 
 ONE_ROUND = ("--rounds", 1, "--seed", 0, "--scene", "packed", "--workers", 1)
 VIEWS = ("--scenes", 4, "--scene", "packed", "--views-per-scene", 1, "--grasps-per-view", 8)
+VIEWS += ("--workers", 1)  # processes take longer to start than these scenes to make
 
 
 @pytest.fixture(scope="module")

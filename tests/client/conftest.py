@@ -14,11 +14,6 @@ def make_client() -> Iterator[Callable[..., GraspClient]]:
         yield lambda *args, **named: stack.enter_context(GraspClient(*args, **named))
 
 
-@pytest.fixture(params=["grpc", "rest"])
-def transport(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 @pytest.fixture
 def client(transport: str, make_client: Any, dummy_server: Any) -> Any:
     return make_client(dummy_server.address(transport))

@@ -14,15 +14,13 @@ from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_description import (
     HAND_DESCRIPTION_SIZE,
     Surroundings,
-    describe_hands,
-    without_support,
 )
 from edgegrasp_model.networks.checkpoint import build_network
 from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.unseen import BEHIND, DEEP, FAR, DepthMap, unseen, unseen_space
+from edgegrasp_model.unseen import FAR, DepthMap, unseen, unseen_space
 
 from .scenes import PANDA, SEED, TINY
 
@@ -106,16 +104,6 @@ def test_turning_or_mirroring_the_whole_scene_changes_next_to_nothing(mirrored, 
     assert np.isclose(scores(before), scores(after), atol=2e-3).mean() > 0.9
 
 
-def test_without_a_support_plane_heights_are_the_same_stand_in() -> None:
-    cloud, candidates = scene(0)
-    described = describe_hands(Surroundings(cloud, UP), candidates, PANDA)
-    assert (described[:, 58:61] == np.float32(0.10)).all()
-    around = Surroundings(cloud, UP, plane(UP, -0.03))
-    known = describe_hands(around, candidates, PANDA)
-    assert not np.array_equal(known, described)
-    np.testing.assert_array_equal(without_support(known), described)
-
-
 def test_the_order_of_the_points_and_what_follows_them_mean_nothing() -> None:
     batch = look(*scene(3))
     draws = torch.rand(batch.points.shape[:2], generator=torch.Generator().manual_seed(1))
@@ -181,14 +169,6 @@ def test_only_what_is_behind_the_plate_is_hidden(exactly_above: bool) -> None:
     )
     hidden = unseen(behind(plate(), camera, places))
     np.testing.assert_array_equal(hidden, [0, 0, 1, 0, 1, 0])
-
-
-def test_what_is_just_behind_is_hidden_by_degrees() -> None:
-    depth = np.array([BEHIND / 2, BEHIND + DEEP / 2, BEHIND + 2 * DEEP], dtype=np.float32)
-    places = np.stack([0 * depth, 0 * depth, 0.1 - depth], axis=1)
-    found = behind(plate(), ABOVE, places)
-    np.testing.assert_allclose(found, depth, atol=5e-4)
-    np.testing.assert_allclose(unseen(found), [0.0, 0.5, 1.0], atol=0.02)
 
 
 def test_the_finger_behind_a_plate_is_unseen() -> None:

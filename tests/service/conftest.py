@@ -278,12 +278,6 @@ def serve(begin: Serve) -> Serve:
     return start
 
 
-@pytest.fixture(params=["grpc", "rest"])
-def transport(request: pytest.FixtureRequest) -> str:
-    name: str = request.param
-    return name
-
-
 @pytest.fixture
 def is_error() -> Callable[[Reply, str], bool]:
     """Whether an answer is the error of a kind, on whichever transport."""

@@ -1,7 +1,6 @@
 """Who is let in: bounds of requests and bytes, fairness between clients, and honest refusals."""
 
 import asyncio
-from functools import partial
 
 import grpc
 import httpx
@@ -13,7 +12,6 @@ from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded
 from edgegrasp_service.front.admission import Admission, Ticket
-from edgegrasp_service.front.connections import Places
 from edgegrasp_service.observability import Call
 
 PATIENCE = 60
@@ -112,34 +110,6 @@ def test_all_addresses_of_a_network_are_one_client() -> None:
 
     assert client("2001:db8::1") == client("2001:db8:0:0:ffff::2") != client("2001:db8:0:1::1")
     assert client("::ffff:10.0.0.1") == client("10.0.0.1") != client("10.0.0.2")
-
-
-async def test_a_newcomer_ends_what_was_idle_for_longest_of_whoever_has_most() -> None:
-    places, lost = Places(3), []
-    taken = [places.take(owner, partial(lost.append, row)) for row, owner in enumerate("aab")]
-    places.use(taken[0])
-    places.take("c", lambda: None)
-    assert lost == [1]
-    for place in (taken[0], taken[2]):
-        places.use(place, idle=False)
-    places.take("b", lambda: None)  # in the place of c, which alone is idle
-    assert lost == [1]
-    places.use(taken[0])
-    places.leave(taken[2])
-    places.take("d", lambda: None)
-    assert lost == [1]
-
-
-async def test_a_newcomer_with_less_need_not_wait_until_another_was_idle_for_long() -> None:
-    places, lost = Places(3, grace=FAR), []
-    for row in range(3):
-        places.take("a", partial(lost.append, row))
-    with pytest.raises(Overloaded):
-        places.take("a", lambda: None)
-    places.take("b", lambda: None)
-    assert lost == [0]
-    with pytest.raises(Overloaded):
-        places.take("b", lambda: None)  # would have as many as the other
 
 
 async def test_a_body_larger_than_all_the_bytes_comes_in_alone() -> None:

@@ -202,7 +202,6 @@ def test_a_form_of_nothing_but_boundaries(dummy_server, cloud) -> None:
     assert codes <= {400, 429, 504}
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
 async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transport: str) -> None:
     """A body of one byte now and then, in every place."""
     running = await serve(max_queue_length=3, read_seconds=1.0)
@@ -229,7 +228,6 @@ async def test_bodies_that_trickle_give_their_places_back(serve, cloud, transpor
         writer.close()
 
 
-@pytest.mark.parametrize("transport", ["grpc", "rest"])
 async def test_answers_that_nobody_takes_are_given_up(serve, cloud, transport: str) -> None:
     """Clients that send and never read."""
     running = await serve(write_seconds=0.5, min_bytes_per_second=10**9)

@@ -91,15 +91,6 @@ async def test_workers_killed_under_load(serve, cloud) -> None:
     assert outcomes["worker-lost"] <= 4
 
 
-async def test_an_idle_worker_that_dies_is_replaced(serve, cloud) -> None:
-    running = await serve()
-    (before,) = running.server.pool.pids
-    os.kill(before, signal.SIGKILL)
-    await running.until(lambda: running.server.pool.pids not in ([], [before]))
-    client = running.connect("grpc")
-    assert (await client.detect(cloud)).fine
-
-
 async def test_a_nursery_that_dies_is_replaced(serve, cloud) -> None:
     running = await serve()
     client, pool = running.connect("rest"), running.server.pool

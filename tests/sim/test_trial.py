@@ -10,7 +10,6 @@ from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
-from edgegrasp_sim.results import attempts_digest
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import (
@@ -95,16 +94,8 @@ def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) 
     with ClutterSimulation(engine=engine) as other:
         run_round(other, keep_first, PILE, paper_with(2), seed=4, index=1)
     assert np.array_equal(first_clouds[0], first_clouds[2])
-
-
-def test_a_round_repeats_exactly(run: Callable[..., Round]) -> None:
-    first = run(plan_top_down, PILE, 3, index=2)
-    run(plan_top_down, PACKED, 1)
-    again = run(plan_top_down, PILE, 3, index=2)
-    other = run(plan_top_down, PILE, 3, seed=1, index=2)
-    assert attempts_digest([first]) == attempts_digest([again]) != attempts_digest([other])
     with pytest.raises(ValueError, match="seed is -1"):
-        run(plan_top_down, PILE, 3, seed=-1)
+        run(plan_top_down, PILE, 2, seed=-1)
 
 
 @pytest.mark.parametrize("name", ["giga", "vgn", "table"])

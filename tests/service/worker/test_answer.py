@@ -50,16 +50,6 @@ def test_facts(points: np.ndarray) -> None:
     assert facts.traceback == ""
 
 
-def test_the_deadline_is_kept_between_stages(points: np.ndarray) -> None:
-    late = answer(job(points, remaining=0.1), DummyCatalogue(0.2), Settings())
-    assert late.error is not None
-    assert late.error.kind == "deadline-exceeded"
-    assert late.facts.points == 60  # known as far as it came
-    passed = answer(job(points, remaining=-1.0), DummyCatalogue(), Settings())
-    assert passed.error is not None
-    assert passed.facts.seconds == {}
-
-
 def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
     failing = FailingCatalogue(ZeroDivisionError("a secret"))
     told = answer(job(points, seed=7), failing, Settings())
