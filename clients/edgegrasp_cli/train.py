@@ -92,8 +92,7 @@ def train(
     """Train weights on labelled views.
 
     The run folder gets log.csv, the weights with the least validation loss, and when training is
-    done a model card. Running the same command again continues from the last state. The scores of
-    a teacher are kept beside the run folder, in `taught`.
+    done a model card. Running the same command again continues from the last state.
     """
     from rich.progress import Progress
 
@@ -133,8 +132,7 @@ def _trainer(data: list[Path], asked: TrainFlags) -> "Trainer":
     views, validation = split_by_scene(find_views(data), asked.validation_share, asked.seed)
     metadata, teacher = recipe(asked.model), None
     if asked.teacher is not None:
-        taught = asked.run.parent / "taught"
-        teacher = Teacher(asked.teacher, metadata.network.crop_radius, taught)
+        teacher = Teacher(asked.teacher, metadata.network.crop_radius)
     trainer = Trainer(
         metadata, views, validation, asked.run, asked, asked.device, teacher, asked.start_from
     )

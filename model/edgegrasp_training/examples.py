@@ -1,9 +1,7 @@
 """Training examples: the balls or hands of a view, with labels, packed as networks take them."""
 
-import os
-from dataclasses import dataclass, fields, replace
-from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -68,19 +66,6 @@ class SoftLabels:
     approach: NDArray[np.float16]  # (E, 3) unit, outward
     depth: NDArray[np.float16]  # (E,) metres
     chance: NDArray[np.float16]  # (E,) probability that it holds, by the teacher
-
-    def save(self, path: Path) -> None:
-        """Write them; readers and concurrent writers only ever see a whole file."""
-        partial = path.with_suffix(f".{os.getpid()}.partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **{f.name: getattr(self, f.name) for f in fields(self)})
-        partial.replace(path)
-
-    @classmethod
-    def load(cls, path: Path) -> Self:
-        """Read what `save` wrote."""
-        with np.load(path, allow_pickle=False) as arrays:
-            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
 
 
 class Packed(NamedTuple):

@@ -25,15 +25,14 @@ GRASPS_PER_BALL = 64  # scored at most; about a third of a ball's candidates
 
 
 class Teacher:
-    """A hand network that scores the candidates of views, and keeps its scores in files."""
+    """A hand network that scores the candidates of views."""
 
-    def __init__(self, weights: Path, crop_radius: float, folder: Path) -> None:
+    def __init__(self, weights: Path, crop_radius: float) -> None:
         """Load the teacher.
 
         Args:
             weights: A checkpoint of architecture `hand`.
             crop_radius: Radius of the balls that candidates are drawn from, metres.
-            folder: Keeps the scores, in a subfolder for this teacher and radius; runs may share it.
 
         Raises:
             InvalidCheckpoint: The weights cannot be read.
@@ -44,16 +43,10 @@ class Teacher:
             found = self.metadata.network.architecture
             raise ValueError(f"teacher: got a network of architecture {found!r}. Use a `hand` one.")
         self.crop_radius = crop_radius
-        self.folder = folder / f"{self.metadata.digest[:12]}-{crop_radius * 1000:g}mm"
 
     def soft_labels(self, path: Path) -> SoftLabels:
-        """Its scores of a view's candidates, read from a file if they were computed before."""
-        digest = zlib.crc32(path.read_bytes())
-        kept = self.folder / f"{path.stem}-{digest:08x}.npz"
-        if not kept.is_file():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self.score(load_view(path), np.random.default_rng(digest)).save(kept)
-        return SoftLabels.load(kept)
+        """Its scores of a view's candidates, the same ones for the same file."""
+        return self.score(load_view(path), np.random.default_rng(zlib.crc32(path.read_bytes())))
 
     def score(self, view: LabelledView, rng: np.random.Generator) -> SoftLabels:
         """Score candidates around some of a view's points."""
