@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Self, TypedDict, Unpack
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,23 +100,6 @@ class ObjectPlacement:
     quaternion_xyzw: tuple[float, float, float, float]
 
 
-class Seeing(TypedDict, total=False):
-    """How the camera sees.
-
-    Attributes:
-        noise_std: standard deviation of the noise in each coordinate of each point, metres; by
-            default `NOISE_STD`.
-        depth_noise: noise of the images.
-        sensor: what else the camera gets wrong.
-        table: what the cloud holds of the table, see `Observation`; by default `known`.
-    """
-
-    noise_std: float
-    depth_noise: DepthNoise
-    sensor: DepthSensor | None
-    table: TableView
-
-
 class ClutterSimulation:
     """Objects in their surroundings, a depth camera and a floating hand.
 
@@ -174,10 +157,11 @@ class ClutterSimulation:
     @property
     def too_wide(self) -> list[ObjectModel]:
         """Models of the objects that are wider at their narrowest than the hand opens."""
+        widest = self._hand.model.max_opening
         return [
-            model
-            for model, scale in ((item.model, item.scale) for item in self._objects)
-            if _least_width(model.urdf) * scale * model.scale > self._hand.model.max_opening
+            item.model
+            for item in self._objects
+            if _least_width(item.model.urdf) * item.scale * item.model.scale > widest
         ]
 
     @property
@@ -260,17 +244,22 @@ class ClutterSimulation:
         self,
         T_world_cameras: Sequence[Matrix],
         rng_noise: np.random.Generator,
-        **seen: Unpack[Seeing],
+        *,
+        noise_std: float = NOISE_STD,
+        depth_noise: DepthNoise | None = None,
+        sensor: DepthSensor | None = None,
+        table: TableView = "known",
     ) -> Observation:
         """Look at the scene from each of the given poses, (4, 4) each.
 
         Args:
             T_world_cameras: one for each image.
             rng_noise: stream of the noise.
-            **seen: see `Seeing`.
+            noise_std: standard deviation of the noise in each coordinate of each point, metres.
+            depth_noise: noise of the images.
+            sensor: what else the camera gets wrong.
+            table: what the cloud holds of the table, see `Observation`.
         """
-        table = seen.get("table", "known")
-        depth_noise, sensor = seen.get("depth_noise"), seen.get("sensor")
         workspace = np.asarray(self.surroundings.workspace)
         box = seen_box(workspace, table)
         clouds = []
@@ -282,8 +271,7 @@ class ClutterSimulation:
                 depth = sensor.apply(depth, CAMERA, rng_noise)
             points = points_of(depth, T_world_camera, CAMERA)
             points = points if box is None else crop(points, box, _CROP_MARGIN)
-            std = seen.get("noise_std", NOISE_STD)
-            points = points + rng_noise.normal(0.0, std, size=points.shape)
+            points = points + rng_noise.normal(0.0, noise_std, size=points.shape)
             points = points if box is None else crop(points, box)
             clouds.append(points.astype(np.float32, order="C"))
         whole = box is None and len(clouds) == 1

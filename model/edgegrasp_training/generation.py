@@ -34,7 +34,7 @@ from edgegrasp_sim.engine import choose_engine
 from edgegrasp_sim.objects import CLUTTER, ObjectSet, SceneKind
 from edgegrasp_sim.scene import PACKED_SCALE, PILE_SCALE
 from edgegrasp_sim.sensor import random_sensor
-from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation, Seeing
+from edgegrasp_sim.simulation import NOISE_STD, ClutterSimulation
 from edgegrasp_sim.surroundings import MIDDLE, TABLE_HEIGHT
 from edgegrasp_sim.workers import run_tasks
 from edgegrasp_training.hands import hand_of_scene
@@ -300,8 +300,12 @@ def ask(
     open_table = kind in (SceneKind.PACKED, SceneKind.PILE)
     around = not open_table or noise.random() < AROUND_SHARE
     seen = _noise(noise)
-    seen["table"] = "around" if around else "known"
-    observation = simulation.observe_from(seen_from.sample(streams[CAMERA_STREAM]), noise, **seen)
+    observation = simulation.observe_from(
+        seen_from.sample(streams[CAMERA_STREAM]),
+        noise,
+        table="around" if around else "known",
+        **seen,
+    )
     support: SupportPlane | AutoPlane = _plane(noise) if around else EXACT_PLANE
     low, high = observation.workspace.tolist()
     workspace: Workspace | None = Workspace(min=tuple(low), max=tuple(high))
@@ -326,7 +330,7 @@ def ask(
     return Query(observation, request)
 
 
-def _noise(rng: np.random.Generator) -> Seeing:
+def _noise(rng: np.random.Generator) -> dict[str, Any]:
     """The benchmark's noise, more or less of it, or a camera's faults."""
     draw = rng.random()
     if draw < SENSOR_SHARE:
