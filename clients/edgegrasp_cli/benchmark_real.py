@@ -131,7 +131,7 @@ def _write(
     from rich.console import Console
     from rich.table import Table
 
-    from edgegrasp_sim.page import image, page, table
+    from edgegrasp_sim.report import image, page, table
 
     total = summary(list(done.values()))
     scenes = {name: asdict(figures) for name, figures in done.items()}

@@ -1,18 +1,31 @@
-"""The report of a benchmark: one HTML file with tables and pictures of failures."""
+"""The report of a benchmark: one HTML file that needs no other, with tables and pictures."""
 
+import base64
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from edgegrasp_camera.picture import draw_grasps
-from edgegrasp_sim.page import Row, image, page, table
 from edgegrasp_sim.replay import Replay
 from edgegrasp_sim.results import RATE_LABELS, ResultFolder, over_seeds, percent, planner_title
 from edgegrasp_sim.trial import Round
 
 PICTURES = 6
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; max-width: 1120px;
+       margin: 2em auto; padding: 0 1.2em; }
+h1 { font-size: 1.7em; margin-bottom: .1em; } h2 { font-size: 1.2em; margin-top: 2em;
+     border-bottom: 1px solid #d5dae0; padding-bottom: .2em; }
+table { border-collapse: collapse; margin: .8em 0; }
+th, td { padding: .28em .9em .28em 0; text-align: left; border-bottom: 1px solid #e6e9ed;
+         vertical-align: top; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
+img { max-width: 100%; margin: 1.2em 0; }
+@media (max-width: 700px) { body { margin-top: 1em; } table { display: block; overflow-x: auto; } }
+"""
+Row = Sequence[object]
 
 
 def write_report(folder: ResultFolder, objects: Path | None = None) -> Path:
@@ -54,6 +67,30 @@ def attempt_title(done: Round, number: int) -> str:
         f"seed {done.seed}, round {done.index}, attempt {number}: {outcome} "
         f"(aimed at {target}; score {attempt.score:.2f})"
     )
+
+
+def page(title: str, parts: Iterable[str]) -> str:
+    """A page of parts that are HTML already, below a title that is not."""
+    title = escape(title)
+    head = "<!doctype html><html lang=en><head><meta charset=utf-8>"
+    head += "<meta name=viewport content='width=device-width, initial-scale=1'>"
+    start = f"{head}<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>"
+    return "\n".join([start, *parts, "</body></html>\n"])
+
+
+def table(rows: Iterable[Row]) -> str:
+    """A table whose first row is its head."""
+    lines = []
+    for number, row in enumerate(rows):
+        kind = "td" if number else "th"
+        lines.append("".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in row))
+    return "<table><tr>" + "</tr>\n<tr>".join(lines) + "</tr></table>"
+
+
+def image(kind: str, content: bytes, text: str) -> str:
+    """A picture of a kind such as png, in the page itself, with a text in its place."""
+    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return f"<img src='{source}' alt='{escape(text, quote=True)}'>"
 
 
 def _key_figures(summary: dict[str, Any]) -> list[Row]:
