@@ -63,9 +63,7 @@ class Tokens:
         if not admin and not self.required:
             return None
         if admin and not any(token.is_admin for token in self._known.values()):
-            raise PermissionDenied(
-                HEADER, "an administrator's call, disabled here", ADMIN_FIX
-            )
+            raise PermissionDenied(HEADER, "an administrator's call, disabled here", ADMIN_FIX)
         if authorization is None:
             raise Unauthenticated(HEADER, "nothing", FIX)
         scheme, _, text = authorization.strip().partition(" ")
