@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import gc
 import ipaddress
 import logging
 import signal
@@ -150,6 +151,7 @@ class Server:
 
     async def _load(self, grpc_server: GrpcServer, ready: Callable[[], None]) -> None:
         await self.pool.start()
+        gc.freeze()  # a collection that visits every module stops the event loop for 100 ms
         if not self.service.stopping.is_set():
             await grpc_server.set_serving(True)
             ready()
