@@ -5,9 +5,13 @@ import os
 import signal
 import zlib
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+
+from edgegrasp.v1 import grasp_pb2
+from edgegrasp_service.worker.job import Answer, Job
 
 
 def grown(running) -> int:
@@ -40,6 +44,26 @@ async def test_a_request_that_workers_die_of_is_not_tried_again(serve, transport
     assert is_error(await client.detect(cloud, seed=1), "harmful-request")
     assert (await client.detect(cloud, seed=2)).fine
     assert "edgegrasp_workers_replaced_total 4.0" in running.metrics()
+
+
+async def test_a_request_cancelled_as_it_is_answered_leaves_its_worker_to_the_next(
+    serve, cloud, monkeypatch
+) -> None:
+    monkeypatch.setattr("edgegrasp_service.worker.pool.KILL_SECONDS", 0.0)
+    pool = (await serve()).server.pool
+    message = grasp_pb2.DetectGraspsRequest(points=cloud.tobytes()).SerializeToString()
+    deadline = asyncio.get_running_loop().time() + 60.0
+
+    async def detect(taken: Callable[[], object] = lambda: None) -> Answer:
+        worker = await pool.take()
+        taken()
+        return await worker.run(Job("DetectGrasps", "grpc", message), deadline)
+
+    first = asyncio.create_task(detect())
+    second = asyncio.create_task(detect(first.cancel))  # the only worker, before the first goes on
+    assert (await second).error is None
+    with pytest.raises(asyncio.CancelledError):
+        await first
 
 
 async def test_a_nursery_that_is_stopped_is_replaced(serve, cloud, monkeypatch) -> None:
