@@ -3,7 +3,8 @@
 #   docker build -t edgegrasp .
 #   docker build -t edgegrasp:cuda --build-arg TORCH=torch .    # as the package index has it
 
-ARG BASE=python:3.11-slim-bookworm
+# docs/security.md says how to renew the digest.
+ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 
 FROM ${BASE} AS base
 # hadolint ignore=DL3008
