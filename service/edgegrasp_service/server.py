@@ -9,7 +9,7 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,7 @@ class Server:
             check_outcomes(settings.outcomes_file)
         self.reloader = Reloader(self.service, self._tls, self.metrics.reloaded)
         self._watch()
-        self.http_url = ""
-        self.grpc_address = ""
+        self.http_url = self.grpc_address = ""
 
     def _watch(self) -> None:
         service, admission, pool = self.service, self.service.admission, self.pool
@@ -187,15 +186,13 @@ class Server:
 class _HttpServer(uvicorn.Server):
     """Leaves signals to the process: both transports stop together."""
 
+    capture_signals = contextlib.nullcontext  # type: ignore[assignment]
+
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen; more connections may wait than are accepted at once."""
         await super().startup(sockets)
         for one in sockets or ():
             one.listen(BACKLOG)
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
 
 
 class _LoopErrors:

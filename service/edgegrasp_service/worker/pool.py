@@ -100,7 +100,7 @@ class WorkerPool:
         self._nursery, self._workers = nursery, set(workers)
         while not self._idle.empty():
             self._idle.get_nowait()
-        self.models, self.robots = workers[0].models, workers[0].robots
+        self.models, self.robots = workers[0].ready.models, workers[0].ready.robots
         nursery.watch(lambda: self._nursery_lost(nursery))
         for worker in workers:
             self._spawn(self._tend(worker))
@@ -293,8 +293,7 @@ class _Worker:
     def __init__(self, nursery: _Nursery) -> None:
         self.nursery = nursery
         self.pid = 0
-        self.models: list[dict[str, Any]] = []
-        self.robots: list[dict[str, Any]] = []
+        self.ready: Any = None  # the message that it sent when it had loaded
         self.answer: asyncio.Future[Answer] | None = None  # of the job that it works on
         self._writer: asyncio.StreamWriter | None = None
         self._killing: asyncio.TimerHandle | None = None
@@ -308,7 +307,7 @@ class _Worker:
         ready = await self.receive()
         if ready is None or ready.failure:
             raise InvalidSettings(ready.failure if ready else "a worker died as it started")
-        self.pid, self.models, self.robots = ready.pid, ready.models, ready.robots
+        self.pid, self.ready = ready.pid, ready
 
     async def receive(self) -> Any:
         """Its next message; None when it has ended."""
