@@ -44,12 +44,8 @@ def test_the_code_of_the_page_runs(start_dummy, tmp_path, monkeypatch) -> None:
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
-    depth = rng.integers(500, 600, (24, 32)).astype(np.uint16)
     names = {
         "points": rng.uniform(-0.1, 0.1, (500, 3)).astype(np.float32),
-        "depth": depth,
-        "mask": depth > 550,
-        "intrinsics": (60.0, 60.0, 15.5, 11.5),
         "task": MagicMock(),
     }
     blocks = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
