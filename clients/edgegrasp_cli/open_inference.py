@@ -29,7 +29,7 @@ from edgegrasp.oip.open_inference_pb2_grpc import (
 from edgegrasp_camera.arrays import Array
 from edgegrasp_cli.flags import CONNECTION, Timeout, connect, takes_flags
 from edgegrasp_client import GraspClient, errors
-from edgegrasp_client.requests import plain_options
+from edgegrasp_client.requests import option_of_text, plain_options
 
 PLATFORM = "edgegrasp"
 VERSION = "1"  # of the tensors' names and meaning
@@ -144,7 +144,7 @@ class Models:
 
         `timeout` among them is in microseconds; `wanted` are names of outputs, empty: all.
         """
-        asked = {key: _option(value) for key, value in parameters.items()}
+        asked = {key: option_of_text(value) for key, value in parameters.items()}
         options: Any = {key: value for key, value in asked.items() if key not in NOT_OPTIONS}
         if name != self._default:
             options["model"] = name
@@ -188,14 +188,6 @@ def _refusing() -> Iterator[None]:
     except errors.GraspClientError as error:
         code, status = next(row[1:] for row in STATUS if isinstance(error, row[0]))
         raise RefusedError(code, status, str(error)) from error
-
-
-def _option(value: Any) -> Any:
-    """The value of a parameter; text that is JSON stands for what it says."""
-    try:
-        return json.loads(value) if isinstance(value, str) else value
-    except (RecursionError, ValueError):
-        return value
 
 
 def tensor(name: str, datatype: str, shape: Any, data: Any) -> Array:

@@ -4,6 +4,7 @@ Also what makes a request of a segmenter's mask, or of an object's cloud and its
 """
 
 import io
+import json
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -163,6 +164,14 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in options.items()
         if value is not None or name in ("suppression", "support")
     }
+
+
+def option_of_text(value: Any) -> Any:
+    """The value of an option that another program gives: text that is JSON stands for its value."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except (RecursionError, ValueError):
+        return value
 
 
 def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOptions:

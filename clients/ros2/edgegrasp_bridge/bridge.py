@@ -5,7 +5,6 @@ dictionaries of fields, for `rosidl_runtime_py.set_message_fields`. Poses are th
 frame, but for `moveit_msgs/Grasp`, which has the end effector's parent link.
 """
 
-import json
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -27,6 +26,7 @@ from edgegrasp_client.conversions import (
     xyz_fields,
 )
 from edgegrasp_client.options import DetectOptions
+from edgegrasp_client.requests import option_of_text
 
 Message = dict[str, Any]
 Lookup = Callable[[str, str, Any], Float64]
@@ -90,7 +90,7 @@ def read_parameters(given: Mapping[str, Any]) -> tuple[Settings, dict[str, Any]]
     options = {}
     for name, value in given.items():
         if name.startswith(OPTION) and not (isinstance(value, str) and value == ""):
-            options[name.removeprefix(OPTION)] = _value(value)
+            options[name.removeprefix(OPTION)] = option_of_text(value)
     return Settings(**own), options
 
 
@@ -426,10 +426,3 @@ def _moved(grasp: Grasp, T_target_cloud: Float64) -> Grasp:
 
 def _seconds(stamp: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
-
-
-def _value(value: Any) -> Any:
-    try:
-        return json.loads(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
