@@ -390,6 +390,8 @@ def label(
     # What is far from every grasp says nothing about any.
     behind = choose_gripper(query.request, load_gripper(), {}).tip_z - BEHIND_TIPS
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
+    if len(places) == 0:  # a teacher's grasps are on the objects
+        places = scene.points_in_cloud[scene.approach_allowed]
     far = cKDTree(places).query(scene.points_in_cloud)[0] > KEPT_DISTANCE
     kept = np.flatnonzero(~far)
     return LabelledView(

@@ -14,7 +14,9 @@ class GenerationOptions(BaseModel, extra="forbid"):
         None, description="Kind of the scenes: packed, pile, bin or table; else all of them"
     )
     views_per_scene: int = Field(2, ge=1, description="Cameras in each scene")
-    grasps_per_view: int = Field(100, ge=1, description="Grasps tried in each view")
+    grasps_per_view: int = Field(
+        100, ge=0, description="Grasps tried in each view; 0: a teacher labels the views"
+    )
     seed: int = Field(1, ge=0, description="Seed of everything random")
     weights: Path | None = Field(
         None, description="Network that chooses half of the grasps: its best and its least certain"

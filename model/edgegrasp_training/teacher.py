@@ -51,7 +51,7 @@ class Teacher:
     def score(self, view: LabelledView, rng: np.random.Generator) -> SoftLabels:
         """Score candidates around some of a view's points."""
         own = np.unique(view.approach_index[view.tried()])
-        others = np.setdiff1d(np.arange(len(view.points)), own)
+        others = np.setdiff1d(np.flatnonzero(view.numbered_objects() >= 0), own)
         own = rng.permutation(own)[:OWN_BALLS]
         balls = np.sort(np.concatenate([own, rng.permutation(others)[:FURTHER_BALLS]]))
         candidates = self._candidates(view, balls, rng) if len(balls) else None
