@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edgegrasp_model.detector import WEIGHTS_FOLDER
 from edgegrasp_model.networks.config import HAND
 from edgegrasp_sim.engine import ENGINES, choose_engine, installed
 from edgegrasp_sim.objects import blob
@@ -11,6 +12,7 @@ from edgegrasp_training.generation import generate, missing_scenes
 from edgegrasp_training.household import FAMILIES
 from edgegrasp_training.options import GenerationOptions
 from edgegrasp_training.shapes import DRAWN_NAMES, made_object
+from edgegrasp_training.teacher import Teacher
 from edgegrasp_training.views import find_views, load_view
 
 
@@ -106,6 +108,18 @@ def test_workers_change_nothing(data: Path, tmp_path: Path) -> None:
         again = load_view(data / path.name)
         np.testing.assert_array_equal(again.success, load_view(path).success)
         np.testing.assert_array_equal(again.points, load_view(path).points)
+
+
+def test_a_teacher_labels_objects_in_views_without_tried_grasps(tmp_path: Path) -> None:
+    list(generate(tmp_path, None, small(scenes=1, grasps_per_view=0, scene="table")))
+    (path,) = find_views([tmp_path])
+    view = load_view(path)
+    assert len(view.tried()) == 0
+    assert len(view.points) > 100
+    teacher = Teacher(WEIGHTS_FOLDER / "edgegrasp-plus.safetensors", 0.04, tmp_path / "taught")
+    labels = teacher.soft_labels(path)
+    assert len(labels.chance) > 0
+    assert (view.object_of_point[labels.approach_index] >= 0).all()
 
 
 def test_views_of_varied_scenes_name_the_objects_as_they_were(tmp_path: Path) -> None:
