@@ -13,7 +13,6 @@ its grasps that pass the detector's collision check is executed.
 from importlib.util import find_spec
 from pathlib import Path
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -25,6 +24,7 @@ from edgegrasp_cli.planners import request_options
 from edgegrasp_model.candidates.collision import collides
 from edgegrasp_model.candidates.edge_grasps import sample_approach_points
 from edgegrasp_model.detector import WEIGHTS_FOLDER, GraspDetector
+from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
@@ -101,7 +101,7 @@ class ContactGraspNet:
             known = self._layers(f"feat_prop.{level}.nn", torch.cat([spread, skip], dim=1))
             at = wanted
         seen = torch.cat([torch.from_numpy(at), known], dim=1)
-        logit, closing, approach, width = (self._head(k, seen) for k in range(4))
+        logit, closing, approach, width = (self._head(f"multihead.{k}", seen) for k in range(4))
         closing = F.normalize(closing, dim=1)
         approach = approach - (closing * approach).sum(dim=1, keepdim=True) * closing
         approach, width = F.normalize(approach, dim=1), width.clamp(max=OPENING)
@@ -112,25 +112,24 @@ class ContactGraspNet:
         return at, T.numpy(), width[:, 0].relu().numpy(), torch.sigmoid(logit[:, 0]).numpy()
 
     def _layers(self, name: str, x: Tensor) -> Tensor:
-        """Layers of a perceptron, by the name of its weights."""
+        """The layers of a perceptron, by the name of its weights."""
         for layer in range(3):
             if f"{name}.{layer}.0.weight" in self.state:
                 x = F.linear(x, *self._weights(f"{name}.{layer}.0")).relu()
                 x = self._normalised(f"{name}.{layer}.2", x)
         return x
 
-    def _head(self, number: int, x: Tensor) -> Tensor:
-        name = f"multihead.{number}"
-        first, last = self._weights(f"{name}.0"), self._weights(f"{name}.3")
-        x = self._normalised(f"{name}.1", F.linear(x, first[0][:, :, 0], first[1]))
-        return F.linear(x, last[0][:, :, 0], last[1])
+    def _head(self, name: str, x: Tensor) -> Tensor:
+        x = self._normalised(f"{name}.1", F.linear(x, *self._weights(f"{name}.0")))
+        return F.linear(x, *self._weights(f"{name}.3"))
 
     def _normalised(self, name: str, x: Tensor) -> Tensor:
         mean, var = self.state[f"{name}.running_mean"], self.state[f"{name}.running_var"]
         return F.batch_norm(x, mean, var, *self._weights(name))
 
     def _weights(self, name: str) -> tuple[Tensor, Tensor]:
-        return self.state[f"{name}.weight"], self.state[f"{name}.bias"]
+        weight = self.state[f"{name}.weight"]
+        return weight[..., 0] if weight.dim() == 3 else weight, self.state[f"{name}.bias"]
 
 
 def _points(scene: Scene, observation: Observation, rng: np.random.Generator) -> Float64:
@@ -148,7 +147,7 @@ def _points(scene: Scene, observation: Observation, rng: np.random.Generator) ->
     return chosen
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@compiled()
 def _near(points: Float32, centres: Float32, radius: float) -> Int64:
     """Rows (M, MOST_NEIGHBOURS + 1) within a radius of each centre; centre i also gets point i.
 
