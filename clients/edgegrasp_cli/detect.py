@@ -77,6 +77,11 @@ class DetectFlags(BaseModel):
     base: str | None = Field(
         None, description="T_base_cloud, its 16 numbers row by row, or the 4 x 4 matrix as JSON"
     )
+    place: str | None = Field(
+        None,
+        description='Where to put the object: {"region": {"min": …, "max": …}} or T_base_object, '
+        "base frame",
+    )
     trajectory: Path | None = Field(
         None, description="JSON file to write the arm's motion to the best pick to"
     )
@@ -272,7 +277,10 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
         raise ValueError(f"{missing[0]}: got nothing. Give {', '.join(given)} together.")
     joints = [float(part) for part in str(asked.joints).split(",") if part]
     pose = value_of_text("--base", str(asked.base))
-    return {"robot": {"name": asked.robot, "joints": joints, "T_base_cloud": pose}}
+    robot = {"name": asked.robot, "joints": joints, "T_base_cloud": pose}
+    if asked.place is not None:
+        robot["place"] = value_of_text("--place", asked.place)
+    return {"robot": robot}
 
 
 def _write_trajectory(file: Path, detection: Any) -> None:

@@ -169,6 +169,20 @@ class Collision(TypedDict, total=False):
     obstacles: Sequence[Obstacle]
 
 
+class PlaceRegion(TypedDict):
+    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+
+    min: Vector
+    max: Vector
+
+
+class Place(TypedDict, total=False):
+    """Where the arm puts the object down: in one pose, or anywhere in a region."""
+
+    T_base_object: Sequence[float] | None
+    region: PlaceRegion | None
+
+
 class RobotArm(TypedDict):
     """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
 
@@ -176,6 +190,7 @@ class RobotArm(TypedDict):
     T_base_cloud: Sequence[float]
     joints: Sequence[float]
     plan: NotRequired[Literal["reach", "motion"]]
+    place: NotRequired[Place | None]
 
 
 class Suppression(TypedDict, total=False):

@@ -329,11 +329,11 @@ def _collision(message: Message, value: Any, path: str) -> Filled:
     return message, {"mode": value} if isinstance(value, str) else value
 
 
-def _robot(message: Message, value: Any, path: str) -> Filled:
+def _with_pose(message: Message, value: Any, path: str) -> Filled:
     """A pose may also be rows, as arrays are sent."""
-    pose = value.get("T_base_cloud") if isinstance(value, Mapping) else None
-    if isinstance(pose, list) and all(isinstance(row, list) for row in pose):
-        value = {**value, "T_base_cloud": [number for row in pose for number in row]}
+    for name, pose in value.items() if isinstance(value, Mapping) else ():
+        if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
+            value = {**value, name: [number for row in pose for number in row]}
     return message, value
 
 
@@ -344,7 +344,8 @@ def _without_kind(value: Mapping[str, Any]) -> dict[str, Any]:
 # Messages that JSON does not write field by field: the message to fill, and its fields.
 _FORMS: dict[type[Message], Callable[[Any, Any, str], Filled]] = {
     grasp_pb2.DetectOptions: _options,
-    grasp_pb2.RobotArm: _robot,
+    grasp_pb2.RobotArm: _with_pose,
+    grasp_pb2.Place: _with_pose,
     grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,

@@ -19,7 +19,8 @@ Int32 = NDArray[np.int32]
 class ArmTrajectory:
     """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
 
-    The gripper opens before `pregrasp_row` and closes at `grasp_row`; the arm rests at both.
+    With a place, it goes on to above it, straight down, and back. The gripper opens before
+    `pregrasp_row`, closes at `grasp_row` and opens at `release_row`; the arm rests at each.
     """
 
     joint_names: list[str]  # J
@@ -28,16 +29,19 @@ class ArmTrajectory:
     velocities: Float64  # (T, J) per second
     pregrasp_row: int
     grasp_row: int
+    release_row: int | None = None  # with a place
 
 
 @dataclass(frozen=True, eq=False)
 class ArmPlan:
     """How an arm gets to a grasp."""
 
-    reachable: bool  # whether it gets to the pregrasp and straight on, touching nothing
+    reachable: bool  # whether it gets there and straight on, and to the place, touching nothing
     pregrasp_joints: Float64 | None  # (J,) where it is reachable
     grasp_joints: Float64 | None  # (J,) where it is reachable
     trajectory: ArmTrajectory | None  # where it was asked for and found in time
+    place_joints: Float64 | None = None  # (J,) where it lets go; None without a place
+    T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) the hand there, base frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +228,17 @@ _STAGES = (
     *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
     *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),
     *("clear_of_support", "checked", "collision_free", "given", "scored", "above_min_score"),
-    *("suppressed", "on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"),
-    *("with_trajectory", "returned", "description", "network", "ranking", "arm", "total"),
+    *("suppressed", "on_arm", "hand_collision", "out_of_reach", "arm_collision", "no_place"),
+    *(
+        "reachable",
+        "with_trajectory",
+        "returned",
+        "description",
+        "network",
+        "ranking",
+        "arm",
+        "total",
+    ),
 )
 
 

@@ -486,6 +486,31 @@ RigidPose = Annotated[
 ]
 
 
+class PlaceRegion(Workspace):
+    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+
+
+class Place(Strict):
+    """Where the arm puts the object down: in one pose, or anywhere in a region."""
+
+    T_base_object: RigidPose | None = Field(
+        default=None,
+        description="where the object's box, as `objects` in the answer have it, is to be in the "
+        "arm's base frame: a 4 x 4 matrix, row by row",
+    )
+    region: PlaceRegion | None = Field(
+        default=None,
+        description="where the whole object is to stand, turned about the vertical at will; the "
+        "base frame's z is up",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if (self.T_base_object is None) == (self.region is None):
+            raise ValueError("must have one of T_base_object and region")
+        return self
+
+
 class RobotArm(Strict):
     """The arm that is to execute a grasp: each grasp is answered with how the arm gets there."""
 
@@ -499,6 +524,11 @@ class RobotArm(Strict):
     plan: Literal["reach", "motion"] = Field(
         default="motion",
         description="reach: joints before and at each grasp; motion: a timed trajectory too",
+    )
+    place: Place | None = Field(
+        default=None,
+        description="where to put the object: a grasp is within reach only if that is too; null: "
+        "the motion ends with the object lifted",
     )
 
 

@@ -1,49 +1,69 @@
-"""What a closed hand holds, and whether it can be taken away."""
+"""What a closed hand holds, whether it can be taken away, and where it is put down."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from edgegrasp_camera.arrays import Bools, Float64
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.gripper import Gripper
-from edgegrasp_model.options import Collision
-from edgegrasp_model.results import Grasp
+from edgegrasp_model.options import Collision, Place
+from edgegrasp_model.results import DetectedObject, Grasp
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_robot.surroundings import moved
+from edgegrasp_robot.surroundings import CELL, Load, moved
 
 STEP = 0.005  # metres along the way
 BESIDE = 0.01  # metres: what is nearer than that to the held object touches it already
 MEETS = 0.003  # metres between points that touch
 SINKS = 0.001  # metres that the held object may go down toward the support
+HIDDEN = 0.03  # metres that the foot of an object may be hidden from the camera
+PUT_DOWN = 0.005  # metres over a region's bottom at which the hand lets go
+TURNS = 8  # of an object about the vertical, in a region
+SHARES = (0.0, -0.5, 0.5, -1.0, 1.0)  # of the room that a region leaves, to each side
 
 
-def can_leave(
-    grasp: Grasp,
-    scene: Scene,
-    gripper: Gripper,
-    way: Float64,
-    collision: Collision,
-) -> bool:
-    """Whether what a grasp holds can go along a straight way without meeting anything seen.
+class Held(NamedTuple):
+    """What a grasp holds, cloud frame."""
+
+    points: Float64  # (H, 3) those of its object and those between the fingers
+    others: Float64  # (V, 3) those that it does not touch already
+
+
+def held_by(grasp: Grasp, scene: Scene, gripper: Gripper) -> Held:
+    """The points of the object that a grasp is on, and those between the fingers."""
+    points = scene.points_in_cloud.astype(np.float64)
+    T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
+    x, y, z = np.abs(moved(T_hand_cloud, points)).T
+    held = (x < gripper.pad_half_width) & (y < gripper.max_opening / 2)
+    held &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
+    if grasp.object is not None:
+        held |= scene.object_of_point == grasp.object
+    if not held.any():
+        return Held(points[held], points)
+    near = cKDTree(points[held]).query(points, distance_upper_bound=BESIDE)[0] <= BESIDE
+    return Held(points[held], points[~near])
+
+
+def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> bool:
+    """Whether what is held can go along a straight way without meeting anything seen.
 
     Args:
-        grasp: The grasp.
-        scene: What is held and what is around it.
-        gripper: The hand.
+        held: What is held.
+        scene: Where it is.
         way: (3,) metres, cloud frame.
         collision: Obstacles beside the cloud.
     """
-    points = scene.points_in_cloud.astype(np.float64)
-    held = _held(grasp, scene, gripper)
-    if not held.any():
+    if not len(held.points):
         return True
-    near = cKDTree(points[held]).query(points, distance_upper_bound=BESIDE)[0] <= BESIDE
-    others = points[~near]
-    tree = cKDTree(others) if len(others) else None
-    lowest = _lowest(scene, points[held])
+    tree = cKDTree(held.others) if len(held.others) else None
+    lowest = _lowest(scene, held.points)
     steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
     for share in np.arange(1, steps + 1) / steps:
-        there = points[held] + share * way
+        there = held.points + share * way
         if tree is not None and np.isfinite(tree.query(there, distance_upper_bound=MEETS)[0]).any():
             return False
         if _lowest(scene, there) < lowest - SINKS:
@@ -56,20 +76,64 @@ def can_leave(
     return True
 
 
-def _held(grasp: Grasp, scene: Scene, gripper: Gripper) -> Bools:
-    """The points (V,) of the object that a grasp is on, and those between the fingers."""
-    T_hand_cloud = np.linalg.inv(grasp.T_cloud_hand.astype(np.float64))
-    x, y, z = np.abs(moved(T_hand_cloud, scene.points_in_cloud)).T
-    between = (x < gripper.pad_half_width) & (y < gripper.max_opening / 2)
-    between &= (z > gripper.palm_z) & (z < gripper.max_tip_z)
-    if grasp.object is None:
-        return np.asarray(between)
-    held: Bools = between | (scene.object_of_point == grasp.object)
-    return held
-
-
 def _lowest(scene: Scene, points: Float64) -> float:
     """How high the lowest of points (N, 3), cloud frame, is over the support; 0 without one."""
     if scene.support is None:
         return 0.0
     return float(scene.support.heights(scene.frame.points(points)).min())
+
+
+def load_of(
+    held: Held, thing: DetectedObject | None, scene: Scene, T_base_cloud: Float64
+) -> Load | None:
+    """The upright box of what is held: that of its object, else of its points; None: no points."""
+    if not len(held.points):
+        return None
+    T_cloud_box = np.eye(4)
+    if thing is not None:
+        T_cloud_box[:3, :3] = Rotation.from_quat(thing.quaternion).as_matrix()
+        T_cloud_box[:3, 3], half = thing.center, thing.half_extents.astype(np.float64)
+    else:
+        upright = scene.frame.points(held.points)
+        low, high = upright.min(axis=0), upright.max(axis=0)
+        T_scene_box = np.eye(4)
+        T_scene_box[:3, 3], half = (low + high) / 2, (high - low) / 2
+        T_cloud_box = np.linalg.inv(scene.frame.T_canonical_cloud) @ T_scene_box
+    foot = _lowest(scene, (T_cloud_box[:3, 3] - half[2] * T_cloud_box[:3, 2])[None])
+    below = foot if scene.support is not None and 0.0 < foot < HIDDEN else 0.0
+    points = moved(T_base_cloud, held.points)
+    return Load(points, T_base_cloud @ T_cloud_box, half, below)
+
+
+def places_for(place: Place, load: Load, voxels: Float64) -> Iterator[Float64]:
+    """Poses T_base_box (4, 4) in which a load may be put, the middle of a region first.
+
+    Args:
+        place: Where it is to be.
+        load: What is put down.
+        voxels: (V, 3) base frame, what is seen around it; no place where the load would hold any.
+    """
+    for pose in _places(place, load):
+        off, half = load.above_its_foot
+        around = np.abs(moved(np.linalg.inv(pose), voxels) - (0.0, 0.0, off))
+        if not (around < half + CELL / 2).all(axis=1).any():
+            yield pose
+
+
+def _places(place: Place, load: Load) -> Iterator[Float64]:
+    if place.region is None:
+        yield np.reshape(np.array(place.T_base_object), (4, 4))
+        return
+    low, high = np.array(place.region.min), np.array(place.region.max)
+    shares = sorted(product(SHARES, SHARES), key=lambda pair: np.hypot(*pair))
+    for share, turn in product(shares, range(TURNS)):
+        about = Rotation.from_euler("z", 2 * np.pi * turn / TURNS).as_matrix()
+        pose = np.eye(4)
+        pose[:3, :3] = about @ load.T_base_box[:3, :3]
+        reach = np.abs(pose[:3, :3]) @ load.half  # of the turned box, along the base's axes
+        reach[2] += load.below / 2 + PUT_DOWN / 2
+        room = (high - low) / 2 - reach
+        if (room > 0.0).all():
+            pose[:2, 3] = ((low + high) / 2)[:2] + share * room[:2]
+            pose[2, 3] = low[2] + 2 * reach[2] - np.abs(pose[2, :3]) @ load.half
+            yield pose

@@ -4,7 +4,8 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
+from typing import NamedTuple
 
 import numpy as np
 from roboplan import core
@@ -12,18 +13,27 @@ from roboplan.rrt import RRT, RRTOptions
 from roboplan.simple_ik import SimpleIk, SimpleIkOptions
 from roboplan.toppra import PathParameterizerTOPPRA, SplineFittingMode, TOPPRAOptions
 
-from edgegrasp_camera.arrays import Float64, Floats
+from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_model.options import DetectOptions, RobotArm
-from edgegrasp_model.results import ArmPlan, ArmTrajectory, Detection, Grasp
+from edgegrasp_model.options import DetectOptions, Place, RobotArm
+from edgegrasp_model.results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
-from edgegrasp_robot.held import can_leave
+from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
 from edgegrasp_robot.robot import GROUP, Robot
-from edgegrasp_robot.surroundings import surrounded
+from edgegrasp_robot.surroundings import (
+    HELD,
+    Load,
+    Surroundings,
+    carrying,
+    moved,
+    surrounded,
+)
 
 TRIED = 200  # grasps that the arm may be asked for, in their order
+PLACES = 6  # in a region, that the arm may be asked for with one grasp
+LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
 SPARE = 4  # more than asked for that are brought within reach, as some may get no motion
 LINE_STEP = 0.05  # metres between the poses of a straight way; each costs more than its checks
 MAX_JUMP = 1.0  # radians that a joint turns between two of them at most
@@ -106,10 +116,10 @@ def plan_picks(
     start = time.perf_counter()
     picks: list[_Pick] = []
     failures: Counter[str] = Counter()
-    with surrounded(robot, scene, points, asked, options.collision.obstacles) as own:
-        grasps = [grasp for grasp in detection.grasps if grasp.object not in own]
+    with surrounded(robot, scene, points, asked, options.collision.obstacles) as around:
+        grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
-        arm = _Arm(robot, asked, scene, options)
+        arm = _Arm(robot, asked, scene, options, around, detection.objects)
         wanted = options.top_k + (SPARE if asked.plan == "motion" else 0)
         for grasp in grasps:
             if failures["reachable"] == wanted or time.monotonic() > until:
@@ -133,6 +143,7 @@ class _Pick:
     plan: ArmPlan | None
     outcome: str
     line: list[Float64] | None = None  # joints (J,) along the approach; None: out of reach
+    put: "_PutDown | None" = None  # where the object goes, if anywhere
 
     @property
     def tier(self) -> int:
@@ -140,6 +151,23 @@ class _Pick:
         if self.plan is None:
             return 2
         return 3 if not self.plan.reachable else int(self.plan.trajectory is None)
+
+
+class _PutDown(NamedTuple):
+    """How an object is put down: joints (J,) along straight ways, and what the hand carries."""
+
+    back: list[Float64]  # away from the grasp
+    down: list[Float64]  # to the place
+    away: list[Float64]  # from the place, the hand empty
+    around: Surroundings  # without the load
+    load: Load
+
+
+class _Ik(NamedTuple):
+    """Inverse kinematics in a scene."""
+
+    scene: core.Scene
+    solver: SimpleIk
 
 
 def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> list[_Pick]:
@@ -156,13 +184,28 @@ def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> l
 class _Arm:
     """The arm of one request, within its surroundings."""
 
-    def __init__(self, robot: Robot, asked: RobotArm, scene: Scene, options: DetectOptions) -> None:
-        self._robot, self._scene, self._options = robot, scene, options
+    def __init__(
+        self,
+        robot: Robot,
+        asked: RobotArm,
+        scene: Scene,
+        options: DetectOptions,
+        around: Surroundings,
+        objects: Sequence[DetectedObject],
+    ) -> None:
+        self._robot, self._scene, self._options, self._around = robot, scene, options, around
+        self._place, self._objects = asked.place, {one.number: one for one in objects}
         self._start = np.array(asked.joints)
         at_home = np.allclose(self._start, robot.home)
         self._starts = [self._start] if at_home else [self._start, robot.home]
         self._T_hand_flange = np.linalg.inv(robot.T_flange_hand)
         self._T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
+        up = scene.frame.directions_in_cloud((0.0, 0.0, 1.0))
+        self._up = self._T_base_cloud[:3, :3] @ up
+        if self._place is not None and self._place.region is not None and self._up[2] < LEVEL:
+            fix = "Send T_base_object, or the poses of a base frame whose z is up."
+            value = f"a region where up is {self._up.round(2).tolist()} in the base frame"
+            raise InvalidRequest("options.robot.place.region", value, fix)
         self._to_pregrasp = self._solver(robot.scene, restarts=2)
         self._along = self._solver(robot.straight, restarts=0)
         self._ignoring = self._solver(robot.straight, restarts=2, check=False)
@@ -171,14 +214,15 @@ class _Arm:
         """Joints at the pregrasp and on straight to the grasp."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
         length = self._options.collision.approach_length
-        poses = self._straight(grasp, grasp.approach_direction, -length, 0.0)
+        poses = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
         for start in self._starts:
             first = self._solve(self._to_pregrasp, poses[0], start)
-            line = None if first is None else self._follow(poses, first)
+            line = None if first is None else self._follow(self._along, poses, first)
             if line is not None:
-                plan = ArmPlan(True, line[0], line[-1])
-                return _Pick(grasp, plan, "reachable", line)
+                pick = _Pick(grasp, ArmPlan(True, line[0], line[-1]), "reachable", line)
+                return pick if self._place is None else self._with_place(pick, self._place)
         first = self._solve(self._ignoring, poses[0], self._start)
         free = first is not None and self._solve(self._ignoring, poses[-1], first) is not None
         return _Pick(grasp, ArmPlan(False), "arm_collision" if free else "out_of_reach")
@@ -187,11 +231,18 @@ class _Arm:
         """Add a trajectory that has been checked, where one is found."""
         assert pick.plan is not None
         assert pick.line is not None
-        path = self._free_path(self._start, pick.line[0])
-        back = self._retreat(pick)
+        free, straight = self._robot.scene, self._robot.straight
+        path = self._free_path(free, self._start, pick.line[0])
+        back = self._retreat(pick.grasp, pick.line) if pick.put is None else pick.put.back
         if path is None or back is None:
             return pick
-        timed = [self._timed(path), self._timed(pick.line, True), self._timed(back, True)]
+        timed = [
+            self._timed(free, path),
+            self._timed(straight, pick.line, True),
+            self._timed(straight, back, True),
+        ]
+        if pick.put is not None:
+            timed += self._carried(pick.put, pick.grasp)
         parts = [part for part in timed if part is not None]
         if len(parts) < len(timed):
             return pick
@@ -199,33 +250,91 @@ class _Arm:
         later = [
             begin + np.array(part.times[1:]) for begin, part in zip(begins[:-1], parts, strict=True)
         ]
+        ends = np.cumsum([len(times) for times in later]).tolist()
         trajectory = ArmTrajectory(
             self._robot.joint_names,
             np.concatenate([[0.0], *later]),
             np.concatenate([self._start[None], *(part.positions[1:] for part in parts)]),
             np.concatenate([np.zeros((1, len(self._start))), *(p.velocities[1:] for p in parts)]),
-            len(later[0]),
-            len(later[0]) + len(later[1]),
+            *ends[:2],
+            None if pick.put is None else ends[4],
         )
         return replace(pick, plan=replace(pick.plan, trajectory=trajectory))
 
-    def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> SimpleIk:
+    def _with_place(self, pick: _Pick, place: Place) -> _Pick:
+        """Add where the object is put down and how, where there is a way."""
+        assert pick.plan is not None
+        assert pick.line is not None
+        held = held_by(pick.grasp, self._scene, self._robot.gripper)
+        thing = None if pick.grasp.object is None else self._objects.get(pick.grasp.object)
+        load = load_of(held, thing, self._scene, self._T_base_cloud)
+        back = self._retreat(pick.grasp, pick.line, held)
+        if load is not None and back is not None:
+            around = self._around.without(load)
+            T_base_hand = self._T_base_cloud @ pick.grasp.T_cloud_hand.astype(np.float64)
+            put = self._put_down(place, around, load, T_base_hand, back)
+            if put is not None:
+                end = put.down[-1]
+                plan = replace(pick.plan, place_joints=end, T_base_place=self._robot.hand_pose(end))
+                return replace(pick, plan=plan, put=put)
+        return _Pick(pick.grasp, ArmPlan(False), "no_place")
+
+    def _put_down(
+        self,
+        place: Place,
+        around: Surroundings,
+        load: Load,
+        T_base_hand: Float64,
+        back: list[Float64],
+    ) -> _PutDown | None:
+        """Straight down onto the first place within reach, and away with an empty hand."""
+        rules = self._options.collision
+        over = max(rules.approach_length, rules.retreat_length)
+        places = places_for(place, load, moved(around.T_base_scene, around.voxels))
+        T_box_hand = np.linalg.inv(load.T_base_box) @ T_base_hand
+        with carrying(self._robot, around, load, T_base_hand) as scene:
+            above, along = self._solver(scene, restarts=2), self._solver(scene, restarts=0)
+            for T_base_box in islice(places, PLACES):
+                T_base_place = T_base_box @ T_box_hand
+                poses = _straight(T_base_place, self._up, over, 0.0)
+                first = self._solve(above, poses[0], back[-1])
+                down = None if first is None else self._follow(along, poses, first)
+                if down is None:
+                    continue
+                scene.removeGeometry(HELD)
+                poses = _straight(T_base_place, -T_base_place[:3, 2], 0.0, rules.approach_length)
+                away = self._follow(self._solver(scene, restarts=0), poses, down[-1])
+                return None if away is None else _PutDown(back, down, away, around, load)
+        return None
+
+    def _carried(self, put: _PutDown, grasp: Grasp) -> list[core.JointTrajectory | None]:
+        """From the end of the retreat over the place, down, and back with an empty hand."""
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
+        with carrying(self._robot, put.around, put.load, T_base_hand) as scene:
+            path = self._free_path(scene, put.back[-1], put.down[0])
+            if path is None:
+                return [None]
+            parts = [self._timed(scene, path), self._timed(scene, put.down, True)]
+            scene.removeGeometry(HELD)
+            return [*parts, self._timed(scene, put.away, True)]
+
+    def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> _Ik:
         """Inverse kinematics that a seed decides, and no clock."""
         options = SimpleIkOptions(
             GROUP, max_iters=40, max_time=10.0, max_restarts=restarts, step_size=0.5,
             max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
             check_collisions=check,
         )  # fmt: skip
-        return SimpleIk(scene, options)
+        return _Ik(scene, SimpleIk(scene, options))
 
-    def _solve(self, solver: SimpleIk, T_base_hand: Float64, start: Float64) -> Float64 | None:
+    def _solve(self, ik: _Ik, T_base_hand: Float64, start: Float64) -> Float64 | None:
         """Joints (J,) that bring the hand there, within their limits."""
         robot = self._robot
         T_base_flange = np.asfortranarray(T_base_hand @ self._T_hand_flange)
         goal = core.CartesianConfiguration(robot.base_frame, robot.flange_frame, T_base_flange)
         found = core.JointConfiguration(robot.joint_names, start)
-        solver.setRngSeed(self._options.seed % 2**31)
-        if not solver.solveIk(goal, core.JointConfiguration(robot.joint_names, start), found):
+        ik.solver.setRngSeed(self._options.seed % 2**31)
+        if not ik.solver.solveIk(goal, core.JointConfiguration(robot.joint_names, start), found):
             return None
         joints = np.array(found.positions)
         return joints if self._within_limits(joints) else None
@@ -233,47 +342,41 @@ class _Arm:
     def _within_limits(self, joints: Float64) -> bool:
         return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
 
-    def _straight(self, grasp: Grasp, direction: Floats, begin: float, end: float) -> list[Float64]:
-        """Poses T_base_hand along a direction, `begin` to `end` metres from the grasp."""
-        steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
-        poses = np.repeat(grasp.T_cloud_hand[None].astype(np.float64), steps + 1, axis=0)
-        poses[:, :3, 3] += np.linspace(begin, end, steps + 1)[:, None] * direction
-        return list(self._T_base_cloud @ poses)
-
-    def _follow(self, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
+    def _follow(self, ik: _Ik, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
         """Joints along a straight way, each near to those before, and nothing in between."""
         line = [first]
         for pose in poses[1:]:
-            joints = self._solve(self._along, pose, line[-1])
+            joints = self._solve(ik, pose, line[-1])
             if joints is None or np.abs(joints - line[-1]).max() > MAX_JUMP:
                 return None
-            if core.hasCollisionsAlongPath(self._robot.straight, line[-1], joints, PATH_STEP):
+            if core.hasCollisionsAlongPath(ik.scene, line[-1], joints, PATH_STEP):
                 return None
             line.append(joints)
         return line
 
-    def _retreat(self, pick: _Pick) -> list[Float64] | None:
+    def _retreat(
+        self, grasp: Grasp, line: Sequence[Float64], held: Held | None = None
+    ) -> list[Float64] | None:
         """Joints along the way out, on which what is held meets nothing."""
-        rules, grasp = self._options.collision, pick.grasp
-        assert pick.line is not None
-        if rules.retreat_length == 0.0 or rules.retreat_direction == "back":
-            direction = -grasp.approach_direction.astype(np.float64)
-        else:
-            direction = self._scene.frame.directions_in_cloud((0.0, 0.0, 1.0)).astype(np.float64)
+        rules = self._options.collision
+        T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
+        back = rules.retreat_length == 0.0 or rules.retreat_direction == "back"
+        direction = -T_base_hand[:3, 2] if back else self._up
         # The hand's way in is known to be free, and the way out that was asked for.
         length = rules.retreat_length or rules.approach_length
-        if not can_leave(grasp, self._scene, self._robot.gripper, direction * length, rules):
+        way = self._T_base_cloud[:3, :3].T @ direction * length
+        held = held or held_by(grasp, self._scene, self._robot.gripper)
+        if not can_leave(held, self._scene, way, rules):
             return None
-        poses = self._straight(grasp, direction, 0.0, length)
-        return self._follow(poses, pick.line[-1])
+        return self._follow(self._along, _straight(T_base_hand, direction, 0.0, length), line[-1])
 
-    def _free_path(self, start: Float64, end: Float64) -> list[Float64] | None:
+    def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64] | None:
         """Joints between which straight motions of the joints touch nothing."""
-        robot, names = self._robot, self._robot.joint_names
+        names = self._robot.joint_names
         options = RRTOptions(
             GROUP, max_nodes=3000, rrt_connect=True, collision_check_step_size=PATH_STEP
         )
-        planner = RRT(robot.scene, options)
+        planner = RRT(scene, options)
         planner.setRngSeed(self._options.seed % 2**31)
         try:
             path = planner.plan(
@@ -284,14 +387,13 @@ class _Arm:
         rules = core.PathShortcuttingOptions(
             GROUP, max_step_size=PATH_STEP, seed=self._options.seed % 2**31
         )
-        shorter = core.PathShortcutter(robot.scene, rules).shortcut(path)
+        shorter = core.PathShortcutter(scene, rules).shortcut(path)
         return [np.array(joints) for joints in shorter.positions]
 
     def _timed(
-        self, joints: Sequence[Float64], straight: bool = False
+        self, scene: core.Scene, joints: Sequence[Float64], straight: bool = False
     ) -> core.JointTrajectory | None:
         """A path with times, from rest to rest, checked all along."""
-        scene = self._robot.straight if straight else self._robot.scene
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
@@ -313,6 +415,14 @@ class _Arm:
             if core.hasCollisionsAlongPath(scene, before, row, FINE):
                 return None
         return found
+
+
+def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float) -> list[Float64]:
+    """Poses (4, 4) along a direction of the base frame, `begin` to `end` metres from the hand."""
+    steps = max(1, int(np.ceil(abs(end - begin) / LINE_STEP)))
+    poses = np.repeat(T_base_hand[None], steps + 1, axis=0)
+    poses[:, :3, 3] += np.linspace(begin, end, steps + 1)[:, None] * direction
+    return list(poses)
 
 
 def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:
@@ -348,7 +458,9 @@ def _told(
         )
     if any(pick.tier == 2 for pick in picks):
         warnings.append("time ran out before the arm was asked for every grasp.")
-    names = ("on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable")
+    names = ["on_arm", "hand_collision", "out_of_reach", "arm_collision", "reachable"]
+    if asked.place is not None:
+        names.insert(-1, "no_place")
     counts = {name: n for name, n in detection.counts.items() if name != "returned"}
     counts |= {name: outcomes[name] for name in names}
     if asked.plan == "motion":

@@ -88,6 +88,7 @@ class Robot:
     model: "Model"
     scene: core.Scene  # for the free motion
     straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
+    carrying: core.Scene  # for the way to where an object is put
 
     def hand_pose(self, joints: ArrayLike) -> Float64:
         """T_base_hand (4, 4) at joints (J,)."""
@@ -215,9 +216,7 @@ def _load(path: Path, file: RobotFile) -> Robot:
     links = [link for link in _links(root) if _has_shape(root, link)]
     standing = [link for link in links if not _moves(root, link)]
     model = Model(arm, text, packages, links, standing, allowed, limits)
-    scenes = [
-        model.scene(path.stem, file.base_frame, file.flange_frame) for _ in ("free", "straight")
-    ]
+    scenes = [model.scene(path.stem, file.base_frame, file.flange_frame) for _ in range(3)]
     lower, upper = scenes[0].getPositionLimitVectors(GROUP)
     home = np.array(file.home) if file.home else np.clip(0.0, lower, upper)
     if ((home < lower) | (home > upper)).any():

@@ -1,12 +1,14 @@
 """What an arm must not touch: the seen cloud, the support, obstacles; and where it may start."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from roboplan import core
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Bools, Float64
@@ -21,9 +23,76 @@ AROUND = 2.0  # metres from the arm's base: what is beyond is left out
 SEEN_SELF = 0.02  # metres from the arm within which the camera sees the arm itself
 INSIDE = 10  # voxels of objects that may lie within the arm, as the camera errs
 SLAB = (6.0, 6.0, 0.5)  # metres, of the support
+FOOT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
+NEAR = 0.02  # metres from what is held, within which voxels are its own
 GREY = np.ones(4)
+HELD = "what is held"
 
 Obstacle = tuple[str, core.Box | core.OcTree, Float64]  # its name, shape and pose in the base frame
+
+
+class Load(NamedTuple):
+    """What a hand takes along, as an upright box; base frame, where it is grasped."""
+
+    points: Float64  # (H, 3)
+    T_base_box: Float64  # (4, 4) its z is up
+    half: Float64  # (3,)
+    below: float  # metres that it may go on below the box, where no camera looked
+
+    @property
+    def above_its_foot(self) -> tuple[float, Float64]:
+        """The box without its foot: how much higher its middle is, and half its lengths."""
+        cut = min(FOOT, self.half[2])
+        return cut / 2, self.half - (0.0, 0.0, cut / 2)
+
+
+class Surroundings(NamedTuple):
+    """What is around a robot."""
+
+    own: set[int | None]  # numbers of objects that are the arm itself, as the camera sees it
+    boxes: list[Obstacle]  # the support and the request's obstacles
+    voxels: Float64  # (V, 3) centers of those of the cloud, scene frame
+    T_base_scene: Float64  # (4, 4)
+
+    def all(self) -> list[Obstacle]:
+        """Every obstacle."""
+        if not len(self.voxels):
+            return self.boxes
+        # Columns as coal's octrees have them: center, size, how probably it is occupied, and from
+        # which probability on it counts; octomap knows no certainty.
+        cells = np.tile([0.0, 0.0, 0.0, CELL, 0.97, 0.5], (len(self.voxels), 1))
+        cells[:, :3] = self.voxels
+        return [*self.boxes, ("the cloud", core.OcTree(list(cells), CELL), self.T_base_scene)]
+
+    def without(self, load: Load) -> "Surroundings":
+        """The same once a load is taken away."""
+        points = moved(np.linalg.inv(self.T_base_scene), load.points)
+        far = cKDTree(points).query(self.voxels, distance_upper_bound=NEAR)[0] > NEAR
+        return self._replace(voxels=self.voxels[far])
+
+
+@contextmanager
+def carrying(
+    robot: Robot, around: Surroundings, load: Load, T_base_hand: Float64
+) -> Iterator[core.Scene]:
+    """A scene in which the hand holds a load, by its pose at the grasp; its foot may touch."""
+    scene, obstacles = robot.carrying, around.all()
+    off, half = load.above_its_foot
+    # The planner takes the pose in the frame of the joint that the flange hangs on.
+    T_base_joint = scene.forwardKinematics(robot.home, robot.joint_names[-1], robot.base_frame)
+    T_joint_hand = np.linalg.inv(T_base_joint) @ robot.hand_pose(robot.home)
+    T_joint_box = T_joint_hand @ np.linalg.inv(T_base_hand) @ load.T_base_box
+    T_joint_box[:3, 3] += off * T_joint_box[:3, 2]
+    pose, box = np.asfortranarray(T_joint_box), core.Box(*(2 * half))
+    _add(scene, robot, obstacles)
+    scene.addBoxGeometry(HELD, robot.flange_frame, box, pose, GREY)
+    scene.setCollisions(HELD, HAND, False)
+    try:
+        yield scene
+    finally:
+        for name in (HELD, *(name for name, _, _ in obstacles)):
+            with suppress(RuntimeError):  # the load may have been put down
+                scene.removeGeometry(name)
 
 
 @contextmanager
@@ -33,7 +102,7 @@ def surrounded(
     points: object,
     asked: RobotArm,
     boxes: Sequence[Box | OrientedBox],
-) -> Iterator[set[int | None]]:
+) -> Iterator[Surroundings]:
     """Put what is around the robot into its scenes, and take it away afterwards.
 
     The hand may touch it in `robot.straight`: there it goes where the detection found it free.
@@ -46,7 +115,7 @@ def surrounded(
         boxes: Obstacles beside the cloud, cloud frame.
 
     Yields:
-        Numbers of objects that are the arm itself, as the camera sees it.
+        What it put there.
 
     Raises:
         InvalidRequest: It touches something where it is, or stands within an object.
@@ -54,24 +123,25 @@ def surrounded(
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
     own = _own_objects(robot, joints, scene, T_base_cloud)
-    around = [_box(row, box, T_base_cloud) for row, box in enumerate(boxes)]
+    known = [_box(row, box, T_base_cloud) for row, box in enumerate(boxes)]
     T_base_scene = T_base_cloud @ np.linalg.inv(scene.frame.T_canonical_cloud)
     if scene.support is not None:
-        around.append(_support(scene, T_base_scene))
-    if (cloud := _cloud(robot, joints, scene, points, T_base_scene)) is not None:
-        around.append(cloud)
-    names = [name for name, _, _ in around]
+        known.append(_support(scene, T_base_scene))
+    voxels = _voxels(robot, joints, scene, points, T_base_scene)
+    around = Surroundings(own, known, voxels, T_base_scene)
+    obstacles = around.all()
+    names = [name for name, _, _ in obstacles]
     for planned in (robot.scene, robot.straight):
-        _add(planned, robot, around)
+        _add(planned, robot, obstacles)
     try:
         robot.straight.setCollisions([(HAND, name) for name in names], False)
         if robot.scene.hasCollisions(joints):
             again = robot.model.scene(robot.name, robot.base_frame, robot.flange_frame)
-            _add(again, robot, around)
+            _add(again, robot, obstacles)
             pair = touching(again, robot.model, joints, names)
             fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
             raise InvalidRequest("options.robot.joints", f"a start where {pair} touch", fix)
-        yield own
+        yield around
     finally:
         for planned in (robot.scene, robot.straight):
             for name in names:
@@ -136,14 +206,14 @@ def _support(scene: Scene, T_base_scene: Float64) -> Obstacle:
     return "the support", core.Box(*SLAB), T_base_scene @ T_scene_slab
 
 
-def _cloud(
+def _voxels(
     robot: Robot,
     joints: Float64,
     scene: Scene,
     points: object,
     T_base_scene: Float64,
-) -> Obstacle | None:
-    """Voxels of the cloud, without the support's and the arm's own; None: there are none."""
+) -> Float64:
+    """Centers (V, 3) of the cloud's voxels, scene frame, without the support's and the arm's."""
     flat = np.asarray(points).reshape(-1, 3)
     if scene.support is None:
         kept = np.isfinite(flat).all(axis=1)
@@ -155,19 +225,13 @@ def _cloud(
     base = np.linalg.inv(T_base_scene)[:3, 3]
     seen = seen[np.einsum("ij,ij->i", seen - base, seen - base) < AROUND**2]
     if len(seen) == 0:
-        return None
+        return seen
     cell = np.floor(seen / CELL).astype(np.int64)
     corner = cell.min(axis=0)
     taken = np.zeros(cell.max(axis=0) - corner + 1, dtype=bool)
     taken[tuple((cell - corner).T)] = True
     centers = (np.argwhere(taken) + corner + 0.5) * CELL
-    centers = centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
-    if len(centers) == 0:
-        return None
-    # Columns as coal's octrees have them: center, size, how probably it is occupied, and from
-    # which probability on it counts; octomap knows no certainty.
-    cells = np.column_stack([centers, np.tile([CELL, 0.97, 0.5], (len(centers), 1))])
-    return "the cloud", core.OcTree(list(cells), CELL), T_base_scene
+    return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
 
 
 def moved(T_b_a: Float64, points: ArrayLike) -> Float64:

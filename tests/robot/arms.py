@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import SupportPlane, parse_options
-from edgegrasp_model.results import Detection, Grasp, GripperOutline
+from edgegrasp_model.results import DetectedObject, Detection, Grasp, GripperOutline
 from edgegrasp_model.scene.cloud import CanonicalFrame
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot import plan_picks, with_robot
@@ -64,15 +64,26 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=()):
         for row, pose in enumerate(poses)
     ]  # fmt: skip
     gripper = GripperOutline(robot.gripper.name, robot.gripper.palm_z, robot.gripper.tip_z)
-    detection = Detection(grasps, {"scored": len(grasps), "returned": len(grasps)}, {}, "", gripper)
+    counts = {"scored": len(grasps), "returned": len(grasps)}
+    turn = Rotation.from_matrix(T_cloud_base[:3, :3]).as_quat()
+    found = [
+        DetectedObject(
+            row, 99, in_cloud([box])[0], np.float32([HALF, HALF, box[2]]), turn, None, 0.9, None
+        )
+        for row, box in enumerate(boxes)
+    ]
+    detection = Detection(grasps, counts, {}, "", gripper, objects=found)
     cloud = np.concatenate([objects, in_cloud(table), *map(in_cloud, more)])
     return scene, cloud, detection
 
 
-def picks_of(robot, T_base_cloud=TURNED, joints=None, plan="motion", options=None, **given):
+def picks_of(
+    robot, T_base_cloud=TURNED, joints=None, plan="motion", options=None, place=None, **given
+):
     """The detection with the arm's plans."""
     scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
     asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}
+    asked["place"] = place
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
     parsed = parse_options({"robot": asked, **(options or {})})
     with_robot(parsed, robot)

@@ -31,6 +31,22 @@ def assert_pose(found, wanted):
     assert turn < CLOSE_ANGLE
 
 
+def assert_motion(robot, motion):
+    """It begins at home, rests where it should, and keeps to the limits all along."""
+    np.testing.assert_allclose(motion.positions[0], robot.home, atol=1e-9)
+    for row in (0, motion.pregrasp_row, motion.grasp_row, -1):
+        assert np.abs(motion.velocities[row]).max() < 1e-6
+    assert (motion.positions >= robot.lower).all()
+    assert (motion.positions <= robot.upper).all()
+    assert (np.abs(motion.velocities) <= robot.max_velocity).all()
+    step = np.diff(motion.times)
+    assert (step > 0).all()
+    velocities = np.diff(motion.positions, axis=0) / step[:, None]
+    assert (np.abs(velocities) <= robot.max_velocity).all()
+    rate = np.abs(np.diff(motion.velocities, axis=0) / step[:, None])
+    assert (rate <= 1.001 * robot.max_acceleration).all()
+
+
 def plans_of(detection):
     return [(grasp, grasp.arm) for grasp in detection.grasps if grasp.arm and grasp.arm.reachable]
 
@@ -64,22 +80,11 @@ def test_the_hand_comes_to_the_grasp_and_limits_are_kept(robot, x, y, tilt):
         assert_pose(robot.hand_pose(plan.pregrasp_joints), before)
         motion = plan.trajectory
         assert motion is not None
-        np.testing.assert_allclose(motion.positions[0], robot.home, atol=1e-9)
         np.testing.assert_allclose(
             motion.positions[motion.pregrasp_row], plan.pregrasp_joints, atol=1e-6
         )
         np.testing.assert_allclose(motion.positions[motion.grasp_row], plan.grasp_joints, atol=1e-6)
-        for row in (0, motion.pregrasp_row, motion.grasp_row, -1):
-            assert np.abs(motion.velocities[row]).max() < 1e-6
-        assert (motion.positions >= robot.lower).all()
-        assert (motion.positions <= robot.upper).all()
-        assert (np.abs(motion.velocities) <= robot.max_velocity).all()
-        step = np.diff(motion.times)
-        assert (step > 0).all()
-        velocities = np.diff(motion.positions, axis=0) / step[:, None]
-        assert (np.abs(velocities) <= robot.max_velocity).all()
-        rate = np.abs(np.diff(motion.velocities, axis=0) / step[:, None])
-        assert (rate <= 1.001 * robot.max_acceleration).all()
+        assert_motion(robot, motion)
 
 
 def test_the_way_in_is_straight(robot):

@@ -102,6 +102,20 @@ def test_reach_alone_and_what_is_out_of_reach(robot, transport):
     assert near.trajectory is None
 
 
+@pytest.mark.parametrize("transport", ["grpc", "http"])
+def test_the_client_reads_where_an_object_is_put(robot, transport):
+    place = {
+        "T_base_object": np.array(
+            [[1, 0, 0, 0.4], [0, 1, 0, -0.35], [0, 0, 1, 0.1], [0, 0, 0, 1.0]]
+        )
+    }
+    plan = read(transport, ask(robot, transport, place=place)[0].body).best_pick.arm
+    np.testing.assert_allclose(robot.hand_pose(plan.place_joints), plan.T_base_place, atol=1e-6)
+    assert plan.trajectory.grasp_row < plan.trajectory.release_row < len(plan.trajectory.times)
+    region = {"min": (0.3, -0.5, 0.0), "max": (0.6, -0.3, 0.3)}
+    assert read(transport, ask(robot, transport, place={"region": region})[0].body).best_pick
+
+
 @pytest.mark.parametrize(
     ("settings", "fix"), [(SETTINGS, "Use one of: fr3."), (Settings(), "Set the setting `robots`.")]
 )

@@ -1163,6 +1163,7 @@ class RobotArm(_message.Message):
     T_BASE_CLOUD_FIELD_NUMBER: _builtins.int
     JOINTS_FIELD_NUMBER: _builtins.int
     PLAN_FIELD_NUMBER: _builtins.int
+    PLACE_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     """One of the server's robots."""
     plan: _builtins.str
@@ -1177,6 +1178,12 @@ class RobotArm(_message.Message):
     def joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """The arm's joints now, radians or metres, in the order of the robot file."""
 
+    @_builtins.property
+    def place(self) -> Global___Place:
+        """Where to put the object: a grasp is within reach only if that is too; absent: the motion ends
+        with the object lifted.
+        """
+
     def __init__(
         self,
         *,
@@ -1184,10 +1191,11 @@ class RobotArm(_message.Message):
         T_base_cloud: _abc.Iterable[_builtins.float] | None = ...,
         joints: _abc.Iterable[_builtins.float] | None = ...,
         plan: _builtins.str | None = ...,
+        place: Global___Place | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_name", b"_name", "_plan", b"_plan", "name", b"name", "plan", b"plan"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_name", b"_name", "_plan", b"_plan", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_cloud", b"T_base_cloud", "_name", b"_name", "_plan", b"_plan", "joints", b"joints", "name", b"name", "plan", b"plan"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_cloud", b"T_base_cloud", "_name", b"_name", "_plan", b"_plan", "joints", b"joints", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
     _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
@@ -1199,6 +1207,70 @@ class RobotArm(_message.Message):
     def WhichOneof(self, oneof_group: _WhichOneofArgType__plan) -> _WhichOneofReturnType__plan | None: ...
 
 Global___RobotArm: _TypeAlias = RobotArm  # noqa: Y015
+
+@_typing.final
+class Place(_message.Message):
+    """Where the arm puts the object down: in one pose, or anywhere in a region."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    T_BASE_OBJECT_FIELD_NUMBER: _builtins.int
+    REGION_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def T_base_object(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Where the object's box, as `objects` in the answer have it, is to be in the arm's base frame:
+        a 4 x 4 matrix, row by row.
+        """
+
+    @_builtins.property
+    def region(self) -> Global___PlaceRegion:
+        """Where the whole object is to stand, turned about the vertical at will; the base frame's z is
+        up.
+        """
+
+    def __init__(
+        self,
+        *,
+        T_base_object: _abc.Iterable[_builtins.float] | None = ...,
+        region: Global___PlaceRegion | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["region", b"region"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_object", b"T_base_object", "region", b"region"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Place: _TypeAlias = Place  # noqa: Y015
+
+@_typing.final
+class PlaceRegion(_message.Message):
+    """An axis-aligned box in the arm's base frame, on whose bottom an object is put."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    MIN_FIELD_NUMBER: _builtins.int
+    MAX_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def min(self) -> Global___Vector:
+        """Lower corner, metres."""
+
+    @_builtins.property
+    def max(self) -> Global___Vector:
+        """Upper corner, metres."""
+
+    def __init__(
+        self,
+        *,
+        min: Global___Vector | None = ...,
+        max: Global___Vector | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["max", b"max", "min", b"min"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___PlaceRegion: _TypeAlias = PlaceRegion  # noqa: Y015
 
 @_typing.final
 class Suppression(_message.Message):
@@ -2263,8 +2335,12 @@ class ArmPlan(_message.Message):
     PREGRASP_JOINTS_FIELD_NUMBER: _builtins.int
     GRASP_JOINTS_FIELD_NUMBER: _builtins.int
     TRAJECTORY_FIELD_NUMBER: _builtins.int
+    PLACE_JOINTS_FIELD_NUMBER: _builtins.int
+    T_BASE_PLACE_FIELD_NUMBER: _builtins.int
     reachable: _builtins.bool
-    """Whether it gets to the pregrasp and straight on, touching nothing."""
+    """Whether it gets to the pregrasp and straight on, and to where it puts the object, touching
+    nothing.
+    """
     @_builtins.property
     def pregrasp_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """J radians (metres of sliding joints) where it is reachable; else absent (null in JSON)."""
@@ -2277,6 +2353,16 @@ class ArmPlan(_message.Message):
     def trajectory(self) -> Global___ArmTrajectory:
         """Where it was asked for and found in time; else absent (null in JSON)."""
 
+    @_builtins.property
+    def place_joints(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J radians (metres of sliding joints) where it lets go; absent (null in JSON) without a place."""
+
+    @_builtins.property
+    def T_base_place(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """16 floats, 4 x 4 row-major: the hand where it lets go, in the arm's base frame; absent (null in
+        JSON) without a place.
+        """
+
     def __init__(
         self,
         *,
@@ -2284,10 +2370,12 @@ class ArmPlan(_message.Message):
         pregrasp_joints: _abc.Iterable[_builtins.float] | None = ...,
         grasp_joints: _abc.Iterable[_builtins.float] | None = ...,
         trajectory: Global___ArmTrajectory | None = ...,
+        place_joints: _abc.Iterable[_builtins.float] | None = ...,
+        T_base_place: _abc.Iterable[_builtins.float] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["trajectory", b"trajectory"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["grasp_joints", b"grasp_joints", "pregrasp_joints", b"pregrasp_joints", "reachable", b"reachable", "trajectory", b"trajectory"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_place", b"T_base_place", "grasp_joints", b"grasp_joints", "place_joints", b"place_joints", "pregrasp_joints", b"pregrasp_joints", "reachable", b"reachable", "trajectory", b"trajectory"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -2295,7 +2383,9 @@ Global___ArmPlan: _TypeAlias = ArmPlan  # noqa: Y015
 
 @_typing.final
 class ArmTrajectory(_message.Message):
-    """A timed motion: to the pregrasp, straight to the grasp, straight out. T rows."""
+    """A timed motion: to the pregrasp, straight to the grasp, straight out; with a place, on to above
+    it, straight down and back. T rows.
+    """
 
     DESCRIPTOR: _descriptor.Descriptor
 
@@ -2305,10 +2395,13 @@ class ArmTrajectory(_message.Message):
     VELOCITIES_FIELD_NUMBER: _builtins.int
     PREGRASP_ROW_FIELD_NUMBER: _builtins.int
     GRASP_ROW_FIELD_NUMBER: _builtins.int
+    RELEASE_ROW_FIELD_NUMBER: _builtins.int
     pregrasp_row: _builtins.int
     """Row at which the arm rests at the pregrasp."""
     grasp_row: _builtins.int
     """Row at which the arm rests at the grasp, for the gripper to close."""
+    release_row: _builtins.int
+    """Row at which the arm rests for the gripper to open; absent (null in JSON) without a place."""
     @_builtins.property
     def joint_names(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
         """J names."""
@@ -2334,12 +2427,15 @@ class ArmTrajectory(_message.Message):
         velocities: _abc.Iterable[_builtins.float] | None = ...,
         pregrasp_row: _builtins.int = ...,
         grasp_row: _builtins.int = ...,
+        release_row: _builtins.int | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_release_row", b"_release_row", "release_row", b"release_row"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["grasp_row", b"grasp_row", "joint_names", b"joint_names", "positions", b"positions", "pregrasp_row", b"pregrasp_row", "times", b"times", "velocities", b"velocities"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_release_row", b"_release_row", "grasp_row", b"grasp_row", "joint_names", b"joint_names", "positions", b"positions", "pregrasp_row", b"pregrasp_row", "release_row", b"release_row", "times", b"times", "velocities", b"velocities"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
-    def WhichOneof(self, oneof_group: _Never) -> None: ...
+    _WhichOneofReturnType__release_row: _TypeAlias = _typing.Literal["release_row"]  # noqa: Y015
+    _WhichOneofArgType__release_row: _TypeAlias = _typing.Literal["_release_row", b"_release_row"]  # noqa: Y015
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__release_row) -> _WhichOneofReturnType__release_row | None: ...
 
 Global___ArmTrajectory: _TypeAlias = ArmTrajectory  # noqa: Y015
 

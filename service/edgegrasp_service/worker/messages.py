@@ -63,7 +63,7 @@ def plain_options(message: grasp_pb2.DetectOptions) -> dict[str, Any]:
     Raises:
         InvalidRequest: One is set in two fields.
     """
-    options = {field.name: _field(message, field) for field, _ in message.ListFields()}
+    options = _set_fields(message)
     if "object_choice" in options:
         if "objects" in options:
             value = f"{options['objects']!r} beside object_choice"
@@ -150,6 +150,10 @@ def _plain_fields(message: Message) -> dict[str, Any]:
     }
 
 
+def _set_fields(message: Message) -> dict[str, Any]:
+    return {field.name: _field(message, field) for field, _ in message.ListFields()}
+
+
 def _field(message: Message, field: Any) -> Any:
     value = getattr(message, field.name)
     if field.type == field.TYPE_BOOL and field.is_repeated:
@@ -202,6 +206,7 @@ def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
 
 # What JSON writes in another way than field by field.
 _FORMS: dict[type[Message], Callable[[Any], Any]] = {
+    grasp_pb2.Place: _set_fields,
     grasp_pb2.Pixel: _coordinates,
     grasp_pb2.Vector: _coordinates,
     grasp_pb2.Quaternion: _coordinates,
