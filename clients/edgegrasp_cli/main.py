@@ -23,6 +23,7 @@ COMMANDS = {
     "open-inference": ("open_inference", "open-inference", "Serve the Open Inference Protocol."),
     "benchmark": ("benchmark", "train", "Clear simulated clutter with a planner; count successes."),
     "benchmark-real": ("benchmark_real", "service,view", "Judge grasps in scenes of real cameras."),
+    "benchmark-tracking": ("benchmark_tracking", "train,view", "Follow grasps of moving objects."),
     "compare": ("benchmark", "train", "Compare two benchmarks scene by scene."),
     "replay": ("replay", "service,sim", "Make a recorded attempt or request again."),
     "generate-data": ("train", "train", "Make labelled edge grasps in simulation."),

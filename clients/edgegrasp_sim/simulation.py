@@ -240,6 +240,18 @@ class ClutterSimulation:
             self._objects.append(item)
         self._gripper = self._add_gripper()
 
+    def move(
+        self,
+        number: int,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+    ) -> None:
+        """Put one of the `placements`, by its place among them, elsewhere without simulating."""
+        if self._rest_state is not None:
+            self.world.remove_state(self._rest_state)
+            self._rest_state = None
+        self._objects[number].body.set_pose(position, quaternion_xyzw)
+
     def observe_from(
         self,
         T_world_cameras: Sequence[Matrix],

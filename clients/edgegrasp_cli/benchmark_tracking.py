@@ -1,0 +1,309 @@
+"""`edgegrasp benchmark-tracking`: grasps followed through a camera's images, and then executed."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_cli.detect import Device, Weights, open_client
+from edgegrasp_cli.flags import CONNECTION, Server, Timeout, takes_flags
+
+if TYPE_CHECKING:
+    from edgegrasp_camera.arrays import Float64
+    from edgegrasp_cli.real_scenes import RealScene
+    from edgegrasp_sim.simulation import ClutterSimulation
+
+Option = typer.Option
+RATE = 30.0  # images a second
+NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
+EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
+OBJECTS = 3  # in a simulated scene
+# Which grasps are executed: the first at the start; the first, and the last one, in the end.
+SUCCESSES = ("still", "open_loop", "followed")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What happens between the first answer and the grasp."""
+
+    seconds: float = 1.0
+    speed: float = 0.0  # of the object, level, metres a second
+    shift: float = np.inf  # metres after which it stops
+    turn: float = 0.0  # degrees about the vertical when it stops
+    camera: float = 0.0  # speed at which the camera comes nearer, metres a second
+
+
+MOTIONS = {
+    "still": Motion(seconds=10.0),
+    "pushed": Motion(speed=0.1, shift=0.02, turn=20.0),
+    "belt-5": Motion(speed=0.05),
+    "belt-10": Motion(speed=0.1),
+    "belt-20": Motion(speed=0.2),
+    "hand-camera": Motion(camera=0.2),
+}
+
+
+@dataclass
+class Followed:
+    """How the first grasp of a scene was followed."""
+
+    seconds: list[float] = field(default_factory=list)  # when each answer with it was there
+    off: list[tuple[float, float]] = field(default_factory=list)  # mm, degrees; as many
+    latency: list[float] = field(default_factory=list)  # seconds, of all answers
+    switches: int = 0  # to another first grasp, or to none
+    first: Any = None  # grasps; None: there was none
+    last: Any = None
+    success: dict[str, bool] = field(default_factory=dict)
+
+
+class Scene:
+    """What a camera sees over time; nothing moves, and nothing can be grasped."""
+
+    def look(self, seconds: float) -> dict[str, Any]:
+        """The image of a time, as arguments of `GraspClient.detect`."""
+        raise NotImplementedError
+
+    def hold(self, T_cloud_tcp: "Float64") -> None:
+        """From now on the object moves that is nearest to a grasp."""
+
+    def moved(self, seconds: float) -> "Float64":
+        """(4, 4) T_now_start of that object, cloud frame."""
+        return np.eye(4)
+
+    def execute(self, done: Followed) -> dict[str, bool]:
+        """Which of the grasps of SUCCESSES hold an object."""
+        return {}
+
+
+class RecordedScene(Scene):
+    """A recorded scene that stands still, in each image with new noise of a depth camera."""
+
+    def __init__(self, scene: "RealScene") -> None:
+        self.points = scene.points
+
+    def look(self, seconds: float) -> dict[str, Any]:
+        """The points (R, 3)."""
+        rng, depth = np.random.default_rng(round(seconds * RATE)), self.points[:, 2]
+        apart = (NOISE[0] + NOISE[1] * depth**2) * rng.standard_normal(len(depth)) / depth
+        noisy = (self.points * (1.0 + apart[:, None])).astype(np.float32)
+        seen = np.isfinite(noisy[:, 0]) & (rng.random(len(depth)) > MISSING)
+        return {"cloud": noisy[seen], "viewpoint": (0.0, 0.0, 0.0)}
+
+
+class SimulatedScene(Scene):
+    """Objects on a table of which one moves, seen by a structured-light camera; world frame."""
+
+    def __init__(
+        self, simulation: "ClutterSimulation", motion: Motion, rng: np.random.Generator
+    ) -> None:
+        self.simulation, self.motion, self.rng = simulation, motion, rng
+        self.start, self.held = simulation.placements, 0
+        self.places = np.array([one.position for one in self.start])
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        self.way = np.array([np.cos(angle), np.sin(angle), 0.0])
+        self.sense = float(rng.choice([-1.0, 1.0]))
+
+    def look(self, seconds: float) -> dict[str, Any]:
+        """The points (H, W, 3)."""
+        from edgegrasp_sim.camera import look_at
+        from edgegrasp_sim.sensor import STRUCTURED_LIGHT
+
+        self._place(seconds)
+        nearer = self.motion.camera * seconds / np.linalg.norm(TARGET - EYE)
+        eye = EYE + nearer * (TARGET - EYE)
+        seen = self.simulation.observe_from(
+            [look_at(eye, TARGET)], self.rng, noise_std=0.0, sensor=STRUCTURED_LIGHT, table="auto"
+        )
+        return {"cloud": seen.image, "viewpoint": tuple(eye.tolist())}
+
+    def hold(self, T_cloud_tcp: "Float64") -> None:
+        """It moves whose middle is nearest."""
+        self.held = int(np.linalg.norm(self.places - T_cloud_tcp[:3, 3], axis=1).argmin())
+
+    def moved(self, seconds: float) -> "Float64":
+        """A shift and a turn about its middle."""
+        motion, place, T = self.motion, self.places[self.held], np.eye(4)
+        gone = min(motion.speed * seconds, motion.shift)
+        turn = self.sense * motion.turn * gone / motion.shift
+        T[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
+        T[:3, 3] = place + gone * self.way - T[:3, :3] @ place
+        return T
+
+    def execute(self, done: Followed) -> dict[str, bool]:
+        """All three are tried."""
+        grasps = dict(zip(SUCCESSES, (done.first, done.first, done.last), strict=True))
+        success = dict.fromkeys(grasps, False)
+        for name, grasp in grasps.items():
+            self._place(0.0 if name == "still" else self.motion.seconds)
+            if grasp is not None:
+                success[name] = self.simulation.try_grasp(grasp.T_cloud_hand).success
+        return success
+
+    def _place(self, seconds: float) -> None:
+        """Put the object where it is at a time."""
+        T, start = self.moved(seconds), self.start[self.held]
+        place = T[:3, :3] @ start.position + T[:3, 3]
+        turn = Rotation.from_matrix(T[:3, :3]) * Rotation.from_quat(start.quaternion_xyzw)
+        self.simulation.move(self.held, place.tolist(), turn.as_quat().tolist())
+
+
+@takes_flags(connection=CONNECTION)
+def benchmark_tracking(
+    scenes: Annotated[
+        list[Path] | None, Option(help="Folder of recorded still scenes, .npz; else simulated.")
+    ] = None,
+    objects: Annotated[
+        Path | None, Option(help="Folder of packed/test/*.urdf; else the built-in objects.")
+    ] = None,
+    motion: Annotated[
+        list[str] | None, Option(help=f"{', '.join(MOTIONS)}; may be repeated; else all.")
+    ] = None,
+    rounds: Annotated[int, Option(help="Simulated scenes for each motion.")] = 20,
+    seconds: Annotated[float | None, Option(help="In place of each motion's own.")] = None,
+    output: Annotated[Path, Option(help="Folder for results.json and jitter.svg.")] = Path(
+        "results/tracking"
+    ),
+    server: Server = None,
+    timeout: Timeout = 60.0,
+    weights: Weights = None,
+    device: Device = "cpu",
+    *,
+    connection: dict[str, Any],
+) -> None:
+    """Follow a grasp at 30 images a second, then execute it in simulation.
+
+    The scene moves on while an answer is computed, and images that come meanwhile are dropped. An
+    answer takes the processor's time of this process; with --server, the time until it is there.
+    """
+    names = motion or (["still"] if scenes else list(MOTIONS))
+    if unknown := [name for name in names if name not in MOTIONS]:
+        raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
+    clock = time.perf_counter if server else time.process_time
+    done: dict[str, list[Followed]] = {}
+    with open_client(server, timeout, connection, weights, None, device) as client:
+        for name in names:
+            asked = MOTIONS[name]
+            asked = replace(asked, seconds=asked.seconds if seconds is None else seconds)
+            made = recorded(scenes) if scenes else simulated(objects, asked, rounds)
+            for label, scene in made:
+                followed = follow(client, scene, asked.seconds, clock)
+                if followed.first is not None:
+                    followed.success = scene.execute(followed)
+                    done.setdefault(label if scenes else name, []).append(followed)
+    rows = {name: summary(each) for name, each in done.items()}
+    output.mkdir(parents=True, exist_ok=True)
+    (output / "results.json").write_text(json.dumps(rows, indent=1) + "\n")
+    _plot(output / "jitter.svg", done)
+    _print(rows)
+
+
+def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]) -> Followed:
+    """Follow the first grasp of a scene, whose motion begins when that is there."""
+    from edgegrasp_client import GraspTracker
+    from edgegrasp_client.requests import plain_options
+
+    tracker, done, now, shown = GraspTracker(top_k=10), Followed(), 0.0, None
+    while now < seconds:
+        taken = np.floor(now * RATE + 1e-6) / RATE  # the latest image
+        image, start = scene.look(taken), clock()
+        found = client.detect(**image, **plain_options(tracker.options()))
+        spent = clock() - start
+        tracker.take(found)
+        best = found.grasps[0] if found.grasps else None
+        if done.first is None:
+            if best is None:
+                return done
+            done.first, shown = best, best.id
+            scene.hold(best.T_cloud_tcp)
+            continue
+        now = max(taken + 1.0 / RATE, taken + spent)
+        done.latency.append(spent)
+        done.switches += int(best is None or best.id != shown)
+        done.last, shown = best or done.last, best and best.id
+        if shown == done.first.id:
+            true = scene.moved(now) @ done.first.T_cloud_tcp
+            turn = Rotation.from_matrix(best.T_cloud_tcp[:3, :3].T @ true[:3, :3]).magnitude()
+            apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])
+            done.seconds.append(now)
+            done.off.append((1000 * float(apart), float(np.degrees(turn))))
+    return done
+
+
+def summary(done: list[Followed]) -> dict[str, Any]:
+    """Figures over some scenes: medians and 95 %, and how many grasps held an object."""
+    off = np.array([each for one in done for each in one.off]).reshape(-1, 2)
+    latency = 1000 * np.array([each for one in done for each in one.latency])
+    measured = {"mm": off[:, 0], "degrees": off[:, 1], "ms": latency}
+    minutes = sum(one.seconds[-1] for one in done if one.seconds) / 60
+    switches = sum(one.switches for one in done)
+    return {
+        "scenes": len(done),
+        "images": len(latency),
+        "switches": switches,
+        "switches_a_minute": switches / minutes if minutes else None,
+        **{
+            f"{name}_{share}": float(np.percentile(values, share)) if len(values) else None
+            for name, values in measured.items()
+            for share in (50, 95)
+        },
+        **{name: sum(one.success[name] for one in done) for name in done[0].success},
+    }
+
+
+def recorded(folders: list[Path]) -> Iterator[tuple[str, Scene]]:
+    """Recorded scenes with their names."""
+    from edgegrasp_cli.real_scenes import load_scenes
+
+    for scene in load_scenes(folders):
+        yield scene.name, RecordedScene(scene)
+
+
+def simulated(objects: Path | None, motion: Motion, rounds: int) -> Iterator[tuple[str, Scene]]:
+    """Simulated scenes with their names, of which only the latest is there."""
+    from edgegrasp_sim.objects import ObjectSet, SceneKind
+    from edgegrasp_sim.simulation import ClutterSimulation
+
+    kind = SceneKind.PACKED
+    sets = None if objects is None else {kind: ObjectSet.from_folder(objects, kind, "test")}
+    with ClutterSimulation(sets, engine="mujoco") as simulation:
+        for number in range(rounds):
+            rng = np.random.default_rng(number)
+            if simulation.reset(kind, rng, num_objects=OBJECTS):
+                yield f"scene {number}", SimulatedScene(simulation, motion, rng)
+
+
+def _print(rows: dict[str, dict[str, Any]]) -> None:
+    """A row for each motion or recorded scene; medians and 95 % in one column."""
+    from rich.console import Console
+    from rich.table import Table
+
+    held = [name for name in next(iter(rows.values()), {}) if name in SUCCESSES]
+    counts, measured = ("scenes", "images", "switches"), ("mm", "degrees", "ms")
+    table = Table("", *counts, *measured, *held, box=None)
+    for label, row in rows.items():
+        pairs = ((row[f"{name}_50"], row[f"{name}_95"]) for name in measured)
+        texts = ("-" if low is None else f"{low:.1f}, {high:.1f}" for low, high in pairs)
+        table.add_row(
+            label, *(str(row[name]) for name in counts), *texts, *(str(row[name]) for name in held)
+        )
+    Console().print(table)
+
+
+def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
+    """How far the first grasp is from where it should be, over time."""
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
+    for name, each in done.items():
+        away = [millimetres for millimetres, _ in each[0].off]
+        axes.plot(each[0].seconds, away, label=name, linewidth=1)
+    axes.set(xlabel="seconds", ylabel="mm", ylim=(0, 3))
+    figure.legend(loc="outside right upper", fontsize=8)
+    figure.savefig(path)
+    pyplot.close(figure)
