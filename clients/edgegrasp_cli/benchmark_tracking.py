@@ -12,7 +12,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_cli.detect import Device, Weights, open_client
-from edgegrasp_cli.flags import CONNECTION, Server, Timeout, takes_flags
+from edgegrasp_cli.flags import CONNECTION, Server, takes_flags
 
 if TYPE_CHECKING:
     from edgegrasp_camera.arrays import Float64
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Option = typer.Option
 RATE = 30.0  # images a second
+TIMEOUT = 60.0  # seconds for a server's answer
 NOISE, MISSING = (0.0003, 0.0015), 0.005  # metres, and for each square metre of depth; of pixels
 EYE, TARGET = np.array([0.15, -0.35, 0.65]), np.array([0.15, 0.15, 0.05])  # of the camera, metres
 OBJECTS = 3  # in a simulated scene
@@ -170,7 +171,6 @@ def benchmark_tracking(
         "results/tracking"
     ),
     server: Server = None,
-    timeout: Timeout = 60.0,
     weights: Weights = None,
     device: Device = "cpu",
     *,
@@ -186,7 +186,7 @@ def benchmark_tracking(
         raise ValueError(f"--motion: got {unknown[0]!r}. Choose one of {', '.join(MOTIONS)}.")
     clock = time.perf_counter if server else time.process_time
     done: dict[str, list[Followed]] = {}
-    with open_client(server, timeout, connection, weights, None, device) as client:
+    with open_client(server, TIMEOUT, connection, weights, None, device) as client:
         for name in names:
             asked = MOTIONS[name]
             asked = replace(asked, seconds=asked.seconds if seconds is None else seconds)
@@ -292,7 +292,7 @@ def _print(rows: dict[str, dict[str, Any]]) -> None:
         table.add_row(
             label, *(str(row[name]) for name in counts), *texts, *(str(row[name]) for name in held)
         )
-    Console().print(table)
+    Console(width=110).print(table)
 
 
 def _plot(path: Path, done: dict[str, list[Followed]]) -> None:
