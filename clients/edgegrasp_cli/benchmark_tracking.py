@@ -226,7 +226,7 @@ def follow(client: Any, scene: Scene, seconds: float, clock: Callable[[], float]
         done.latency.append(spent)
         done.switches += int(best is None or best.id != shown)
         done.last, shown = best or done.last, best and best.id
-        if shown == done.first.id:
+        if best is not None and best.id == done.first.id:
             true = scene.moved(now) @ done.first.T_cloud_tcp
             turn = Rotation.from_matrix(best.T_cloud_tcp[:3, :3].T @ true[:3, :3]).magnitude()
             apart = np.linalg.norm(best.T_cloud_tcp[:3, 3] - true[:3, 3])
