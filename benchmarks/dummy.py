@@ -14,6 +14,7 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Array, Float32, Int64
 from edgegrasp_model.errors import UnknownModel
+from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.results import (
@@ -27,7 +28,7 @@ from edgegrasp_model.results import (
     Pace,
     Scoring,
 )
-from edgegrasp_model.scene.cloud import CloudInput, check_cloud, check_edges, check_hand_poses
+from edgegrasp_model.scene.cloud import CloudInput, check_cloud
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z

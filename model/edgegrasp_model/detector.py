@@ -19,6 +19,8 @@ from edgegrasp_model.candidates.sample import Sample, Sampler
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.given import (
     Scorer,
+    check_edges,
+    check_hand_poses,
     evaluate,
     from_edges,
     from_hand_poses,
@@ -42,8 +44,6 @@ from edgegrasp_model.results import Detection, Evaluation, GripperOutline, NoGra
 from edgegrasp_model.scene.cloud import (
     CheckedCloud,
     check_cloud,
-    check_edges,
-    check_hand_poses,
     seen_from_origin,
 )
 from edgegrasp_model.scene.scene import (

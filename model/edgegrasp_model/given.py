@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from edgegrasp_camera.arrays import Float32, Floats, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Floats, Int64
 from edgegrasp_model.candidates.collision import CollisionCheck, clearances, collides
 from edgegrasp_model.candidates.edge_grasps import (
     EDGE_MARGIN,
@@ -18,12 +18,13 @@ from edgegrasp_model.candidates.edge_grasps import (
     measure_edges,
     retract,
 )
+from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.networks.balls import BallBatch
 from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
-from edgegrasp_model.options import Collision
+from edgegrasp_model.options import MAX_CANDIDATES, Collision
 from edgegrasp_model.ranking import grasps_in_cloud
 from edgegrasp_model.results import Evaluation, NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
@@ -117,6 +118,54 @@ def _contact_rows(candidates: Candidates, balls: Int64, crop: BallCrop, size: in
     keys = crop.ball_of_point * size + crop.ball_rows  # ascending
     ball = np.searchsorted(balls, candidates.approach_index)
     return np.searchsorted(keys, ball * size + candidates.contact_index).astype(np.int64)
+
+
+def check_edges(edges: object, rows: int) -> Int64:
+    """Check (M, 2) rows of the cloud as sent.
+
+    Raises:
+        InvalidRequest: Another type or shape, too many, or a row that the cloud does not have.
+    """
+    fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
+    if not isinstance(edges, np.ndarray):
+        raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
+    if edges.dtype.kind not in "iu" or edges.shape[1:] != (2,):
+        raise InvalidRequest("edges", f"dtype {edges.dtype}, shape {edges.shape}", fix)
+    _check_number("edges", len(edges))
+    low, high = int(edges.min(initial=0)), int(edges.max(initial=0))
+    if low < 0 or high >= rows:
+        value = f"row {low if low < 0 else high} of a cloud of {rows} rows"
+        raise InvalidRequest("edges", value, f"Send rows from 0 to {rows - 1}.")
+    return edges.astype(np.int64)
+
+
+def check_hand_poses(poses: object) -> Float32:
+    """Check (M, 4, 4) poses T_cloud_hand.
+
+    Raises:
+        InvalidRequest: Another type or shape, too many, or one that is no rigid transform.
+    """
+    fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
+    if not isinstance(poses, np.ndarray):
+        raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
+    if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
+        raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
+    _check_number("hand_poses", len(poses))
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
+    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    rigid: Bools = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
+    rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
+    if not rigid.all():
+        fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
+        value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"
+        raise InvalidRequest("hand_poses", value, fix)
+    return poses.astype(np.float32)
+
+
+def _check_number(field: str, number: int) -> None:
+    if not 1 <= number <= MAX_CANDIDATES:
+        raise InvalidRequest(field, f"{number} of them", f"Send 1 to {MAX_CANDIDATES}.")
 
 
 def from_edges(

@@ -102,6 +102,11 @@ class Gripper:
         hand = np.broadcast_to(np.asarray(self.hand_boxes), (*opening.shape, *self._hand_shape))
         return np.concatenate([hand, right, left], axis=-3)
 
+    @cached_property
+    def open_boxes(self) -> Float64:
+        """`boxes` of the open gripper, to be copied before a change.  # (B, 2, 3)."""
+        return self.boxes(self.max_opening)
+
     def opened_to(self, opening: float) -> "Gripper":
         """The same gripper where it opens no further than to `opening` metres."""
         ahead = float(self.tip_advance(opening))

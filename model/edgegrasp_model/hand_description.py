@@ -210,7 +210,7 @@ def _look(
     count = view.num_candidates
     shapes = (count, 7), (count, 29), (count,), (count, 2), (count, 3)
     seen = _Seen(*(np.zeros(shape, dtype=np.float32) for shape in shapes))
-    boxes = gripper.boxes(gripper.max_opening).astype(np.float32)
+    boxes = gripper.open_boxes.astype(np.float32)
     first, last = len(gripper.hand_boxes), len(gripper.hand_boxes) + len(gripper.finger_boxes)
     across = gripper.pad_half_width, gripper.max_opening / 2
     along = gripper.palm_z, gripper.tip_z, gripper.max_tip_z

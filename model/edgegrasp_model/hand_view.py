@@ -28,7 +28,7 @@ def reach_of(
     Returns:
         (2, 3) lowest and highest corner, hand frame.
     """
-    boxes = gripper.boxes(gripper.max_opening)
+    boxes = gripper.open_boxes
     around, back = max(around, NEAR) + lift, max(back, APPROACH_LENGTH)
     low = boxes[:, 0].min(axis=0) - np.array([around, around, back + around - NEAR])
     high = boxes[:, 1].max(axis=0) + np.array([around, around, around + NEAR])

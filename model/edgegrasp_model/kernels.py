@@ -19,26 +19,6 @@ JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more chang
 DIAGONAL = 1e-12  # share of a matrix's trace that its other elements together may be
 
 
-def heights_and_distances(
-    points: Float32, axes: Float64, bow: Float64, max_bow: float, eye: Float64
-) -> tuple[Float32, Float32]:
-    """How high points stand over a bowed plane, and how far they are from a place.
-
-    Args:
-        points: (N, 3) metres.
-        axes: (4, 3): the axes x, y and z of the plane's frame, and its origin on the plane.
-        bow: (6,) rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
-        max_bow: Metres that the rise is limited to.
-        eye: (3,) the place.
-
-    Returns:
-        Height (N,) along z over the bowed plane, and distance (N,) squared from the place.
-    """
-    height, squared = np.empty((2, len(points)), dtype=np.float32)
-    _heights_and_distances(points, axes, bow, max_bow, eye, height, squared)
-    return height, squared
-
-
 def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float32:
     """Unit direction (M, 3), of either sign, in which points spread least.
 
@@ -151,27 +131,6 @@ def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
             return fresh
 
     return decorate
-
-
-@compiled("contract")
-def _heights_and_distances(
-    points: Float32,
-    axes: Float64,
-    bow: Float64,
-    max_bow: float,
-    eye: Float64,
-    height: Float32,
-    squared: Float32,
-) -> None:
-    for i in range(len(points)):
-        a, b, c = points[i, 0] - axes[3, 0], points[i, 1] - axes[3, 1], points[i, 2] - axes[3, 2]
-        x = axes[0, 0] * a + axes[0, 1] * b + axes[0, 2] * c
-        y = axes[1, 0] * a + axes[1, 1] * b + axes[1, 2] * c
-        rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
-        rise = min(max(rise, -max_bow), max_bow)
-        height[i] = axes[2, 0] * a + axes[2, 1] * b + axes[2, 2] * c - rise
-        a, b, c = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
-        squared[i] = a * a + b * b + c * c
 
 
 @compiled("contract")

@@ -754,6 +754,13 @@ class DetectOptions(Strict):
     )
 
     @property
+    def known_up(self) -> NDArray[np.float64] | None:
+        """(3,) unit, away from gravity; None where neither it nor the support is told."""
+        plane = self.support.normal if isinstance(self.support, SupportPlane) else None
+        known = plane if self.up is None else self.up
+        return None if known is None else np.asarray(known) / np.linalg.norm(known)
+
+    @property
     def follows_only(self) -> bool:
         """Whether only the grasps of an earlier answer are asked for."""
         return self.previous is not None and not self.previous.search

@@ -33,8 +33,8 @@ from edgegrasp_model.results import (
     Grasp,
     Tracking,
 )
-from edgegrasp_model.scene.grouping import UNKNOWN
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.segment import UNKNOWN
 
 MARGIN = 0.1  # of the score, by which another grasp has to be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first

@@ -18,9 +18,8 @@ from torch.nn import functional
 from torch.optim import swa_utils
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
-from edgegrasp_model.scene.grouping import group, instance_traits
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
-from edgegrasp_model.scene.segment import look
+from edgegrasp_model.scene.segment import group, instance_traits, look
 from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
 
 UP_SHARE = 0.5  # of the images whose `up` the network is given

@@ -9,9 +9,13 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import SupportPlane, parse_options
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
-from edgegrasp_model.scene.depth_scale import correct_depth_scale, depth_scale
 from edgegrasp_model.scene.scene import build_scene, select_points
-from edgegrasp_model.scene.support import Seen, fit_plane
+from edgegrasp_model.scene.support import (
+    Seen,
+    correct_depth_scale,
+    depth_scale,
+    fit_plane,
+)
 
 from .scenes import SEED
 

@@ -15,9 +15,9 @@ from edgegrasp_model.hand_kernels import (
 from edgegrasp_model.hand_view import HandView, hand_views, reach_of
 from edgegrasp_model.options import Collision, SupportPlane
 from edgegrasp_model.scene.cloud import UP, Cloud
-from edgegrasp_model.scene.grouping import FIXED
 from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_model.scene.segment import FIXED
 from edgegrasp_model.unseen import DepthMap, enters_unseen
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
@@ -131,7 +131,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
         (E,) metres. Negative where something lies within a box of the hand: its depth below the
         box's surface, the deepest.
     """
-    boxes = gripper.boxes(gripper.max_opening)
+    boxes = gripper.open_boxes
     nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
     if scene.support is not None:
         nearest = np.minimum(nearest, support_clearance(T_cloud_hand, scene.support, gripper))
@@ -148,10 +148,8 @@ def approach_sweep_length(request: Collision) -> float:
 
 def inflated_boxes(gripper: Gripper, request: Collision) -> Float64:
     """Boxes (B, 2, 3) of the open hand with the margin around them."""
-    boxes = gripper.boxes(gripper.max_opening)
-    boxes[:, 0] -= request.margin
-    boxes[:, 1] += request.margin
-    return boxes
+    margin = request.margin * np.array([[-1.0], [1.0]])
+    return np.asarray(gripper.open_boxes + margin)
 
 
 def swept_boxes(boxes: Float64, request: Collision) -> Float64:

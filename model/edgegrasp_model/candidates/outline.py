@@ -163,9 +163,7 @@ def _inserted(
         room = np.where(fall > LEVEL, height / np.maximum(fall, LEVEL), room)
     enough = np.flatnonzero(room >= least)
     candidates = candidates.take(enough)
-    boxes = gripper.boxes(gripper.max_opening)
-    boxes[:, 0] -= margin
-    boxes[:, 1] += margin
+    boxes = gripper.open_boxes + margin * np.array([[-1.0], [1.0]])
     way = free_way(points, candidates.T_cloud_hand, boxes, APPROACH_LENGTH) - CLEARANCE
     way = np.minimum(way, room[enough])
     row = np.flatnonzero(way >= least)

@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Array, Bools, Float32, Float64, Floats, Int64
 from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import least_spread
-from edgegrasp_model.options import MAX_CANDIDATES
 
 MAX_EXTENT = 20.0  # metres; where most of a cloud is wider, it is in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
@@ -24,6 +23,7 @@ CUBE = 8  # voxels along the edge of a cube whose points follow one another
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
+ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
 
 
 @dataclass(frozen=True)
@@ -90,17 +90,28 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
         valid, row = valid[near], row[near]
         low, high = valid.min(axis=0), valid.max(axis=0)
     _check_place(len(valid), float(np.maximum(-low, high).max()), num_approach_points)
-    _floats("colors", sent.colors, size, None)
+    _beside("colors", sent.colors, size, row[:0], 3)
     return CheckedCloud(
         np.ascontiguousarray(valid, dtype=np.float32),
         row.astype(np.int64, copy=False),
         size,
-        _floats("normals", sent.normals, size, row),
-        _integers("segment_ids", sent.segment_ids, size, row),
-        _integers("view_ids", sent.view_ids, size, row),
+        _beside("normals", sent.normals, size, row, 3),
+        _beside("segment_ids", sent.segment_ids, size, row),
+        _beside("view_ids", sent.view_ids, size, row),
         size_of_image,
         said,
     )
+
+
+def thinned(count: int, most: int = ENOUGH) -> slice:
+    """Rows, spread evenly, of `most` or a few more of a cloud's points."""
+    return slice(None, None, max(count // most, 1))
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (..., 3) of length 1; those that have none stay short."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, 1e-9))
 
 
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
@@ -116,86 +127,27 @@ def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
     return bool(upward <= MAX_UPWARD * np.linalg.norm(middle))
 
 
-def check_edges(edges: object, rows: int) -> Int64:
-    """Check (M, 2) rows of the cloud as sent.
-
-    Raises:
-        InvalidRequest: Another type or shape, too many, or a row that the cloud does not have.
-    """
-    fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
-    if not isinstance(edges, np.ndarray):
-        raise InvalidRequest("edges", f"a {type(edges).__name__}", fix)
-    if edges.dtype.kind not in "iu" or edges.shape[1:] != (2,):
-        raise InvalidRequest("edges", f"dtype {edges.dtype}, shape {edges.shape}", fix)
-    _check_number("edges", len(edges))
-    low, high = int(edges.min(initial=0)), int(edges.max(initial=0))
-    if low < 0 or high >= rows:
-        value = f"row {low if low < 0 else high} of a cloud of {rows} rows"
-        raise InvalidRequest("edges", value, f"Send rows from 0 to {rows - 1}.")
-    return edges.astype(np.int64)
-
-
-def check_hand_poses(poses: object) -> Float32:
-    """Check (M, 4, 4) poses T_cloud_hand.
-
-    Raises:
-        InvalidRequest: Another type or shape, too many, or one that is no rigid transform.
-    """
-    fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
-    if not isinstance(poses, np.ndarray):
-        raise InvalidRequest("hand_poses", f"a {type(poses).__name__}", fix)
-    if poses.dtype.kind != "f" or poses.shape[1:] != (4, 4):
-        raise InvalidRequest("hand_poses", f"dtype {poses.dtype}, shape {poses.shape}", fix)
-    _check_number("hand_poses", len(poses))
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0).astype(np.float64)
-    off = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    rigid: Bools = finite & (off < 1e-3) & (np.linalg.det(turn) > 0)
-    rigid &= (np.abs(poses[:, 3] - [0, 0, 0, 1]) < 1e-6).all(axis=1)
-    if not rigid.all():
-        fix = "Send 4 x 4 matrices of a rotation and a translation in metres, last row 0 0 0 1."
-        value = f"pose {int(np.argmin(rigid))}, which is no rigid transform"
-        raise InvalidRequest("hand_poses", value, fix)
-    return poses.astype(np.float32)
-
-
-def _check_number(field: str, number: int) -> None:
-    if not 1 <= number <= MAX_CANDIDATES:
-        raise InvalidRequest(field, f"{number} of them", f"Send 1 to {MAX_CANDIDATES}.")
-
-
-def _floats(field: str, array: object | None, size: int, row: Int64 | None) -> Float32 | None:
-    """The given rows of an (N, 3) or (H, W, 3) array beside the cloud; None: only check it."""
+def _beside(
+    field: str, array: object | None, size: int, row: Int64, width: int = 1
+) -> Array | None:
+    """The given rows of an array beside the cloud, of one integer or of three floats a point."""
     if array is None:
         return None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fui":
-        raise InvalidRequest(field, _kind(array), "Send an array of numbers, three for each point.")
-    if array.shape[-1:] != (3,) or array.size != 3 * size:
-        fix = f"Send three numbers for each of the cloud's {size} points."
+    kinds, kind = ("iu", "one integer") if width == 1 else ("fui", "three numbers")
+    fix = f"Send {kind} for each of the cloud's {size} points."
+    if not isinstance(array, np.ndarray):
+        raise InvalidRequest(field, f"a {type(array).__name__}", fix)
+    if array.dtype.kind not in kinds:
+        raise InvalidRequest(field, f"dtype {array.dtype}", fix)
+    if array.size != width * size or (width > 1 and array.shape[-1:] != (width,)):
         raise InvalidRequest(field, f"shape {array.shape}", fix)
-    if row is None:
-        return None
-    values = np.ascontiguousarray(array.reshape(-1, 3)[row], dtype=np.float32)
+    if width == 1:
+        return array.reshape(-1)[row].astype(np.int64)
+    values = np.ascontiguousarray(array.reshape(-1, width)[row], dtype=np.float32)
     if not np.isfinite(values).all():
         bad = int(row[np.argmin(np.isfinite(values).all(axis=1))])
         raise InvalidRequest(field, f"NaN or infinity in row {bad}", "Send finite numbers.")
     return values
-
-
-def _integers(field: str, array: object | None, size: int, row: Int64) -> Int64 | None:
-    """The given rows of an (N,) or (H, W) array beside the cloud."""
-    if array is None:
-        return None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iu":
-        raise InvalidRequest(field, _kind(array), "Send an array of integers, one for each point.")
-    if array.size != size:
-        fix = f"Send one integer for each of the cloud's {size} points."
-        raise InvalidRequest(field, f"shape {array.shape}", fix)
-    return array.reshape(-1)[row].astype(np.int64)
-
-
-def _kind(array: object) -> str:
-    return f"dtype {array.dtype}" if isinstance(array, np.ndarray) else f"a {type(array).__name__}"
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_model.kernels import compiled
+from edgegrasp_model.scene.cloud import WIDEST_VIEW, thinned, unit
 from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
 
-SAMPLE = 6000  # points that decide what part of the view the image covers
-WIDEST = 1.2  # tangent of half of the widest view, 100 degrees
 NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
 COARSE = 40  # cells across the view, which tell how densely points lie
@@ -39,8 +38,8 @@ def range_image(
         down: (3,) downward in the image where `up` does not say; None: as cloud frames usually are.
     """
     downward = [way for way in (None if up is None else -up, down) if way is not None]
-    apart = points[:: max(len(points) // SAMPLE, 1)].astype(np.float64) - viewpoint
-    sight = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+    apart = points[thinned(len(points))].astype(np.float64) - viewpoint
+    sight = unit(apart)
     # Rounded, so that the image does not depend on the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
     for _ in range(2):
@@ -52,7 +51,7 @@ def range_image(
     middle = (low + high) / 2
     image = np.full((height, width, 3), np.nan, dtype=np.float32)
     corner = middle - pixel_size * np.array([width, height]) / 2
-    some = points[:: max(len(points) // (DENSE * width * height), 1)]
+    some = points[thinned(len(points), DENSE * width * height)]
     _render(some, viewpoint, turn, corner, pixel_size, image)
     filled = image.copy()
     _fill_holes(image, filled)
@@ -83,7 +82,9 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
         return np.full(2, -0.1), np.full(2, 0.1)
     low, high = np.percentile(ahead[:, :2] / ahead[:, 2:], (COVERED, 100 - COVERED), axis=0)
     edge = 0.02 * (high - low) + 1e-3
-    return np.maximum(low - edge, -WIDEST).round(9), np.minimum(high + edge, WIDEST).round(9)
+    return np.maximum(low - edge, -WIDEST_VIEW).round(9), np.minimum(
+        high + edge, WIDEST_VIEW
+    ).round(9)
 
 
 def _pixel_size(points: Float64, low: Float64, high: Float64, count: int) -> float:

@@ -18,9 +18,10 @@ from edgegrasp_model.options import (
     Segments,
     Shape,
     Sphere,
+    Workspace,
 )
 from edgegrasp_model.scene.cloud import CheckedCloud, Voxels
-from edgegrasp_model.scene.grouping import FIXED
+from edgegrasp_model.scene.segment import FIXED
 
 HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
 NEAR_POINT = 0.1  # metres from a position to the object that it asks for, at most
@@ -141,6 +142,15 @@ def inside_region(region: Region, points: Float32, voxels: Voxels, cloud: Checke
 
     wanted = in_any(region.include) if region.include else np.ones(len(points), dtype=bool)
     return wanted & ~in_any(region.exclude)
+
+
+def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
+    """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
+    if box is None:
+        return np.ones(len(points), dtype=bool)
+    low, high = np.asarray(box.min) - around, np.asarray(box.max) + around
+    x, y, z = ((axis >= a) & (axis <= b) for axis, a, b in zip(points.T, low, high, strict=True))
+    return np.asarray(x & y & z)
 
 
 def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32) -> Bools:

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import (
     AutoPlane,
     DetectOptions,
-    RansacPlane,
     Region,
     SupportPlane,
     Workspace,
@@ -29,48 +28,44 @@ from edgegrasp_model.scene.cloud import (
     estimate_normals,
     orient_normals,
     statistical_outlier_removal,
+    thinned,
+    unit,
     voxelise,
 )
-from edgegrasp_model.scene.depth_scale import correct_depth_scale
-from edgegrasp_model.scene.grouping import FIXED, UNKNOWN
 from edgegrasp_model.scene.obstacles import SolidBoxes
 from edgegrasp_model.scene.regions import (
     check_regions,
     chosen_objects,
     has_rows,
     inside_region,
+    inside_workspace,
 )
 from edgegrasp_model.scene.segment import (
+    FIXED,
+    UNKNOWN,
     Segmentation,
     segment,
     with_clusters,
     with_risen,
     without_long,
 )
-from edgegrasp_model.scene.support import LIMITS as PLANE_LIMITS
 from edgegrasp_model.scene.support import (
     Seen,
     Support,
-    area,
-    by_surface,
-    fit_plane,
-    measured,
-    near_objects,
+    choose_support,
+    correct_depth_scale,
 )
 
 MIN_POINTS = 4  # fewer make no surface
 MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
 SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-SUPPORT_STREAM = 2  # random stream of one request
 REACH = 0.25  # metres around an object in which a hand at it may meet something
 FOLLOWED_REACH = 0.16  # the same where only grasps that are known are looked at
 PLAN_CELL = 0.05  # metres
-BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 CLOSE = 0.06  # metres within which no camera measures
 UNRECOGNISED = 0.7  # probability of an object that the network did not see
 LIKELY = 0.5  # probability of object or support from which what rises may be an object
-SUPPORT_POINTS = 6000  # that the support plane is fitted to, at least, where there are as many
 
 
 @dataclass(frozen=True)
@@ -121,8 +116,9 @@ def select_points(
     counts["points"] = len(sent.points)
     if isinstance(options.support, SupportPlane) and options.support.max_depth_error > 0.0:
         sent = correct_depth_scale(sent, options.support, viewpoints, warnings)
-    reach = FOLLOWED_REACH if options.follows_only else REACH
-    sent = near_workspace(sent, options.workspace, reach)
+    if options.workspace is not None:
+        reach = FOLLOWED_REACH if options.follows_only else REACH
+        sent = sent.take(inside_workspace(sent.points, options.workspace, reach))
     inside = inside_workspace(sent.points, options.workspace)
     counts["in_workspace"] = int(inside.sum())
     seen = Seen(sent.points, None if viewpoints is None else viewpoints.mean(axis=0))
@@ -136,7 +132,7 @@ def select_points(
     above = np.flatnonzero(height > margin)
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
-    plan = support.plan(sent.points) if support else sent.points[:, :2].astype(np.float64)
+    plan = (support.frame.points(sent.points) if support else sent.points)[:, :2]
     number, confidence = _given_numbers(sent), dict[int, float]()
     if not _objects_given(sent, options):
         if shown is not None:
@@ -173,7 +169,7 @@ def _segmentation(
     if len(sent.points) == 0 or options.support is None or not needed:
         return None
     views = _views(sent, viewpoints, options)
-    return segment(sent.points, views, _known_up(options), _down_in_image(sent, viewpoints))
+    return segment(sent.points, views, options.known_up, _down_in_image(sent, viewpoints))
 
 
 def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
@@ -206,18 +202,10 @@ def _recognised(
     if support is not None:
         likely = (shown.object + shown.support)[above] > LIKELY
         number = with_risen(number, plan, height[above], margin[above], likely)
-        if math.isnan(support.spread):
+        if math.isnan(support.growth):
             number = with_clusters(number, plan)
             confidence |= dict.fromkeys(range(len(confidence), number.max() + 1), UNRECOGNISED)
     return number, confidence
-
-
-def _known_up(options: DetectOptions) -> Float64 | None:
-    """(3,) unit, away from gravity; None where the caller tells neither it nor the support."""
-    known = options.up
-    if known is None and isinstance(options.support, SupportPlane):
-        known = options.support.normal
-    return None if known is None else np.asarray(known) / np.linalg.norm(known)
 
 
 def _views(
@@ -225,7 +213,7 @@ def _views(
 ) -> list[tuple[Float64, Int64 | None]]:
     """The position of each camera and the rows that it saw; without any, one above the points."""
     if viewpoints is None:
-        up = _known_up(options)
+        up = options.known_up
         up = np.array([0.0, 0.0, 1.0]) if up is None else up
         low, high = np.percentile(sent.points, (1, 99), axis=0)
         away = max(1.0, 1.5 * float((high - low).max()))
@@ -243,17 +231,13 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
     """
     if viewpoints is None:
         apart = sent.points - sent.points.mean(axis=0)
-        furthest: Float64 = apart[np.linalg.norm(apart, axis=1).argmax()].astype(np.float64)
-        return furthest / max(float(np.linalg.norm(furthest)), 1e-9)
+        return np.asarray(unit(apart[np.linalg.norm(apart, axis=1).argmax()]), dtype=np.float64)
     if sent.image_size is None or len(viewpoints) > 1:
         return None
-    some = slice(None, None, max(len(sent.row) // 5000, 1))
-    sight = sent.points[some] - viewpoints[0]
-    sight = sight / np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-9)
+    some = thinned(len(sent.row))
     row = sent.row[some] // sent.image_size[1]
-    down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
-    length = float(np.linalg.norm(down))
-    return down / length if length > 0 else None
+    down = (row - row.mean()) @ unit(sent.points[some] - viewpoints[0])
+    return unit(down) if down.any() else None
 
 
 def build_scene(
@@ -366,82 +350,16 @@ def _check_voxels(
     )
 
 
-def choose_support(
-    seen: Seen,
-    inside: Bools,
-    shown: Segmentation | None,
-    objects: Bools,
-    options: DetectOptions,
-    warnings: list[str],
-) -> Support | None:
-    """The support plane: given, or fitted to what the network calls a support near objects."""
-    request = options.support
-    if request is None or len(seen.points) == 0:
-        return None
-    up = _known_up(options)
-    found: Support | None
-    if isinstance(request, SupportPlane):
-        # A bin's floor is not measured by the table around it.
-        around = BELOW_WORKSPACE * np.abs(request.normal)
-        if options.follows_only:
-            around = np.full(3, REACH)  # the workspace is a followed object's
-        over = inside_workspace(seen.points, options.workspace, around)
-        found = measured(Seen(seen.points[over], seen.viewpoint), request)
-    else:
-        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
-        if isinstance(request, RansacPlane):
-            weight = by_surface(seen.points) * inside
-            plane = fit_plane(seen, weight, rng, up, request.max_tilt)
-            found = None if plane is None else measured(seen, plane, request.distance)
-            found = None if found is None or found.share < request.min_share else found
-        else:
-            found = _fitted_support(seen, shown, objects, up, rng)
-        if found is None:
-            warnings.append(
-                "no support plane is seen: objects are returned without one. Send support, or the "
-                "true up, if there is one in view."
-            )
-    if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
-        warnings.append(
-            "the viewpoint lies below the support plane: check viewpoint, up and support."
-        )
-    return found
-
-
-def _fitted_support(
-    seen: Seen,
-    shown: Segmentation | None,
-    objects: Bools,
-    up: Float64 | None,
-    rng: np.random.Generator,
-) -> Support | None:
-    """The plane of the points that the network calls a support, those near objects above all."""
-    assert shown is not None
-    on = np.flatnonzero(shown.support > 0.5)
-    on = on[:: max(len(on) // SUPPORT_POINTS, 1)]
-    part = Seen(seen.points[on], seen.viewpoint)
-    held = seen.points[objects]
-    weight = near_objects(part.points, held)
-    plane = fit_plane(part, weight, rng, shown.up if up is None else up)
-    if plane is not None and len(held) and np.median(plane.heights(held)) < -PLANE_LIMITS.margin[1]:
-        # The top of something larger: they stand on what lies below it.
-        weight[plane.heights(part.points) > -PLANE_LIMITS.margin[1]] = 0.0
-        plane = fit_plane(part, weight, rng, shown.up if up is None else up)
-    if plane is None:
-        return None
-    found = measured(part, plane, PLANE_LIMITS.margin[0])
-    return found if area(found, part.points) > PLANE_LIMITS.least_area else None
-
-
 def _up(options: DetectOptions, support: Support | None, shown: Segmentation | None) -> Float64:
     """Unit vector (3,) away from gravity: as sent, else the support's normal, else the network's.
 
     +z where there is none of them, or no camera.
     """
-    up = np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
+    if options.up is not None:
+        return unit(np.asarray(options.up))
     if support is not None:
-        up = support.normal
-    return up if options.up is None else np.asarray(options.up) / np.linalg.norm(options.up)
+        return support.normal
+    return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
 
 
 def _given_numbers(sent: CheckedCloud) -> Int64:
@@ -513,20 +431,6 @@ def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | No
     return viewpoints
 
 
-def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
-    """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
-    if box is None:
-        return np.ones(len(points), dtype=bool)
-    low, high = np.asarray(box.min) - around, np.asarray(box.max) + around
-    x, y, z = ((axis >= a) & (axis <= b) for axis, a, b in zip(points.T, low, high, strict=True))
-    return np.asarray(x & y & z)
-
-
-def near_workspace(sent: CheckedCloud, box: Workspace | None, around: float) -> CheckedCloud:
-    """The part of a cloud that a hand in the workspace could meet."""
-    return sent if box is None else sent.take(inside_workspace(sent.points, box, around))
-
-
 def _turned_normals(
     sent: CheckedCloud,
     points: Float32,
@@ -545,15 +449,10 @@ def _turned_normals(
     normals = orient_normals(points, normals, seen_from)
     if sent.normals is None:
         return normals
-    given = frame.directions(voxels.mean(_unit(sent.normals))[kept])
+    given = frame.directions(voxels.mean(unit(sent.normals))[kept])
     length = np.linalg.norm(given, axis=1, keepdims=True)
     given = given / np.maximum(length, MIN_NORMAL)
     return np.where(length >= MIN_NORMAL, given, normals).astype(np.float32)
-
-
-def _unit(vectors: Float32) -> Float32:
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
 
 def plane_in_frame(plane: SupportPlane, frame: CanonicalFrame) -> SupportPlane:

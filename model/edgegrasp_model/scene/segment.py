@@ -12,25 +12,31 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.scene.grouping import (
-    FIXED,
-    UNKNOWN,
-    Pixels,
-    group,
-    instance_traits,
-    joined,
-)
+from edgegrasp_model.scene.cloud import thinned, unit
 from edgegrasp_model.scene.network import SceneNet, scene_features
 from edgegrasp_model.scene.range_image import NEAREST, range_image
 
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 
+# In place of an object's number: background; what may belong to an object.
+FIXED, UNKNOWN = -1, -2
+
+# When pixels show the same object.
+APART = 0.035  # metres of depth between neighbours; and between the mean votes of its parts
+SMALLEST = 20  # pixels of an object, in the network's output
+SMALLEST_AREA = 5e-4  # square metres of it, as seen
+SMOOTH = 0.97  # cosine between normals of neighbours on one smooth surface
+STEP = 3.0  # pixels between neighbours on one smooth surface
+VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
+VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
 BESIDE = 0.012  # metres from an object to points that the network missed and that belong to it
 STANDS_OUT = 0.004  # metres that these rise at least over what belongs to the support
 FEWEST_CELLS, FEWEST_EACH = 5, 4  # of a cluster of such points, as wide as BESIDE; points in each
@@ -46,6 +52,17 @@ class Segmentation(NamedTuple):
     support: Float32  # (N,) probability of a support
     confidence: Float64  # (O,) probability of each number to be an object
     up: Float64  # (3,) unit, away from gravity, as the network sees it; cloud frame
+
+
+class Pixels(NamedTuple):
+    """What the network says of the pixels of its output, and what they show; camera frame."""
+
+    points: Float32  # (H, W, 3) metres; NaN where nothing was seen
+    normals: Float32  # (H, W, 3) unit; 0 where unknown
+    classes: Float32  # (3, H, W) probabilities
+    votes: Float32  # (H, W, 3) metres from each point to the centre of its object
+    links: Float32  # (2, H, W) probability of showing the same object as the right, lower pixel
+    footprint: float  # metres, width of a pixel at a depth of one metre
 
 
 class Recogniser(NamedTuple):
@@ -98,7 +115,7 @@ def segment(
     best = np.zeros(int(merged.max(initial=-1)) + 1)
     np.maximum.at(best, merged, confidence)
     number = np.where(number >= 0, merged[np.maximum(number, 0)], number) if len(merged) else number
-    return Segmentation(number, objects, support, best, _unit(seen_up))
+    return Segmentation(number, objects, support, best, unit(seen_up))
 
 
 def _segment_view(
@@ -143,11 +160,7 @@ def look(
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
     if not seen_up.any():  # nothing was seen: toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
-    return Pixels(seen, normals, classes, votes, links, 2 * footprint), _unit(seen_up)
-
-
-def _unit(vector: Float64) -> Float64:
-    return vector / max(float(np.linalg.norm(vector)), 1e-9)
+    return Pixels(seen, normals, classes, votes, links, 2 * footprint), unit(seen_up)
 
 
 @contextmanager
@@ -159,6 +172,137 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+def group(pixels: Pixels) -> Int64:
+    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN in doubt."""
+    points, _, classes, votes, links, footprint = pixels
+    seen = ~np.isnan(points[..., 2])
+    held = seen & (classes.argmax(axis=0) == 2)
+    number = np.where(held, UNKNOWN, FIXED)
+    if not held.any():
+        return number
+    centre = points + votes
+    index, pairs, strength = np.arange(held.size).reshape(held.shape), [], []
+    right, lower = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])  # neighbours
+    for link, (first, second) in zip(links, (right, lower), strict=True):
+        near = np.abs(points[first][..., 2] - points[second][..., 2]) < APART
+        joined = held[first] & held[second] & (link[first] > 0.5) & near
+        pairs.append(np.stack([index[first][joined], index[second][joined]], axis=1))
+        strength.append(link[first][joined])
+    order = np.argsort(-np.concatenate(strength), kind="stable")
+    component = np.arange(held.size)
+    flat = np.nan_to_num(centre.reshape(-1, 3)).astype(np.float64)
+    _join(np.concatenate(pairs)[order], component, flat.copy(), SMALLEST, APART)
+    rows = np.flatnonzero(held)
+    _, part, count = np.unique(component[rows], return_inverse=True, return_counts=True)
+    flat = flat[rows]
+    mean = np.stack([np.bincount(part, flat[:, d]) for d in range(3)], axis=1) / count[:, None]
+    area = np.bincount(part, (points[..., 2].reshape(-1)[rows] * footprint) ** 2)
+    large = np.flatnonzero((count >= SMALLEST) & (area >= SMALLEST_AREA))
+    if len(large) == 0:
+        return number
+    # Parts that something in front separates vote for one centre.
+    apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
+    _, merged = connected_components(apart < APART, directed=False)
+    of_part = np.full(len(count), UNKNOWN)
+    of_part[large] = merged
+    number.reshape(-1)[rows] = of_part[part]
+    return number
+
+
+@compiled()
+def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: float) -> None:
+    """Join pairs (P, 2) of pixels in order, but not two large parts with different centres.
+
+    One weak link then does not join two objects (Kruskal's algorithm, with that exception).
+
+    Args:
+        pairs: Those that most probably show one object first.
+        component: (N,) each pixel; becomes the part that it belongs to.
+        centre: (N, 3) metres, what each pixel votes for; overwritten by sums.
+        large: Pixels of a large part.
+        apart: Metres between centres.
+    """
+    count = np.ones(len(component), dtype=np.int64)
+    for p in range(len(pairs)):
+        a, b = pairs[p, 0], pairs[p, 1]
+        while component[a] != a:
+            component[a] = component[component[a]]
+            a = component[a]
+        while component[b] != b:
+            component[b] = component[component[b]]
+            b = component[b]
+        if a == b:
+            continue
+        if count[a] >= large and count[b] >= large:
+            away = 0.0
+            for d in range(3):
+                away += (centre[a, d] / count[a] - centre[b, d] / count[b]) ** 2
+            if away > apart * apart:
+                continue
+        if count[a] < count[b]:
+            a, b = b, a
+        component[b] = a
+        count[a] += count[b]
+        for d in range(3):
+            centre[a, d] += centre[b, d]
+    for n in range(len(component)):
+        root = n
+        while component[root] != root:
+            root = component[root]
+        component[n] = root
+
+
+def instance_traits(number: Int64, pixels: Pixels) -> Float64:
+    """What tells objects from patches of background that the network calls one.
+
+    Args:
+        number: (H, W) as from `group`, of O objects.
+        pixels: The same.
+
+    Returns:
+        (O, 3) 1, the mean probability of an object, and the share of the border on which the
+        surface runs on smoothly into what is no object.
+    """
+    points, normals, classes, _, _, footprint = pixels
+    count = int(number.max(initial=-1)) + 1
+    held = number >= 0
+    size = np.bincount(number[held], minlength=count)
+    mean = np.bincount(number[held], classes[2][held], minlength=count) / np.maximum(size, 1)
+    border, smooth = np.zeros((2, count))
+    near = STEP * footprint * np.nan_to_num(points[..., 2])
+    for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
+        step = np.linalg.norm(points[a] - points[b], axis=-1) < near[a]  # false for NaN
+        along = (normals[a] * normals[b]).sum(axis=-1) > SMOOTH
+        for inside, outside in ((a, b), (b, a)):
+            edge = (number[inside] >= 0) & (number[outside] != number[inside])
+            edge &= ~np.isnan(points[outside][..., 2])
+            border += np.bincount(number[inside][edge], minlength=count)
+            runs_on = edge & step & along & (number[outside] < 0)
+            smooth += np.bincount(number[inside][runs_on], minlength=count)
+    share = smooth / np.maximum(border, 1)
+    return np.stack([np.ones(count), mean, share], axis=1)
+
+
+def joined(points: Float32, number: Int64, count: int) -> Int64:
+    """The new number (O,) of each of the numbers (N,): objects in the same place become one."""
+    held = np.flatnonzero(number >= 0)
+    if len(held) == 0:
+        return np.arange(count)
+    cell = np.floor(points[held] / VIEW_CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    size = cell.max(axis=0) + 1
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    _, key = np.unique(key, return_inverse=True)
+    shape = count, int(key.max()) + 1
+    lies = coo_array((np.ones(len(held), dtype=np.int32), (number[held], key)), shape).tocsr()
+    lies.data[:] = 1
+    shared = (lies @ lies.T).toarray()
+    cells = np.diag(shared)
+    same = shared >= VIEW_SHARE * np.maximum(np.minimum.outer(cells, cells), 1)
+    same &= shared > 0
+    return np.asarray(connected_components(same, directed=False)[1])
 
 
 def with_risen(
@@ -179,7 +323,7 @@ def with_risen(
     held = np.flatnonzero((number >= 0) & (height > margin))
     if len(rows) == 0 or len(held) == 0:
         return number
-    held = held[:: max(len(held) // 20_000, 1)]
+    held = held[thinned(len(held))]
     places = np.column_stack([plan, height])
     apart, nearest = cKDTree(places[held]).query(places[rows], distance_upper_bound=BESIDE)
     near, number = np.isfinite(apart), number.copy()
@@ -224,7 +368,7 @@ def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
     starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     number = number.copy()
     for rows in np.split(order, starts[1:]):
-        some = points[rows[:: max(len(rows) // 400, 1)]].astype(np.float64)
+        some = points[rows[thinned(len(rows), 500)]].astype(np.float64)
         around = some - some.mean(axis=0)
         _, axes = np.linalg.eigh(around.T @ around)
         low, high = np.percentile(around @ axes, (1, 99), axis=0)

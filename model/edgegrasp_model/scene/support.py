@@ -1,41 +1,39 @@
-"""The support plane: given, or fitted to the points that the `scene` network calls a support."""
+"""The support plane: given, the largest one seen, or fitted to what the network calls support."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from edgegrasp_camera.arrays import Float32, Float64, Floats
-from edgegrasp_model.kernels import heights_and_distances
-from edgegrasp_model.options import SupportPlane
+from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats
+from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.kernels import compiled
+from edgegrasp_model.options import DetectOptions, RansacPlane, SupportPlane
+from edgegrasp_model.scene.cloud import MAX_DISTANCE, CanonicalFrame, CheckedCloud, thinned
+from edgegrasp_model.scene.regions import inside_workspace
+from edgegrasp_model.scene.segment import Segmentation
 
-
-@dataclass(frozen=True)
-class PlaneLimits:
-    """What belongs to a support plane; metres unless stated."""
-
-    thickness: tuple[float, float] = (0.004, 0.006)  # and per squared metre of distance
-    thickest: float = 0.03  # however far the plane is away
-    margin: tuple[float, float] = (0.004, 0.02)  # least and greatest height that belongs to it
-    given_margin: float = 0.005  # of a plane that is given and not seen
-    deviations: float = 4.0  # of its own points that still belong to it
-    bow: float = 0.025  # by which a support may rise over its plane
-    tilt: float = math.radians(30)  # radians between the plane and a given `up`
-    near_objects: float = 0.15  # around an object where the support counts in full
-    far_weight: float = 0.1  # of support points elsewhere
-    fewest: int = 60  # points that a plane is fitted to, and by which its residual is measured
-    cell: float = 0.02  # in which surfaces are counted
-    least_area: float = 0.008  # square metres of it that are seen
-    usual_distance: float = 0.7  # to a camera that is not known
-
-
-LIMITS = PlaneLimits()
+THICK, GROWTH = 0.004, 0.006  # metres from a plane, and per squared metre of distance
+MOST_MARGIN = 0.02  # metres over it that belong to it at most; THICK do at least
+GIVEN_MARGIN = 0.005  # metres over a plane that is given
+DEVIATIONS = 4.0  # of its own points that still belong to it
+BOW = 0.025  # metres by which a support may rise over its plane
+TILT = math.radians(30)  # between the plane and a given `up`
+NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
+FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
+CELL = 0.02  # metres, in which surfaces are counted
+USUAL_DISTANCE = 0.7  # metres to a camera that is not known
+BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 TRIES, SAMPLE = 150, 1200  # planes that are tried, points that judge them
 REFINEMENTS = 4  # least squares over the plane's points
-MEASURED = 6000  # points that say how well a plane agrees with what is seen
 STIFF = 1e-6 * np.eye(6)  # keeps a support flat where too little of it is seen
+SUPPORT_STREAM = 2  # random stream of one request
+# Of depths that a known plane corrects:
+NEAR = 0.01  # metres from the plane within which points belong to it
+FLAT = 0.35  # of NEAR: largest median distance of a plane's points (a wall's is 0.5)
+MIN_SHARE = 0.1  # of the points that the plane must hold
 
 
 @dataclass(frozen=True)
@@ -43,22 +41,18 @@ class Support:
     """A support plane, and how well what is seen agrees with it; the cloud's frame."""
 
     plane: SupportPlane
-    residual: float  # metres, median distance of its points; NaN where it is not seen
-    share: float  # of the points that lie in it
-    spread: float  # standard deviation of its points at `distance`, metres; NaN: not seen
-    distance: float  # metres from the camera to its points, the median
+    frame: CanonicalFrame  # its z is the height over the plane
     least: float  # metres over it that belong to it anyway
-    bow: Float64  # (6,) rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2
-    axes: Float64  # (4, 3) x and y along the plane, its normal, and an origin on it; cloud frame
+    residual: float = math.nan  # metres, median distance of its points; NaN where it is not seen
+    share: float = 0.0  # of the points that lie in it
+    growth: float = math.nan  # noise of its points, metres per squared metre of distance
+    # Rise over the plane at (x, y): of 1, x, y, x^2, x y, y^2.
+    bow: Float64 = field(default_factory=lambda: np.zeros(6))
 
     @property
     def normal(self) -> Float64:
         """(3,) unit."""
-        return np.asarray(self.axes[2])
-
-    def plan(self, points: Floats) -> Float64:
-        """Places (N, 2) along the plane of points (N, 3), metres."""
-        return np.asarray((points - self.axes[3]) @ self.axes[:2].T)
+        return np.asarray(self.frame.T_canonical_cloud[2, :3])
 
     def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
         """How high points stand over the support, which may be bowed, and what belongs to it.
@@ -71,16 +65,15 @@ class Support:
         Returns:
             The height (N,) of each, and the height (N,) up to which it belongs to the support.
         """
-        eye = seen.viewpoint
-        height, squared = heights_and_distances(
-            seen.points, self.axes, self.bow, LIMITS.bow, self.axes[3] if eye is None else eye
-        )
-        if math.isnan(self.spread):
+        height, squared = np.empty((2, len(seen.points)), dtype=np.float32)
+        eye = np.zeros(3) if seen.viewpoint is None else seen.viewpoint
+        _heights(seen.points, self.frame.T_canonical_cloud, self.bow, eye, height, squared)
+        if math.isnan(self.growth):
             return height, np.full_like(height, self.least)
-        if eye is None:
-            squared = np.full(len(squared), LIMITS.usual_distance**2, dtype=np.float32)
-        grown = np.float32(LIMITS.deviations * self.spread / self.distance**2) * squared
-        return height, np.clip(grown, self.least, max(LIMITS.margin[1], self.least))
+        if seen.viewpoint is None:
+            squared[:] = USUAL_DISTANCE**2
+        squared *= np.float32(DEVIATIONS * self.growth)
+        return height, np.clip(squared, self.least, max(MOST_MARGIN, self.least), out=squared)
 
 
 class Seen(NamedTuple):
@@ -92,14 +85,95 @@ class Seen(NamedTuple):
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
         if self.viewpoint is None:
-            return np.full(len(self.points), LIMITS.usual_distance)
+            return np.full(len(self.points), USUAL_DISTANCE)
         apart = self.points - self.viewpoint
         return np.asarray(np.sqrt(np.einsum("nd,nd->n", apart, apart)))
 
     def thickness(self) -> Float64:
         """Metres (N,) from a plane within which points may belong to it."""
-        thick = LIMITS.thickness[0] + LIMITS.thickness[1] * np.square(self.distance())
-        return np.minimum(thick, LIMITS.thickest)
+        return THICK + GROWTH * np.square(self.distance())
+
+
+def choose_support(
+    seen: Seen,
+    inside: Bools,
+    shown: Segmentation | None,
+    objects: Bools,
+    options: DetectOptions,
+    warnings: list[str],
+) -> Support | None:
+    """The support plane of a request.
+
+    Args:
+        seen: N points.
+        inside: (N,) which of them lie in the workspace.
+        shown: What the network says of them, where it was asked.
+        objects: (N,) which of them are of an object.
+        options: support, up, workspace and seed.
+        warnings: Gets what is wrong with it, or that there is none.
+    """
+    request = options.support
+    if request is None or len(seen.points) == 0:
+        return None
+    up = options.known_up
+    found: Support | None
+    if isinstance(request, SupportPlane):
+        # A bin's floor is not measured by the table around it; a followed object's workspace is
+        # no bin.
+        around = np.inf if options.follows_only else BELOW_WORKSPACE * np.abs(request.normal)
+        over = inside_workspace(seen.points, options.workspace, around)
+        found = measured(Seen(seen.points[over], seen.viewpoint), request, GIVEN_MARGIN)
+    else:
+        rng = np.random.default_rng([options.seed, SUPPORT_STREAM])
+        if isinstance(request, RansacPlane):
+            weight = by_surface(seen.points) * inside
+            plane = fit_plane(seen, weight, rng, up, request.max_tilt)
+            found = None if plane is None else measured(seen, plane, request.distance)
+            found = None if found is None or found.share < request.min_share else found
+        else:
+            assert shown is not None
+            found = _fitted(seen, shown, objects, up, rng)
+        if found is None:
+            warnings.append(
+                "no support plane is seen: objects are returned without one. Send support, or the "
+                "true up, if there is one in view."
+            )
+    if found is not None and seen.viewpoint is not None and found.plane.heights(seen.viewpoint) < 0:
+        warnings.append(
+            "the viewpoint lies below the support plane: check viewpoint, up and support."
+        )
+    return found
+
+
+def _fitted(
+    seen: Seen, shown: Segmentation, objects: Bools, up: Float64 | None, rng: np.random.Generator
+) -> Support | None:
+    """The plane of the points that the network calls a support, those near objects above all."""
+    on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
+    part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
+    around = seen.points[held[thinned(len(held), 500)]]
+    weight, up = near_objects(part.points, around), shown.up if up is None else up
+    plane = fit_plane(part, weight, rng, up)
+    if plane is not None and len(held) and np.median(plane.heights(around)) < -MOST_MARGIN:
+        # The top of something larger: they stand on what lies below it.
+        weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
+        plane = fit_plane(part, weight, rng, up)
+    return None if plane is None else measured(part, plane, THICK)
+
+
+def near_objects(points: Float32, objects: Float32) -> Float64:
+    """What each point (N, 3) of a support counts: in full near an object (M, 3), else a little."""
+    if len(objects) == 0:
+        return np.ones(len(points))
+    apart, _ = cKDTree(objects).query(points, distance_upper_bound=NEAR_OBJECTS)
+    return np.where(np.isfinite(apart), 1.0, FAR_WEIGHT)
+
+
+def by_surface(points: Float32) -> Float64:
+    """What each point (N, 3) counts so that equal areas count alike."""
+    cell = np.floor(points / CELL).astype(np.int64)
+    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / count[which.reshape(-1)])
 
 
 def fit_plane(
@@ -107,7 +181,7 @@ def fit_plane(
     weight: Floats,
     rng: np.random.Generator,
     up: Float64 | None = None,
-    max_tilt: float = LIMITS.tilt,
+    max_tilt: float = TILT,
 ) -> SupportPlane | None:
     """The plane that holds the most of weighted points, facing the camera (RANSAC).
 
@@ -122,7 +196,7 @@ def fit_plane(
         The plane; None where there are too few points, or none of it is level enough.
     """
     held = np.flatnonzero(weight > 0)
-    if len(held) < LIMITS.fewest:
+    if len(held) < FEWEST:
         return None
     chosen = rng.choice(
         held, min(SAMPLE, len(held)), replace=False, p=weight[held] / weight[held].sum()
@@ -147,7 +221,7 @@ def fit_plane(
     normal, offset = normals[best], float(normals[best] @ origin[best])
     for within in (1.0, 0.7, 0.5):
         near = np.abs(points @ normal - offset) < within * thick
-        if near.sum() < LIMITS.fewest // 2:
+        if near.sum() < FEWEST // 2:
             break
         middle = points[near].mean(axis=0)
         _, vectors = np.linalg.eigh(np.cov((points[near] - middle).T))  # ascending
@@ -159,29 +233,6 @@ def fit_plane(
     return SupportPlane(normal=(x, y, z), offset=offset)
 
 
-def near_objects(points: Float32, objects: Float32) -> Float64:
-    """What each point (N, 3) of a support counts: in full near an object (M, 3), else a little."""
-    if len(objects) == 0:
-        return np.ones(len(points))
-    around = cKDTree(objects[:: max(len(objects) // 500, 1)])
-    apart, _ = around.query(points, distance_upper_bound=LIMITS.near_objects)
-    return np.where(np.isfinite(apart), 1.0, LIMITS.far_weight)
-
-
-def by_surface(points: Float32) -> Float64:
-    """What each point (N, 3) counts so that equal areas count alike."""
-    cell = np.floor(points / LIMITS.cell).astype(np.int64)
-    _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(1.0 / count[which.reshape(-1)])
-
-
-def area(support: Support, points: Float32) -> float:
-    """Square metres of the support that points (N, 3) cover."""
-    near = np.abs(support.plane.heights(points)) < LIMITS.margin[1]
-    cell = np.floor(support.plan(points[near]) / LIMITS.cell).astype(np.int64)
-    return len(np.unique(cell, axis=0)) * LIMITS.cell**2
-
-
 def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
     """Directions (T, 3) to which normals point: the camera, else up, else +z."""
     if seen.viewpoint is not None:
@@ -189,7 +240,7 @@ def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
     return np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
 
 
-def measured(seen: Seen, plane: SupportPlane, least: float = LIMITS.given_margin) -> Support:
+def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
     """A plane, and how well the points agree with it where it is seen.
 
     Args:
@@ -197,48 +248,120 @@ def measured(seen: Seen, plane: SupportPlane, least: float = LIMITS.given_margin
         plane: Of the cloud's frame.
         least: Metres over it that belong to it anyway.
     """
-    each = max(len(seen.points) // MEASURED, 1)
-    sample = Seen(seen.points[::each], seen.viewpoint)
-    points, distance = sample.points.astype(np.float64), sample.distance()
-    thick = sample.thickness()
-    normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
-    origin = points.mean(axis=0) if len(points) else np.zeros(3)
-    height: Float64 = plane.heights(points).astype(np.float64)
-    origin -= float(plane.heights(origin)) * normal
-    axes = np.stack([*plan_axes(normal, seen.viewpoint, points), normal, origin])
+    sample = Seen(seen.points[thinned(len(seen.points))], seen.viewpoint)
+    frame = CanonicalFrame.of_scene(sample.points, plane.normal, seen.viewpoint)
+    frame.T_canonical_cloud[2, 3] = -plane.offset / np.linalg.norm(plane.normal)
+    x, y, height = frame.points(sample.points).T
+    thick, distance = sample.thickness(), sample.distance()
     near = np.abs(height) < thick
     # Where the cloud was cut off above the plane, only what stands on it is near.
-    if near.sum() < LIMITS.fewest or (height[near] < 1e-4).mean() < 0.2:
-        unknown, flat = math.nan, np.zeros(6)
-        return Support(plane, unknown, 0.0, unknown, LIMITS.usual_distance, least, flat, axes)
-    terms = _squares((points - origin) @ axes[:2].T)
-    bow: Float64 = np.zeros(6)
+    if near.sum() < FEWEST or (height[near] < 1e-4).mean() < 0.2:
+        return Support(plane, frame, least)
+    terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
     for _ in range(REFINEMENTS):
         near = np.abs(height - bow @ terms) < thick
         held = near * terms
         bow = np.asarray(np.linalg.solve(held @ terms.T + STIFF, held @ height))
-    off, apart = np.abs(height - bow @ terms)[near], distance[near]
-    middle = float(np.median(apart))
-    spread = 1.4826 * float(np.median(off / np.square(apart / middle)))
-    share = float(near.mean())
-    return Support(plane, float(np.median(off)), share, spread, middle, least, bow, axes)
+    off = np.abs(height - bow @ terms)[near]
+    growth = 1.4826 * float(np.median(off / np.square(distance[near])))
+    return Support(plane, frame, least, float(np.median(off)), float(near.mean()), growth, bow)
 
 
-def plan_axes(normal: Float64, viewpoint: Float64 | None, points: Floats) -> Float64:
-    """Two unit axes (2, 3) along a plane, the first toward the camera, else the furthest point."""
-    middle = (
-        np.array([axis.mean(dtype=np.float64) for axis in points.T]) if len(points) else np.zeros(3)
-    )
-    offsets = points[:: max(len(points) // 1000, 1)] - middle
-    offsets = np.concatenate([np.eye(3) if viewpoint is None else [viewpoint - middle], offsets])
-    level = offsets - (offsets @ normal)[:, None] * normal
-    length = np.linalg.norm(level, axis=1)
-    first = 0 if viewpoint is not None and length[0] > 1e-3 else int(length.argmax())
-    x = level[first] / max(length[first], 1e-9)
-    return np.stack([x, np.cross(normal, x)])
+@compiled("contract")
+def _heights(
+    points: Float32,
+    T_plane_cloud: Float64,
+    bow: Float64,
+    eye: Float64,
+    height: Float32,
+    squared: Float32,
+) -> None:
+    """Fill in heights (N,) over a bowed plane, and squared distances (N,) from the camera."""
+    T = T_plane_cloud
+    for i in range(len(points)):
+        a, b, c = points[i, 0], points[i, 1], points[i, 2]
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        rise = bow[0] + bow[1] * x + bow[2] * y + bow[3] * x * x + bow[4] * x * y + bow[5] * y * y
+        rise = min(max(rise, -BOW), BOW)
+        height[i] = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3] - rise
+        squared[i] = (a - eye[0]) ** 2 + (b - eye[1]) ** 2 + (c - eye[2]) ** 2
 
 
-def _squares(plan: Float64) -> Float64:
-    """1, x, y, x^2, x y, y^2 (6, N) of points (N, 2)."""
-    x, y = plan.T
-    return np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
+def correct_depth_scale(
+    sent: CheckedCloud, plane: SupportPlane, viewpoints: Float64 | None, warnings: list[str]
+) -> CheckedCloud:
+    """Scale every view about its camera so that the support plane it sees lies where it should.
+
+    Args:
+        sent: N points, in which the plane is seen.
+        plane: Where the support is, and how wrong depths may be (max_depth_error).
+        viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
+        warnings: Gets what was done, or why nothing was.
+
+    Raises:
+        InvalidRequest: There is no viewpoint to scale about.
+    """
+    if viewpoints is None:
+        fix = "Send the camera's position: depths are corrected along its rays."
+        raise InvalidRequest("options.viewpoint", "nothing", fix)
+    several = len(viewpoints) > 1 and sent.view_ids is not None
+    points = sent.points.copy()
+    for number, viewpoint in enumerate(viewpoints):
+        rows = np.flatnonzero(sent.view_ids == number) if several else slice(None)
+        which = f"the depths of view {number}" if several else "the depths"
+        scale = depth_scale(points[rows], viewpoint, plane)
+        if scale is None:
+            warnings.append(
+                f"{which} are taken as they are: no support plane is seen within "
+                f"options.support.max_depth_error ({plane.max_depth_error:g}) of its place."
+            )
+        elif round(scale, 3) != 1.0:
+            warnings.append(f"{which} were multiplied by {scale:.3f}, as the support plane shows.")
+            points[rows] = viewpoint + scale * (points[rows] - viewpoint)
+    return replace(sent, points=points)
+
+
+def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> float | None:
+    """The factor on all depths of a view that brings its points of the plane into the plane.
+
+    Where several factors fit (the table, or the flat top of an object), the smallest counts:
+    nothing is seen below the table.
+
+    Args:
+        points: (N, 3) metres.
+        viewpoint: (3,) metres.
+        plane: With the greatest depth error that is looked for.
+
+    Returns:
+        The factor; None where the camera is not above the plane, or too high, or sees too little.
+    """
+    height = float(plane.heights(viewpoint))
+    falls = height - plane.heights(points.astype(np.float64))
+    if not NEAR < height < MAX_DISTANCE:
+        return None
+    # A point lies in the plane once it is as far below the camera as the plane is.
+    factors = np.sort(height / falls[falls > 0.5 * height])
+    reach = NEAR / height
+    tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error, reach / 10)
+    held = np.searchsorted(factors, tried + reach) - np.searchsorted(factors, tried - reach)
+    enough = max(MIN_SHARE * len(points), FEWEST)
+    start, width = 0, 21  # tries from a plane's rise to past its peak
+    while start < len(tried):
+        window = held[start : start + width]
+        if window.max() >= enough:
+            scale = _middle(factors, float(tried[start + int(window.argmax())]), reach)
+            if scale is not None:
+                return scale
+            start += width - 1
+        start += 1
+    return None
+
+
+def _middle(factors: Float64, scale: float, reach: float) -> float | None:
+    """The median of the factors around one; None where they are too spread for a plane."""
+    for _ in range(20):
+        within = factors[np.abs(factors - scale) <= reach]
+        scale = float(np.median(within))
+    spread = float(np.median(np.abs(within - scale)))
+    return scale if spread <= FLAT * reach else None
