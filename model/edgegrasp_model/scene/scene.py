@@ -234,7 +234,7 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
         return np.asarray(unit(apart[np.linalg.norm(apart, axis=1).argmax()]), dtype=np.float64)
     if sent.image_size is None or len(viewpoints) > 1:
         return None
-    some = thinned(len(sent.row))
+    some = thinned(len(sent.row), 5000)
     row = sent.row[some] // sent.image_size[1]
     down = (row - row.mean()) @ unit(sent.points[some] - viewpoints[0])
     return unit(down) if down.any() else None
