@@ -1,7 +1,7 @@
 """From the array a caller sends to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,9 @@ WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
 MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
 ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
+
+
+Vectors = TypeVar("Vectors", bound=Floats)
 
 
 @dataclass(frozen=True)
@@ -108,10 +111,10 @@ def thinned(count: int, most: int = ENOUGH) -> slice:
     return slice(None, None, max(count // most, 1))
 
 
-def unit(vectors: Floats) -> Floats:
+def unit(vectors: Vectors) -> Vectors:
     """Vectors (..., 3) of length 1; those that have none stay short."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-9))
+    return cast("Vectors", vectors / np.maximum(length, 1e-9))
 
 
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:

@@ -236,7 +236,8 @@ def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | 
         return None
     some = thinned(len(sent.row), 5000)
     row = sent.row[some] // sent.image_size[1]
-    down = (row - row.mean()) @ unit(sent.points[some] - viewpoints[0])
+    sight = unit(sent.points[some] - viewpoints[0])
+    down = np.asarray((row - row.mean()) @ sight, dtype=np.float64)
     return unit(down) if down.any() else None
 
 
@@ -356,7 +357,7 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
     +z where there is none of them, or no camera.
     """
     if options.up is not None:
-        return unit(np.asarray(options.up))
+        return unit(np.asarray(options.up, dtype=np.float64))
     if support is not None:
         return support.normal
     return np.array([0.0, 0.0, 1.0]) if shown is None else shown.up
