@@ -132,7 +132,8 @@ def select_points(
     above = np.flatnonzero(height > margin)
     sent, inside = sent.take(above), inside[above]
     counts["above_support"] = int(inside.sum())
-    plan = (support.frame.points(sent.points) if support else sent.points)[:, :2]
+    on_plan = support.frame.points(sent.points) if support else sent.points.astype(np.float64)
+    plan = on_plan[:, :2]
     number, confidence = _given_numbers(sent), dict[int, float]()
     if not _objects_given(sent, options):
         if shown is not None:
