@@ -116,7 +116,7 @@ def test_a_teacher_labels_objects_in_views_without_tried_grasps(tmp_path: Path) 
     view = load_view(path)
     assert len(view.tried()) == 0
     assert len(view.points) > 100
-    teacher = Teacher(WEIGHTS_FOLDER / "edgegrasp-plus.safetensors", 0.04, tmp_path / "taught")
+    teacher = Teacher(WEIGHTS_FOLDER / "edgegrasp-plus.safetensors", 0.04)
     labels = teacher.soft_labels(path)
     assert len(labels.chance) > 0
     assert (view.object_of_point[labels.approach_index] >= 0).all()
