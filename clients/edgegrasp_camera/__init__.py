@@ -1,8 +1,8 @@
-"""What a depth camera gives: depth images, PointCloud2, files of clouds, and poses; numpy alone."""
+"""Data of depth cameras: depth images, PointCloud2, cloud files and poses; needs only numpy."""
 
 
 class EdgeGraspError(Exception):
-    """Base of every error that the project raises on purpose, but for the client's."""
+    """Base of every error that the project raises on purpose, except the client's."""
 
 
 class InvalidRequest(EdgeGraspError):  # noqa: N818
@@ -10,7 +10,7 @@ class InvalidRequest(EdgeGraspError):  # noqa: N818
 
     Args:
         field: Name of the request field, as it is spelled on the wire (`cloud`, `options.seed`).
-        value: What was received, short enough to print.
+        value: What was received, shortened for printing.
         fix: What to send instead, as an imperative sentence.
     """
 
@@ -26,4 +26,4 @@ class PayloadTooLarge(InvalidRequest):
 
 
 class UnsupportedMediaType(InvalidRequest):
-    """Data is in a format that there is no reader for."""
+    """The data's format is not supported."""

@@ -1,4 +1,4 @@
-"""Clouds as arrays: of records whose fields are named, and of sensor_msgs/PointCloud2."""
+"""Clouds as arrays, from records with named fields and from sensor_msgs/PointCloud2."""
 
 import sys
 from collections.abc import Sequence
@@ -16,17 +16,17 @@ Records = NDArray[np.void]
 
 @dataclass(frozen=True)
 class CloudInput:
-    """A cloud as a caller sends it; rows are counted row-major where it is organised.
+    """A cloud as the caller sends it; rows of an organised cloud are counted row-major.
 
     Per-point arrays have one entry for each point, in the shape of the cloud or flat.
     """
 
     points: object  # (N, 3), or (H, W, 3) with NaN where there is no point; float32/64, metres
-    normals: object | None = None  # like points, outward, any length; used as they are
-    colors: object | None = None  # like points; checked, and not used by any network so far
+    normals: object | None = None  # like points, outward, any length; used as given
+    colors: object | None = None  # like points; checked, but not used by any network
     segment_ids: object | None = None  # (N,) or (H, W) integers
     view_ids: object | None = None  # (N,) or (H, W) integers: which of options.viewpoint saw it
-    warnings: tuple[str, ...] = ()  # what was doubtful when it was read, for the answer
+    warnings: tuple[str, ...] = ()  # warnings from reading it, for the answer
 
 
 class PointField(Protocol):
@@ -56,7 +56,7 @@ def too_many(count: int, max_points: int, field: str = "cloud") -> PayloadTooLar
     return PayloadTooLarge(field, f"{count} points", fix)
 
 
-# Records of numbers: the points of PLY and PCD files and of PointCloud2
+# Records of numbers: points of PLY and PCD files and of PointCloud2
 
 PCL_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "rgba")  # that are read
 
@@ -80,7 +80,7 @@ def cloud_of_records(rows: Records) -> CloudInput:
 
 
 def _stacked(rows: Records, *names: str) -> Array | None:
-    """Fields of the rows side by side; None where one of them is missing."""
+    """Fields of the rows side by side; None if one is missing."""
     if not {*names} <= {*(rows.dtype.names or ())}:
         return None
     return np.stack([rows[name] for name in names], axis=-1)
@@ -92,9 +92,9 @@ POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8:
 
 
 def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> CloudInput:
-    """Read x, y, z of a cloud, and normals and colours where there are any.
+    """Read x, y, z of a cloud, and normals and colours if present.
 
-    Sizes are checked before anything is allocated: the message may be a stranger's.
+    Sizes are checked before anything is allocated, since the message is untrusted.
 
     Returns:
         Points (N, 3), or (H, W, 3) where the height is 2 or more.
@@ -121,7 +121,7 @@ def read_point_cloud2(cloud: PointCloud2, max_points: int = sys.maxsize) -> Clou
 
 
 def _record(cloud: PointCloud2) -> np.dtype[Any]:
-    """The layout of a point, with the fields that are read."""
+    """The dtype of a point, with the fields that are read."""
     fix = f"Send each field once, within point_step = {cloud.point_step}."
     order = ">" if cloud.is_bigendian else "<"
     found = [field for field in cloud.fields if field.name in PCL_FIELDS and field.count <= 1]
@@ -130,7 +130,7 @@ def _record(cloud: PointCloud2) -> np.dtype[Any]:
         value = ", ".join(f"{field.name} of type {field.datatype}" for field in cloud.fields)
         wanted = f"Send {', '.join(missing)} too, as 7 (float32) or 8 (float64), metres."
         raise InvalidRequest("point_cloud2.fields", value[:80], wanted)
-    for field in found:  # NumPy adds them up in 32 bits
+    for field in found:  # NumPy adds them in 32 bits
         end = field.offset + np.dtype(POINT_TYPES[field.datatype]).itemsize
         if end > cloud.point_step:
             raise InvalidRequest("point_cloud2.fields", f"{field.name} up to byte {end}", fix)

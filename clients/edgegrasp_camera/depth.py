@@ -1,4 +1,4 @@
-"""Depth images of pinhole cameras: what their intrinsics say, and the points they show.
+"""Depth images of pinhole cameras: intrinsics, and conversion to points.
 
 Camera frame: x right, y down, z forward; the centre of the top left pixel is (0, 0).
 """
@@ -15,9 +15,9 @@ from edgegrasp_camera.clouds import CloudInput
 Position = tuple[float, float, float]  # metres
 
 MILLIMETRE = 0.001  # metres for one unit of whole numbers
-FOCAL_LENGTHS = 0.1, 20.0  # of the image's width or height: seen under 157 and 3 degrees
-OFF_CENTRE = 0.15  # share of the width or height that a principal point hardly lies off the middle
-OBLONG = 1.5  # one focal length divided by the other; none is that of a pixel
+FOCAL_LENGTHS = 0.1, 20.0  # shares of the image's size: 157 and 3 degrees
+OFF_CENTRE = 0.15  # share of the width or height that a principal point may lie off the middle
+OBLONG = 1.5  # ratio of the focal lengths; no real pixel is that elongated
 
 
 class Intrinsics(NamedTuple):
@@ -38,9 +38,9 @@ class DepthView(NamedTuple):
 
 
 def intrinsics_of(value: Any) -> Intrinsics:
-    """Intrinsics of fx, fy, cx, cy by name or in this order, or of the (3, 3) or (9,) matrix.
+    """Intrinsics from fx, fy, cx, cy by name or in this order, or from the (3, 3) or (9,) matrix.
 
-    The numbers are as they were given, unchecked.
+    The numbers are not checked.
 
     Raises:
         ValueError: It is none of these.
@@ -69,7 +69,7 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
         (H, W), NaN where there is no reading.
 
     Raises:
-        InvalidRequest: It is no image of depths, or has negative ones.
+        InvalidRequest: It is not an image of depths, or has negative depths.
     """
     if depth.shape[2:] == (1,):
         depth = depth[..., 0]
@@ -89,7 +89,7 @@ def metres(depth: Array, scale: float | None = None, field: str = "depth") -> Fl
 def unproject(depth: Float64, camera: Intrinsics) -> Float64:
     """The points (H, W, 3) of depths (H, W) in metres, camera frame; NaN stays NaN."""
     row, column = np.indices(depth.shape)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused as a point
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow is refused later
         x = (column - camera.cx) / camera.fx * depth
         y = (row - camera.cy) / camera.fy * depth
     return np.stack([x, y, depth], axis=-1)
@@ -105,13 +105,12 @@ def fuse_depth_images(
         views: The camera of each, as DepthView has it.
 
     Returns:
-        A cloud whose rows are the pixels, one image after the other, with NaN where a pixel has no
-        reading: (H, W, 3) for one image; for several (1, N, 3), which is no image, and the view of
-        each point; what is doubtful about its cameras is in its warnings. And the position of each
-        camera.
+        A cloud whose rows are the pixels, image after image, NaN without a reading: (H, W, 3) for
+        one image, (1, N, 3) with the view of each point for several; doubts about the cameras are
+        in its warnings. And the position of each camera.
 
     Raises:
-        InvalidRequest: An array is no image of depths, or cannot be that of its camera; names
+        InvalidRequest: An array is not a depth image or does not fit its camera; names
             `depth_images.N`.
     """
     clouds: list[Float32] = []
@@ -133,7 +132,7 @@ def fuse_depth_images(
 
 
 def _doubts(camera: Intrinsics, shape: tuple[int, ...], field: str) -> Iterator[str]:
-    """What is doubtful about intrinsics for an image (H, W), in words.
+    """Doubts about intrinsics for an image (H, W), as sentences.
 
     Raises:
         InvalidRequest: They cannot belong to an image of that size.

@@ -1,7 +1,7 @@
 """Read point cloud files from memory: .npy, .npz, .ply, .pcd and .xyz; and .png images.
 
-The bytes may be a stranger's. Nothing is unpickled, and no count in a header is trusted before it
-is compared with the bytes at hand: a short file cannot make a worker allocate a large array.
+The bytes are untrusted. Nothing is unpickled, and counts in headers are compared with the bytes
+present, so a short file cannot make a worker allocate a large array.
 """
 
 import io
@@ -31,13 +31,13 @@ from edgegrasp_camera.clouds import PCL_FIELDS, CloudInput, Records, cloud_of_re
 from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 
 MAX_HEADER = 65536  # bytes of a PLY or PCD header; each line takes 50 times its size to read
-MAX_NPY_HEADER = 1024  # bytes; Python's parser runs out of memory where brackets or signs nest
+MAX_NPY_HEADER = 1024  # bytes; deeply nested brackets would exhaust the memory of Python's parser
 MAX_CHUNKS = 4096  # of a PNG file, however small they are
-MAX_LINE = 65536  # bytes of a line of numbers, which takes 15 times its size to read
-MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own
+MAX_LINE = 65536  # most bytes of a line of numbers; reading it takes 15 times its size
+MAX_UNPACKED = 256 * 2**20  # bytes; compressed data may claim a hundred times its own size
 MAX_MEMBERS = 64  # of an .npz file, which has 5 arrays at most
-UNZIPPED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others let the file say how much memory
-ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # of an object, in the message of a library
+UNZIPPED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others can take any memory
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # an object's address, in a library's message
 
 FIXES = {
     "npy": "Send what numpy.save(file, points) writes, points of shape (N, 3).",
@@ -49,7 +49,7 @@ FIXES = {
 }
 FILE_FORMATS = tuple(FIXES)
 NPZ_CLOUD = {"points", "normals", "colors", "segment_ids", "view_ids"}
-NPZ_IMAGE = {"depth", "intrinsics"}  # of a camera, whose frame is that of the cloud
+NPZ_IMAGE = {"depth", "intrinsics"}  # of a camera whose frame is the cloud's
 
 
 def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
@@ -60,9 +60,9 @@ def read_file(file_format: str, data: bytes, max_points: int) -> CloudInput:
         for ply and xyz, (N, 3) or (H, W, 3) for pcd.
 
     Raises:
-        InvalidRequest: The file is truncated, or no file of that format.
+        InvalidRequest: The file is truncated, or not a file of that format.
         PayloadTooLarge: More than `max_points` points.
-        UnsupportedMediaType: No such format.
+        UnsupportedMediaType: The format is unknown.
     """
     if file_format not in _READERS:
         fix = f"Send one of: {', '.join(FILE_FORMATS)}; a depth image as `depth` with `intrinsics`."
@@ -95,7 +95,7 @@ def sent_cloud(file: Path | None, images: Sequence[Any] | None) -> CloudInput:
 
 @contextmanager
 def _reading(field: str, file_format: str, size: int, fix: str) -> Iterator[None]:
-    """Whatever foreign bytes make a reader raise is an InvalidRequest."""
+    """Turns every exception of a reader into InvalidRequest."""
     try:
         yield
     except (EdgeGraspError, MemoryError):
@@ -118,7 +118,7 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
         The array in it, of whatever shape and dtype, in native byte order.
 
     Raises:
-        InvalidRequest: The file is truncated, or no .npy file of numbers.
+        InvalidRequest: The file is truncated, or not a .npy file of numbers.
         PayloadTooLarge: More than `max_points` points.
     """
     fix = FIXES["npy"] if field == "cloud" else f"Send what numpy.save(file, {field}) writes."
@@ -143,7 +143,7 @@ def read_npy(data: bytes, max_points: int, field: str = "cloud") -> Array:
 
 
 def _read_npz(data: bytes, max_points: int) -> CloudInput:
-    """Read points or a depth image and the arrays beside them, or points alone under any name."""
+    """Read points or a depth image with its per-point arrays, or points alone under any name."""
     if data.count(b"PK\1\2") > MAX_MEMBERS:  # zipfile reads the whole directory
         raise ValueError(f"more than {MAX_MEMBERS} arrays")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -181,12 +181,12 @@ def _read_npz(data: bytes, max_points: int) -> CloudInput:
 def _unzipped(archive: zipfile.ZipFile, info: zipfile.ZipInfo, max_points: int) -> bytes:
     if info.compress_type not in UNZIPPED:
         raise ValueError("compressed in another way than numpy does")
-    # Six doubles a point and a header: more than any cloud of max_points needs.
+    # Six doubles per point and a header: more than any cloud of max_points needs.
     if info.file_size > 48 * max_points + 65536:
         value = f"an array of {info.file_size} bytes once unpacked"
         raise PayloadTooLarge("cloud", value, f"Send at most {max_points} points.")
     with archive.open(info) as member:
-        # Without a size, read() unpacks everything, even where that is more than promised.
+        # Without a size, read() would unpack everything, even beyond the promised size.
         return member.read(info.file_size)
 
 
@@ -200,14 +200,14 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
         (H, W) bool, uint8 or uint16, or (H, W, C) uint8 of C channels.
 
     Raises:
-        InvalidRequest: The file is truncated, or no PNG.
+        InvalidRequest: The file is truncated, or not a PNG.
         PayloadTooLarge: More than `max_points` pixels.
     """
     from PIL import Image  # not in the base install
 
     fix = "Send a whole PNG file, of 16-bit greyscale for depths."
     with _reading(field, "png", len(data), fix), warnings.catch_warnings():
-        warnings.simplefilter("error")  # that the image is huge
+        warnings.simplefilter("error")  # warning of a huge image
         start = 8
         for _ in range(MAX_CHUNKS):
             start += 12 + int.from_bytes(data[start : start + 4], "big")
@@ -223,7 +223,7 @@ def read_png(data: bytes, max_points: int, field: str) -> Array:
 
 
 def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]], re.Match[bytes]]:
-    """The words of the lines before the last one, and where that is."""
+    """The words of the header's lines, and the offset of its end."""
     end = last.search(data[:MAX_HEADER])
     if end is None:
         raise ValueError("no header")
@@ -231,7 +231,7 @@ def _read_header(data: bytes, last: re.Pattern[bytes]) -> tuple[list[list[str]],
 
 
 def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]:
-    """The layout of a point, of name, type and count of each field; "": one that is not read."""
+    """The dtype of a point from name, type and count of each field; "": a skipped field."""
     layout = [
         (name if name and count == 1 else f"{column}", order + kind, (count,) if count != 1 else ())
         for column, (name, kind, count) in enumerate(fields)
@@ -245,7 +245,7 @@ def _record(fields: Iterable[tuple[str, str, int]], order: str) -> np.dtype[Any]
 def _read_records(
     body: bytes, record: np.dtype[Any], count: int, max_points: int, text: bool
 ) -> Records:
-    """Read `count` records, which may not be more than the body holds."""
+    """Read `count` records, after checking that the body holds as many."""
     columns = sum(math.prod(record[name].shape) for name in record.names or ())
     if count > max_points:
         raise too_many(count, max_points)
@@ -267,7 +267,7 @@ def _read_text(data: bytes, **options: Any) -> Float64:
         if data.find(b"\n", start, start + MAX_LINE) < 0:
             raise ValueError(f"a line of more than {MAX_LINE} characters")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that there are no numbers: a caller counts the rows
+        warnings.simplefilter("ignore")  # warning of no data; the caller counts rows
         return np.loadtxt(io.BytesIO(data), ndmin=2, encoding="latin-1", **options)
 
 
@@ -286,7 +286,7 @@ PLY_HEADER_END = re.compile(rb"^end_header[ \t\r]*\n", re.MULTILINE)
 
 
 def _read_ply(data: bytes, max_points: int) -> CloudInput:
-    """Read x, y, z of the vertices, and nx, ny, nz and red, green, blue where there are any."""
+    """Read x, y, z of the vertices, and nx, ny, nz and red, green, blue if present."""
     lines, end = _read_header(data, PLY_HEADER_END)
     encoding = next((line[1] for line in lines if line[:1] == ["format"]), "")
     elements = [row for row, line in enumerate(lines) if line[:1] == ["element"]]
@@ -311,7 +311,7 @@ PCD_HEADER_END = re.compile(rb"^DATA[ \t]+(ascii|binary|binary_compressed)[ \t\r
 
 
 def _read_pcd(data: bytes, max_points: int) -> CloudInput:
-    """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb where there are any."""
+    """Read x, y, z of the points, and normal_x, normal_y, normal_z and rgb if present."""
     lines, end = _read_header(data, PCD_HEADER_END)
     header = {words[0]: words[1:] for words in lines if words}
     if missing := {"FIELDS", "TYPE", "SIZE", "POINTS"} - header.keys():
@@ -359,10 +359,10 @@ def _read_compressed_records(
 
 
 def _unpack_lzf(packed: bytes, size: int) -> bytearray:
-    """Undo LZF: runs of bytes, and references to what came before; raises ValueError or IndexError.
+    """Decompress LZF: literal runs and back references; raises ValueError or IndexError.
 
-    A byte n below 32 begins n + 1 bytes to copy. Others have 3 bits of a length, 7 of which say
-    that a byte more adds to it, and 13 bits of a distance, the lowest 8 in the last byte.
+    A byte n below 32 is followed by n + 1 literal bytes. Others hold 3 bits of length, where 7
+    means that another byte is added, and 13 bits of distance, the lowest 8 in the last byte.
     """
     plain, place = bytearray(), 0
     while place < len(packed) and len(plain) <= size:
@@ -380,7 +380,7 @@ def _unpack_lzf(packed: bytes, size: int) -> bytearray:
         if start < 0:
             raise ValueError("compressed data that refers to what is before its start")
         copied = plain[start : start + length]
-        plain += (copied * (length // distance + 1))[:length]  # it may repeat itself
+        plain += (copied * (length // distance + 1))[:length]  # the copy may overlap its own output
     if len(plain) != size or place != len(packed):
         raise ValueError(f"{len(plain)} bytes of compressed data where {size} are promised")
     return plain

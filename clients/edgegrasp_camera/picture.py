@@ -1,7 +1,7 @@
 """Pictures of clouds and the grasps found in them, drawn without a screen.
 
-A picture looks through a pinhole camera: the one that took the cloud, over its own image where
-there is one, or else one that is put where it stood.
+A picture is drawn through a pinhole camera: the one that took the cloud, over its image if there is
+one, or else one at the same position.
 """
 
 import itertools
@@ -20,20 +20,20 @@ from edgegrasp_camera.clouds import CloudInput
 Points = Float64
 
 PANDA = (0.0658, 0.1122)  # metres along the hand's z: the palm's surface and the fingertips
-STEM_LENGTH = 0.03  # metres drawn behind the palm, to show where the hand comes from
+STEM_LENGTH = 0.03  # metres drawn behind the palm, to show the approach
 BAR = 0.005  # metres, thickness of a fork
-BARS = (2.0, 7.0)  # points that this is at least and at most
-BEHIND = 0.006  # metres behind the cloud from which on a fork is drawn as hidden
+BARS = (2.0, 7.0)  # the same in points, least and most
+BEHIND = 0.006  # metres behind the cloud from which a fork is drawn as hidden
 DRAWN = 10  # grasps in a picture of a request
 AROUND = 0.4  # metres from these: what a picture of a cloud shows
-LABELLED = 5  # grasps that carry their rank
+LABELLED = 5  # grasps that are labelled with their rank
 SIZE = (960, 1280)  # rows and columns of a picture of a cloud without an image
 SMALLEST = 0.25  # metres across, of what such a picture shows
-SPREAD = 8  # pixels that gaps between points are closed by at most
+SPREAD = 8  # largest gap between points that is closed, pixels
 WIDTH, DPI = 10.0, 130  # inches, dots per inch
 FOOT = 0.75  # inches below the picture: title and scale
-SMOOTHED = 8  # times that depths are averaged with their neighbours before they are shaded
-LAMP = (-0.3, -0.6, -0.74)  # to it from a surface, camera frame: left, up, towards the camera
+SMOOTHED = 8  # smoothing passes over the depths before shading
+LAMP = (-0.3, -0.6, -0.74)  # direction from a surface to the light, camera frame
 MAP = "viridis"  # colours of scores from 0 to 1
 OUTLINE = "#10151d"
 REGION = "#4cc9f0"
@@ -127,7 +127,7 @@ class View:
 
 
 class Picture:
-    """A picture of a cloud; what is drawn later lies over what was drawn before.
+    """A picture of a cloud; later drawings cover earlier ones.
 
     Args:
         view: The camera.
@@ -184,7 +184,7 @@ class Picture:
         self._axes.plot(*pixels.T, color=color, linewidth=width)
 
     def outline(self, mask: Bools, color: str = "white") -> None:
-        """Draw the border of what is marked in the image: (H, W)."""
+        """Draw the border of a mask (H, W)."""
         if mask.any():
             self._axes.contour(mask, [0.5], colors=color, linewidths=1.0)
 
@@ -222,7 +222,7 @@ class Picture:
             bar.ax.tick_params(labelsize=8, length=2, pad=1)
 
     def _fork(self, pieces: Points, color: Any) -> None:
-        """Draw a fork, (4, 2, 3); faint where the cloud hides it."""
+        """Draw a fork, (4, 2, 3), faintly where the cloud hides it."""
         _, depth = self.view.project(pieces)
         bar = float(np.clip(BAR * self.view.fy / np.median(depth) * self._point, *BARS))
         for width, shade in ((bar + 1.6, OUTLINE), (bar, color)):
@@ -238,7 +238,7 @@ class Picture:
                     )
 
     def _depth_at(self, pixels: Points) -> Points:
-        """Distance of the cloud at pixels (K, 2); NaN where there is none."""
+        """Distance of the cloud at pixels (K, 2); NaN where there is no point."""
         column, row = np.rint(pixels).astype(int).T
         rows, columns = self.view.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
@@ -291,8 +291,8 @@ def draw_detection(
 ) -> None:
     """Write a picture of a request and the best of its grasps.
 
-    What is organised as a camera's image is drawn as that camera saw it, in its colours where they
-    are given; another cloud from its viewpoint, or from above at a slant.
+    An organised cloud is drawn as its camera saw it, in its colours if given; any other cloud from
+    its viewpoint, or obliquely from above.
 
     Args:
         path: `.png` or `.jpg` file to write, or where to write a PNG.

@@ -1,4 +1,4 @@
-"""The arm of a benchmark: where it stands, what the simulation and a planner need of it."""
+"""The arm of a benchmark: its place beside the scene, for the simulation and for planners."""
 
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ class BenchmarkArm(NamedTuple):
 
 
 def benchmark_arm(name: str, camera: CameraRules) -> BenchmarkArm:
-    """An arm on the side of a scene that the camera looks from, as one on its wrist does.
+    """An arm on the camera's side of a scene, as with a camera on its wrist.
 
     Raises:
         InvalidRobot: the file cannot be used.

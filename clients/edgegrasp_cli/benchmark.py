@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from edgegrasp_sim.trial import Round
 
 Option = typer.Option
-# Options of a detection that the simulation, the protocol or another flag decides.
+# Options of a detection that are set by the simulation, the protocol or another flag.
 DECIDED = (
     *("model", "gripper", "seed", "viewpoint", "up", "support", "objects", "workspace"),
     *("top_k", "debug", "robot", "previous"),
@@ -134,7 +134,7 @@ def benchmark(
 def _plan(
     asked: BenchmarkFlags, connection: dict[str, Any], options: dict[str, Any]
 ) -> "tuple[BenchmarkConfig, PlannerChoice]":
-    """What to run, and with which planner."""
+    """The benchmark to run, and its planner."""
     from edgegrasp_cli.planners import PlannerChoice
     from edgegrasp_model.gripper import gripper_fields
     from edgegrasp_sim.benchmark import BenchmarkConfig
@@ -142,7 +142,7 @@ def _plan(
     from edgegrasp_sim.protocol import load_protocol
 
     rules = load_protocol(asked.protocol)
-    # The Panda's hand has shapes of its own.
+    # The Panda's hand has its own shapes.
     hand = gripper_fields(asked.gripper) if asked.gripper not in (None, "panda") else None
     arm = None
     if hand is not None:
@@ -212,7 +212,7 @@ def compare(
 
 @contextmanager
 def interruptible(command: str, *, resumes: bool) -> Iterator[None]:
-    """End the program with a message where workers cannot run, or its user interrupts it."""
+    """End the program with a message if workers cannot run or the user interrupts it."""
     try:
         yield
     except RuntimeError as error:
@@ -230,7 +230,7 @@ def run_rounds(
     workers: int | None,
     ray: str | None,
 ) -> "tuple[list[Round], str]":
-    """Run what is left of a benchmark behind a progress bar.
+    """Run the remaining rounds of a benchmark with a progress bar.
 
     Returns:
         All rounds, and the name of the weights or of the planner.
@@ -241,7 +241,7 @@ def run_rounds(
     from edgegrasp_sim.benchmark import manifest, run_benchmark
     from edgegrasp_sim.results import planner_title
 
-    # A wrong folder fails before a server is started; meshes are split once for all workers.
+    # Fails on a wrong folder before a server is started, and prepares meshes once for all workers.
     with Console(stderr=True).status("reading objects"):
         config.object_set()
     with open_planner(choice, config.protocol.planning) as planner:
@@ -263,7 +263,7 @@ def run_rounds(
 def _progress(
     config: "BenchmarkConfig", folder: "ResultFolder | None"
 ) -> "Iterator[Callable[[Round], None]]":
-    """A bar with the time left; yields what to call after each round."""
+    """A progress bar with the time left; yields a function to call after each round."""
     from rich.progress import Progress, TimeElapsedColumn
 
     from edgegrasp_sim.results import count

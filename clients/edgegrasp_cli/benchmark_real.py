@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from edgegrasp_model.gripper import Gripper
 
 Option = typer.Option
-# Options that the scene decides, or this command.
+# Options that are set by the scene or by this command.
 DECIDED = ("viewpoint", "debug", "robot", "previous")
 PLANE_SQUARE = 0.12  # metres, edge of the square that shows a plane at an object's foot
 LABELLED, FOUND = "#39d353", "#ff4fd8"  # colours of the planes
@@ -53,8 +53,8 @@ def benchmark_real(
 ) -> None:
     """Find grasps in scenes that real cameras saw, and judge them by the scenes' labels.
 
-    A request holds the image and its intrinsics, or the cloud and that the camera is at its
-    origin, and the options given as flags; nothing else is said about a scene.
+    A request contains the image and its intrinsics, or the cloud with the camera at its origin, and
+    the options given as flags; nothing else about the scene.
     """
     from rich.console import Console
     from rich.progress import track
@@ -68,7 +68,7 @@ def benchmark_real(
     with open_client(server, timeout, connection, weights, grippers, device) as client:
         model = model_used(client, fields.get("model", ""))
         gripper = _gripper(model.gripper, grippers, fields)
-        _ask(client, loaded[0], fields)  # what is loaded or compiled first takes time
+        _ask(client, loaded[0], fields)  # loading and compiling take time
         for scene in track(loaded, "scenes", console=Console(stderr=True)):
             start = time.perf_counter()
             found, refused = _ask(client, scene, fields)
@@ -85,7 +85,7 @@ def benchmark_real(
 
 
 def _ask(client: Any, scene: "RealScene", fields: Mapping[str, Any]) -> tuple[Any | None, str]:
-    """The answer for a scene; None and why where the request is refused."""
+    """The answer for a scene, or None and the reason if the request is refused."""
     from edgegrasp_client import InvalidRequestError
     from edgegrasp_model.errors import InvalidRequest
 
@@ -98,9 +98,9 @@ def _ask(client: Any, scene: "RealScene", fields: Mapping[str, Any]) -> tuple[An
 def _labels(
     client: Any, scene: "RealScene", fields: Mapping[str, Any], found: Any | None
 ) -> "Int64":
-    """What the detector calls each point (R,), as in `DebugInfo`, by a request that is not timed.
+    """The detector's label of each point (R,), as in `DebugInfo`, from an untimed request.
 
-    All is unlabelled where it refuses, or finds no object.
+    Everything is unlabelled if the detector refuses or finds no object.
     """
     if found is not None and found.objects:
         found, _ = _ask(client, scene, {**fields, "debug": True})
@@ -110,7 +110,7 @@ def _labels(
 
 
 def _gripper(name: str, files: Sequence[Path] | None, options: Mapping[str, Any]) -> "Gripper":
-    """The hand that a request with these options is answered for; else that of the model."""
+    """The gripper named by the options, else the model's."""
     from edgegrasp_model.gripper import choose_gripper, load_gripper
     from edgegrasp_model.options import parse_options
 
@@ -153,13 +153,13 @@ def _write(
 
 
 def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
-    """Figures over all scenes; shares are of the grasps judged, None where there are none."""
+    """Figures over all scenes; shares are of the judged grasps, None if there are none."""
     best = sum(figures.best for figures in done)
 
     def share(name: str) -> float | None:
         return sum(getattr(figures, name) for figures in done) / best if best else None
 
-    # Of a heap that is labelled as one object, neither the plane nor the objects are known.
+    # For a heap that is labelled as one object, neither plane nor objects are known.
     apart = [figures for figures in done if figures.plane_labelled]
 
     def mean(name: str, judged: "Sequence[SceneFigures]") -> float | None:
@@ -191,7 +191,7 @@ def summary(done: "Sequence[SceneFigures]") -> dict[str, Any]:
 def _grasp_table(
     done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
 ) -> list[tuple[str, ...]]:
-    """What the best grasps are worth."""
+    """Table of the best grasps."""
     head = ("scene", "best", "on an object", "from below", "through points", "objects held", "ms")
     rows: list[tuple[str, ...]] = [head]
     for name, one in done.items():
@@ -208,7 +208,7 @@ def _grasp_table(
 def _segmentation_table(
     done: "Mapping[str, SceneFigures]", total: Mapping[str, Any]
 ) -> list[tuple[str, ...]]:
-    """What is called an object, and the plane."""
+    """Table of segmentation and plane."""
     head = ("scene", "object pixels P/R", "overlap P/R/F", "objects found", "called", "plane")
     rows: list[tuple[str, ...]] = [head]
     for name, one in done.items():
@@ -262,8 +262,7 @@ def draw(
 ) -> None:
     """Write a picture: the camera's image with the grasps, and both support planes.
 
-    Grasps are best first and the plane that was found is its normal (3,) and offset, both in the
-    camera's frame.
+    Grasps are best first; the found plane is given by its normal (3,) and offset; camera frame.
     """
     from edgegrasp_camera.picture import Picture
 
@@ -282,8 +281,8 @@ def draw(
 def draw_labels(path: Path, scene: "RealScene", labels: "Int64") -> None:
     """Write three pictures side by side: the camera's image, its labels, the detector's (R,).
 
-    Support and obstacles are grey, objects in colour: a labelled object and the one that the
-    detector matches best have the same.
+    Support and obstacles are grey, objects coloured; a labelled object and the detected one that
+    matches it best have the same colour.
     """
     from matplotlib import colormaps
     from matplotlib.image import imsave

@@ -1,4 +1,4 @@
-"""The commands that ask a detector, on a server or in this process: detect and models."""
+"""The commands `detect` and `models`, which use a server or a detector in this process."""
 
 import importlib
 import json
@@ -187,14 +187,14 @@ def open_client(
     grippers: Sequence[Path] | None = None,
     device: str = "cpu",
 ) -> AbstractContextManager[Any]:
-    """A client of a server, or where there is none an OwnDetector."""
+    """A client of a server, or an OwnDetector if no server is given."""
     if server:
         return connect(server, timeout, **connection)
     return nullcontext(OwnDetector(weights or (), grippers or (), device))
 
 
 class OwnDetector:
-    """A detector in this process, asked as `GraspClient` asks a server."""
+    """A detector in this process, with the interface of `GraspClient`."""
 
     def __init__(self, weights: Sequence[Path], grippers: Sequence[Path], device: str) -> None:
         self._load = weights, grippers, device
@@ -241,7 +241,7 @@ class OwnDetector:
 
 
 def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
-    """Raise ValueError, before any work, where a picture or a motion could not be written."""
+    """Raise ValueError, before any work, if a picture or trajectory could not be written."""
     if asked.trajectory is not None and "robot" not in fields:
         raise ValueError("--trajectory: got no robot. Give --robot, --joints and --base.")
     path = asked.picture
@@ -251,11 +251,11 @@ def _check_outputs(asked: DetectFlags, fields: Mapping[str, Any]) -> None:
         raise ValueError(f"--picture: got {path.name!r}. Name a file {' or '.join(PICTURES)}.")
     if not path.absolute().parent.is_dir():
         raise ValueError(f"--picture: there is no folder {path.parent}. Make it first.")
-    importlib.import_module("matplotlib")  # fails before the work, not after it
+    importlib.import_module("matplotlib")  # fails before the work
 
 
 def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
-    """The options of the flags, and of the file where there is no flag."""
+    """The options from the flags, and from the file where no flag is given."""
     try:
         fields = json.loads(file.read_text()) if file else {}
         if not isinstance(fields, dict):
@@ -266,7 +266,7 @@ def _options(file: Path | None, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _robot_option(asked: DetectFlags) -> dict[str, Any]:
-    """The option `robot` of the flags; nothing where there is none of them."""
+    """The option `robot` from the flags; empty if none of them is given."""
     from edgegrasp_service.worker.http_bodies import value_of_text
 
     given = {"--robot": asked.robot, "--joints": asked.joints, "--base": asked.base}
@@ -284,7 +284,7 @@ def _robot_option(asked: DetectFlags) -> dict[str, Any]:
 
 
 def _write_trajectory(file: Path, detection: Any) -> None:
-    """Write the motion to the best pick, and the pick; raises ValueError where there is none."""
+    """Write the best pick and its trajectory; raises ValueError if there is none."""
     moving = [one for one in detection.grasps if one.arm is not None and one.arm.trajectory]
     if not moving:
         counts = ", ".join(f"{count} {name}" for name, count in detection.counts.items())
@@ -298,7 +298,7 @@ def _write_trajectory(file: Path, detection: Any) -> None:
 
 
 def _depth_images(file: Path | None, asked: DetectFlags) -> "list[DepthImage] | None":
-    """The images of --depth with their cameras; None where a cloud is given."""
+    """The images of --depth with their cameras; None if a cloud is given."""
     from edgegrasp_service.worker.http_bodies import value_of_text
 
     depths, intrinsics, poses = asked.depth, asked.intrinsics, asked.pose

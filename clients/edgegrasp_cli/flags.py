@@ -1,4 +1,4 @@
-"""Flags that commands share: read from pydantic models, and those of commands that ask a server."""
+"""Flags shared by commands: those of pydantic models, and those for connecting to a server."""
 
 import functools
 import inspect
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound="BaseModel")
 Flags: TypeAlias = list[inspect.Parameter]
-PLAIN = (bool, int, float, str, Path)  # types that a flag has as they are
+PLAIN = (bool, int, float, str, Path)  # types that a flag takes directly
 TOKEN_VARIABLE = "EDGEGRASP_CLIENT_TOKEN"
 
 Server = Annotated[
@@ -47,7 +47,7 @@ def takes_flags(**groups: Flags) -> Callable[[Callable[..., None]], Callable[...
         ]
         added = [flag for flags in groups.values() for flag in flags]
         run.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
-        run.__annotations__ = {"return": None}  # typer reads the signature alone
+        run.__annotations__ = {"return": None}  # typer reads only the signature
         return run
 
     return decorate
@@ -62,7 +62,7 @@ def model_flags(
     """A flag for each field of a pydantic model, with the field's description and default.
 
     Args:
-        model: The fields; those that are no number, text, truth value or path are given as JSON.
+        model: The fields; those other than numbers, text, booleans and paths are given as JSON.
         leave_out: Fields without a flag.
         panel: Heading of the flags in the help.
         defaults: Whether the help shows the fields' defaults.
@@ -85,7 +85,7 @@ def model_flags(
 
 
 def given_flags(model: "type[Model]", given: Mapping[str, Any]) -> "Model":
-    """The model that flags of `model_flags` stand for.
+    """The model from the flags of `model_flags`.
 
     Raises:
         ValueError: A value is out of range; names flag, value and limit.
@@ -108,7 +108,7 @@ def option_flags(*leave_out: str, defaults: bool = True) -> Flags:
 
 
 def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that flags of `option_flags` stand for; text is read as in query parameters.
+    """The options from the flags of `option_flags`; text is read like query parameters.
 
     Raises:
         InvalidRequest: A value is of the wrong type or out of range.
@@ -120,7 +120,7 @@ def parse_option_flags(given: Mapping[str, Any]) -> dict[str, Any]:
         (name, value if isinstance(value, str) else json.dumps(value))
         for name, value in given.items()
     )
-    parse_options(options)  # a wrong value is refused before anything is started
+    parse_options(options)  # a wrong value is refused before anything starts
     return options
 
 
@@ -177,7 +177,7 @@ def _token(file: Path | None) -> str | None:
 
 
 def _flag_type(annotation: Any) -> tuple[Any, str | None]:
-    """The type that typer reads a field as, and what its help shows for the value, if not that."""
+    """The type of a field for typer, and the placeholder in its help if it differs."""
     parts = [part for part in get_args(annotation) if part is not type(None)]
     choice = next((one for one in (annotation, *parts) if get_origin(one) is Literal), None)
     if choice is not None:
@@ -189,7 +189,7 @@ def _flag_type(annotation: Any) -> tuple[Any, str | None]:
 
 
 def _default_text(default: Any) -> str:
-    """A default behind its description; none for nothing, nor for an object."""
+    """A default value for the help; empty for None and for objects."""
     if default in ("", (), None) or hasattr(default, "model_dump"):
         return ""
     return f" ({default if isinstance(default, (str, Path)) else json.dumps(default)})"

@@ -1,4 +1,4 @@
-"""The program `edgegrasp`: a table of commands, each in a module that is imported when it runs."""
+"""The program `edgegrasp`: a table of commands, whose modules are imported when they run."""
 
 import functools
 import importlib
@@ -38,7 +38,7 @@ class LazyGroup(TyperGroup):
     """Shows commands from the table, and imports the one that is run."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
-        """Put the real command in the place of its table entry."""
+        """Replace a table entry by the real command."""
         name, _, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name)), rest
 
@@ -47,7 +47,7 @@ def load_command(name: str) -> Any:
     """Import a command.
 
     Raises:
-        SystemExit: It needs packages that are not installed.
+        SystemExit: Needed packages are not installed.
     """
     module, _, _ = COMMANDS[name]
     try:
@@ -66,7 +66,7 @@ def load_command(name: str) -> Any:
 
 
 def _ending_with_a_sentence(name: str, function: Callable[..., None]) -> Callable[..., None]:
-    """The function; errors that its user can mend end the program with their message."""
+    """The function; errors that the user can fix end the program with their message."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -107,7 +107,7 @@ def _common(
         ),
     ] = False,
 ) -> None:
-    """Nothing but the flags of the program itself."""
+    """The flags of the program itself."""
 
 
 def _program() -> typer.Typer:

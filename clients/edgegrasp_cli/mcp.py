@@ -1,7 +1,7 @@
 """`edgegrasp mcp`: grasps for language-model agents, by the Model Context Protocol.
 
-A client of a running server. An agent names files below one folder; answers are short enough for
-its context, and `visualize_grasps` shows it a picture.
+Runs as a client of a grasp server. An agent names files below one folder; answers are short enough
+for its context, and `visualize_grasps` returns a picture.
 """
 
 import functools
@@ -61,7 +61,8 @@ def mcp(
 ) -> None:
     """Serve grasps to language-model agents (Model Context Protocol).
 
-    HTTP asks for no token: bind it to 127.0.0.1, or put a proxy that does in front of it.
+    HTTP does not require a token: bind it to 127.0.0.1, or put an authenticating proxy in front of
+    it.
     """
     if not folder.is_dir():
         raise ValueError(f"--folder: {folder} is no folder. Name one with clouds or images.")
@@ -75,9 +76,9 @@ def mcp(
 
 
 def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
-    """The tools, to be run over a transport.
+    """The MCP server with its tools.
 
-    Files are named relative to the folder; no file outside of it is read.
+    File names are relative to the folder; no file outside of it is read.
     """
     from mcp.server.mcpserver import MCPServer
 
@@ -99,7 +100,7 @@ def grasp_tools(client: "GraspClient", folder: Path) -> "MCPServer":
 
 
 class _Tools:
-    """What an agent calls; docstrings and arguments are what it reads."""
+    """The tools that an agent calls; it reads their docstrings and arguments."""
 
     def __init__(self, client: "GraspClient", folder: Path) -> None:
         self._client, self._folder = client, folder
@@ -214,16 +215,16 @@ class _Tools:
         path = (self._folder / name).resolve()
         if not path.is_relative_to(self._folder):
             raise ValueError(f"{name} is not below the folder. Name a file below it.")
-        if not path.is_file():  # a pipe would be waited for
+        if not path.is_file():  # reading a pipe would block
             raise ValueError(f"{name} is no file.")
         return path
 
 
 def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
-    """The tool, which refuses arguments that it does not have, and describes its options."""
+    """The tool, refusing unknown arguments and with a schema of its options."""
     from mcp.server.mcpserver.tools.base import Tool
 
-    # Compact text: as structured output the SDK would send it twice, once indented.
+    # Compact text, since the SDK would send structured output twice, once indented.
     tool = Tool.from_function(_with_sentences(function, folder), structured_output=False)
     arguments = tool.fn_metadata.arg_model
     arguments.model_config["extra"] = "forbid"
@@ -257,13 +258,13 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
 def _asked(
     options: dict[str, Any] | None, num_grasps: int, viewpoint: list[float] | None = None
 ) -> dict[str, Any]:
-    """The options of a request: arguments of a tool of their own come first."""
+    """The options of a request; a tool's own arguments take precedence."""
     given = {"top_k": num_grasps}
     return {**(options or {}), **given, **({"viewpoint": viewpoint} if viewpoint else {})}
 
 
 def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
-    """The tool; what its caller can mend reaches the model as a sentence, without the folder."""
+    """The tool; errors that the caller can fix reach it without the folder's path."""
     from mcp.server.mcpserver.exceptions import ToolError
 
     from edgegrasp_client import GraspClientError
@@ -272,7 +273,7 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
     def run(**arguments: Any) -> Any:
         try:
             return function(**arguments)
-        except OSError as error:  # its own text has the whole path
+        except OSError as error:  # its own text contains the whole path
             name = Path(str(error.filename or "")).name
             raise ToolError(f"{name}: {error.strerror}.") from error
         except (EdgeGraspError, GraspClientError, ValueError) as error:
@@ -282,7 +283,7 @@ def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[...,
 
 
 def _short(found: "Detection") -> str:
-    """What an agent needs of a detection, as JSON in few digits."""
+    """The part of a detection that an agent needs, as JSON with few digits."""
     from edgegrasp_client.conversions import quaternion_from_matrix
 
     grasps = [

@@ -1,7 +1,7 @@
 """`edgegrasp open-inference`: the Open Inference Protocol v2 in front of a grasp server.
 
-A client of the server, in a process of its own: it gives the bytes of tensors their shape and
-sends them on. The server's workers are what reads them.
+Runs as a client of the server, in its own process: it gives the bytes of tensors their shape and
+passes them on. The server's workers decode them.
 """
 
 import json
@@ -37,7 +37,7 @@ DTYPES = {"FP32": "<f4", "FP64": "<f8", "UINT16": "<u2", "INT32": "<i4"}
 CONTENTS = {"FP32": "fp32_contents", "FP64": "fp64_contents", "UINT16": "uint_contents"}
 INPUTS = {"points": ("FP32", [-1, 3]), "depth": ("FP32", [-1, -1]), "intrinsics": ("FP32", [4])}
 OUTPUTS = {
-    "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, as all of them
+    "T_cloud_hand": ("FP32", [-1, 4, 4]),  # best first, like all outputs
     "score": ("FP32", [-1]),
     "width": ("FP32", [-1]),  # metres
     "object": ("INT32", [-1]),  # -1: of none
@@ -80,7 +80,7 @@ def open_inference(
 ) -> None:
     """Answer the Open Inference Protocol v2 (KServe, Triton's clients) for a grasp server.
 
-    It asks for no token: let the gateway in front of it do that.
+    It does not require a token: let the gateway in front of it check tokens.
     """
     with connect(server, timeout, **connection) as client:
         models = Models(client, name, timeout)
@@ -90,7 +90,7 @@ def open_inference(
 
 
 class RefusedError(Exception):
-    """The answer to a request that cannot be served: a gRPC code's name, an HTTP status, why."""
+    """A refusal: the gRPC code's name, the HTTP status and the reason."""
 
     def __init__(self, code: str, status: int, why: str) -> None:
         super().__init__(why.encode("utf-8", "backslashreplace").decode())  # half characters
@@ -98,7 +98,7 @@ class RefusedError(Exception):
 
 
 class Answer(NamedTuple):
-    """What a model makes of tensors."""
+    """A model's answer to tensors."""
 
     outputs: Tensors  # in the order of OUTPUTS
     parameters: dict[str, str]
@@ -118,12 +118,12 @@ class Models:
         return self._client.ready(timeout=5.0)
 
     def names(self) -> list[str]:
-        """What models are called."""
+        """The models' names."""
         with _refusing():
             return [self._default, *(model.name for model in self._client.models())]
 
     def check(self, name: str, version: str = "") -> None:
-        """Refuse a name that no model has, and a version but the one that there is."""
+        """Refuse an unknown name or version."""
         known = self.names()
         if name not in known:
             raise RefusedError(
@@ -182,7 +182,7 @@ class Models:
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """Errors of the client as those of the protocol."""
+    """Converts errors of the client to those of the protocol."""
     try:
         yield
     except errors.GraspClientError as error:
@@ -369,7 +369,7 @@ def _http_infer(models: Models, name: str, body: bytearray, header: str | None) 
         if lists > head // 7 + MAX_SHORT_LISTS:  # each takes 20 times its size in memory
             raise ValueError(f"{lists} lists in {head} bytes")
         request = json.loads(body[:head])
-        str(request.get("id", "")).encode()  # or it cannot be sent back
+        str(request.get("id", "")).encode()  # otherwise it could not be sent back
         tensors, parameters = _http_inputs(request, bytes(body[head:]))
         wanted = [str(each["name"]) for each in request.get("outputs") or ()]
     except RefusedError:

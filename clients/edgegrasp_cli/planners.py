@@ -1,4 +1,4 @@
-"""Planners for clutter removal: a detector on a server or in this process, or one by its name."""
+"""Planners for clutter removal: a detector, on a server or in this process, or any by name."""
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +22,7 @@ GROUP = "edgegrasp.planners"  # entry points under which packages may name their
 SHIPPED = ("server", "in-process")
 CONNECT_SECONDS, REQUEST_SECONDS = 30.0, 300.0
 SUFFIX = ".safetensors"
-MAX_DEPTH_ERROR = 0.12  # of views that show the table; more than any protocol's noise
+MAX_DEPTH_ERROR = 0.12  # depth error for views that show the table; more than any protocol's noise
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class PlannerChoice:
     weights: tuple[Path, ...] = ()  # files or folders besides those that ship
     server: str | None = None  # `host:port` or `http://host:port`; None: one is started
     connection: dict[str, Any] = field(default_factory=dict)  # arguments of `connect`
-    # Of each request, in place of the protocol's.
+    # Options of each request, in place of the protocol's.
     options: dict[str, Any] = field(default_factory=dict)
     robot: str | None = None  # that the options name: one that ships, or its file
 
@@ -53,7 +53,7 @@ class PlannerChoice:
 
 
 class ChosenPlanner(NamedTuple):
-    """How to make a planner, and what it is."""
+    """A factory of planners, and its description."""
 
     make: Callable[[], Planner]  # in the process that uses it; can be sent to another
     facts: dict[str, Any]  # for the manifest
@@ -61,7 +61,7 @@ class ChosenPlanner(NamedTuple):
 
 @contextmanager
 def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[ChosenPlanner]:
-    """Find a planner for a protocol; a server of its own runs as long as the context.
+    """Find a planner for a protocol; a server started for it runs for the duration of the context.
 
     Raises:
         ValueError: no such planner, or no such file of weights.
@@ -70,7 +70,7 @@ def open_planner(choice: PlannerChoice, rules: PlanningRules) -> Iterator[Chosen
     """
     if choice.name not in SHIPPED:
         make = partial(named_planner, choice.name)
-        make()  # a wrong name fails here, not in every worker
+        make()  # fails here on a wrong name, not in every worker
         yield ChosenPlanner(make, {"name": choice.name})
         return
     if choice.server and choice.model.endswith(SUFFIX):
@@ -127,7 +127,7 @@ def named_planner(name: str) -> Planner:
 
 @dataclass
 class ServerPlanner:
-    """Asks a server for the best grasp of each observation; waits for one that restarts."""
+    """Requests the best grasp of each observation from a server; waits while it restarts."""
 
     address: str  # host:port (gRPC) or http://host:port
     rules: PlanningRules  # of the protocol
@@ -190,7 +190,7 @@ class InProcessPlanner:
         options = parse_options(asked)
         cloud = CloudInput(observation.image, view_ids=view_ids(observation))
         threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # sums then do not depend on how many there are elsewhere
+        torch.set_num_threads(1)  # so that sums do not depend on the number of threads elsewhere
         try:
             if self._robot is None:
                 return _best(self._detector.detect(cloud, options).grasps, asked)
@@ -236,7 +236,7 @@ def request_options(
         "top_k": 1,
         "min_score": rules.min_score,
     }
-    if observation.table != "auto":  # there the detector finds out for itself
+    if observation.table != "auto":  # the detector finds them itself
         options |= {"support": support, "workspace": {"min": low, "max": high}}
     return options | dict(extra)
 
@@ -247,7 +247,7 @@ def view_ids(observation: Observation) -> NDArray[np.int32] | None:
 
 
 def _best(grasps: Sequence[Any], options: Mapping[str, Any]) -> PlannedGrasp | None:
-    """The first of the grasps, which come best first; for an arm, only with a motion."""
+    """The first of the sorted grasps; for an arm, the first with a motion."""
     if not grasps:
         return None
     best = grasps[0]

@@ -1,9 +1,9 @@
-"""The worker's function as a Ray Serve application, for more machines than one.
+"""The worker's function as a Ray Serve application, for several machines.
 
 serve run docker/ray/serve.yaml
 
-docs/scaling.md says when. Ray does what `edgegrasp_service.front` does for one machine: it admits,
-queues, chooses a replica, adds and replaces replicas. Streams, tokens and TLS it has not.
+docs/scaling.md says when to use it. Ray replaces `edgegrasp_service.front`: it admits and queues
+requests, and chooses, adds and replaces replicas. It has no streams, tokens or TLS.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ class Grasps:
     """A worker: one request at a time, bytes in and bytes out."""
 
     async def reconfigure(self, settings: dict[str, Any]) -> None:
-        """Load what these settings of the server name; Ray calls it at start and as they change."""
+        """Load the weights of these settings; called by Ray at start and on changes."""
         given = Settings(**settings)
         self._catalogue = await asyncio.to_thread(load_catalogue, given)
         self._settings = given

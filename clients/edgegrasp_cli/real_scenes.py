@@ -1,4 +1,4 @@
-"""Recorded scenes with labels, and how a detector's grasps are judged by them.
+"""Recorded scenes with labels, and the evaluation of a detector's grasps on them.
 
 A scene is an .npz file: docs/benchmark.md has its arrays.
 """
@@ -33,7 +33,7 @@ class RealScene:
     """A camera's data with labels. Camera frame, metres; R rows."""
 
     name: str
-    request: Mapping[str, Any]  # what a detector gets, as arguments of `GraspClient.detect`
+    request: Mapping[str, Any]  # the detector's input, as arguments of `GraspClient.detect`
     points: Float32  # (R, 3) NaN where there is no reading
     labels: NDArray[np.uint8]  # (R,) 0 anything else, 1 the support plane, 2 and up objects
     normal: Float64 | None  # (3,) of the support plane, toward the camera; None: it is hidden
@@ -53,7 +53,7 @@ class RealScene:
 
     @property
     def feet(self) -> Float64:
-        """(K, 3) the middle of each object, dropped onto the support plane, which is seen."""
+        """(K, 3) the middle of each object, projected onto the visible support plane."""
         assert self.normal is not None
         middles = [
             np.nanmedian(self.points[self.labels == label], axis=0) for label in self.objects
@@ -65,16 +65,16 @@ class RealScene:
 
 @dataclass(frozen=True)
 class PlaneFigures:
-    """The plane that was found, beside the labelled one."""
+    """The found plane, compared with the labelled one."""
 
     angle: float  # degrees between the normals
-    offset: float  # metres between the planes at the foot of an object, the greatest
+    offset: float  # greatest distance between the planes at the foot of an object, metres
     right: bool  # whether grasps may rely on it
 
 
 @dataclass(frozen=True)
 class SceneFigures:
-    """What the answer for one scene is worth: counts of its best grasps."""
+    """Evaluation of the answer for one scene: counts over its best grasps."""
 
     grasps: int  # in the answer
     best: int  # of those judged, BEST at most
@@ -87,14 +87,15 @@ class SceneFigures:
     plane_labelled: bool  # otherwise the scene is a heap: its objects are one, its plane hidden
     segmentation: Segmentation
     milliseconds: float  # from the request to the answer
-    refused: str = ""  # why the request was
+    refused: str = ""  # the reason, if the request was refused
 
 
 def load_scenes(folders: Sequence[Path]) -> list[RealScene]:
     """The scenes of folders, by name in each.
 
     Raises:
-        ValueError: One has none, or a file is none, or two have one name; names file and fix.
+        ValueError: A folder has no scene, a file is not a scene, or two have the same name; names
+            file and fix.
     """
     files: list[Path] = []
     for folder in folders:
@@ -112,7 +113,7 @@ def load_scene(file: Path) -> RealScene:
     """Read one scene.
 
     Raises:
-        ValueError: It is none; names file, field and fix.
+        ValueError: It is not a scene; names file, field and fix.
     """
     try:
         with np.load(file) as archive:
@@ -155,7 +156,7 @@ def judge(
     gripper: "Gripper",
     milliseconds: float,
 ) -> SceneFigures:
-    """What an answer is worth.
+    """Evaluate an answer.
 
     Args:
         scene: With its labels.
@@ -188,7 +189,7 @@ def judge(
 
 
 def _meet_points(scene: RealScene, grasps: Sequence[Any], gripper: "Gripper") -> Bools:
-    """Which open hands (E,) hold a measured point deeper than NOISE: of all, none cleaned away."""
+    """Which open hands (E,) contain a measured point, before any cleaning, deeper than NOISE."""
     from edgegrasp_model.hand_kernels import any_point_in_boxes
 
     seen = scene.points[np.isfinite(scene.points).all(axis=1)]
@@ -203,7 +204,7 @@ def _objects_held(scene: RealScene, grasps: Sequence[Any]) -> Int64:
     """The label (E,) of the object that both points of a grasp are on; 0: of none."""
     seen = np.isfinite(scene.points).all(axis=1)
     ends = [(grasp.approach_point, grasp.contact_point) for grasp in grasps]
-    # Points of a grasp are means of small voxels: they lie beside a measured point, not on it.
+    # Points of a grasp are means of small voxels, so they lie near a measured point, not on it.
     _, row = cKDTree(scene.points[seen]).query(np.asarray(ends).reshape(-1, 2, 3))
     label = scene.labels[seen][row].astype(np.int64)  # (E, 2)
     same = (label[:, 0] == label[:, 1]) & (label[:, 0] >= FIRST_OBJECT)
@@ -219,7 +220,7 @@ def _compare(scene: RealScene, normal: Array, offset: float) -> PlaneFigures:
 
 
 class _Arrays:
-    """The arrays of a file; what is wrong with one raises ValueError."""
+    """The arrays of a file; an invalid one raises ValueError."""
 
     def __init__(self, file: str, arrays: Mapping[str, Array]) -> None:
         self.file = file
@@ -228,7 +229,7 @@ class _Arrays:
     def get(
         self, field: str, kinds: str, wanted: str, shape: tuple[int, ...] | None = None
     ) -> Array:
-        """An array of one of these dtype kinds and, where one is given, of a shape."""
+        """An array of one of these dtype kinds and, if given, of a shape."""
         if field not in self.arrays:
             self.refuse(field, "nothing", wanted)
         array = self.arrays[field]
@@ -241,7 +242,7 @@ class _Arrays:
 
 
 def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
-    """Normal (3,) and offset of the support plane; None and 0 where the file has neither."""
+    """Normal (3,) and offset of the support plane; None and 0 if the file has neither."""
     if not {"support_normal", "support_offset"} & arrays.arrays.keys():
         return None, 0.0
     normal = arrays.get("support_normal", "f", "three numbers, of length 1", (3,))
@@ -252,7 +253,7 @@ def _plane(arrays: _Arrays) -> tuple[Float64 | None, float]:
 
 
 def _cloud(arrays: _Arrays) -> tuple[dict[str, Any], Float32]:
-    """What a detector gets; and the points (H, W, 3) or (N, 3), NaN where there is no reading."""
+    """The detector's input, and the points (H, W, 3) or (N, 3), NaN without a reading."""
     from edgegrasp_camera.depth import DepthView, fuse_depth_images, intrinsics_of
 
     if "depth" in arrays.arrays:

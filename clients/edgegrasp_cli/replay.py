@@ -1,4 +1,4 @@
-"""`edgegrasp replay`: make an attempt of a benchmark again, or a request that a server recorded."""
+"""`edgegrasp replay`: repeat an attempt of a benchmark, or a request recorded by a server."""
 
 import json
 import sys
@@ -36,7 +36,7 @@ def attempt(
         Path | None, Option(help="PNG to write: the cloud seen, and the gripper.")
     ] = None,
 ) -> None:
-    """Make one recorded attempt again, in the scene and view it was made in."""
+    """Repeat one recorded attempt, in its scene and view."""
     from rich.console import Console
 
     from edgegrasp_camera.picture import draw_grasps
@@ -66,7 +66,7 @@ def request(
     file: Annotated[Path, typer.Argument(help="A file that a server with --record-folder wrote.")],
     config: Annotated[Path | None, Option(help="TOML file with the server's settings.")] = None,
 ) -> None:
-    """Answer a recorded request again, in this process, and compare with the answer of then.
+    """Answer a recorded request again, in this process, and compare with the recorded answer.
 
     Weights and limits are those of --config and of EDGEGRASP_* variables, as for `serve`.
     """

@@ -1,4 +1,4 @@
-"""The command `robot`: make a robot file of a URDF, and check one."""
+"""The command `robot`: make a robot file from a URDF, and check one."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`edgegrasp serve`, and `view`: the playground of a server of one's own."""
+"""`edgegrasp serve`, and `view`, which opens the playground of a local server."""
 
 import json
 import os
@@ -70,7 +70,7 @@ def view(
 
     from edgegrasp_client.connection import local_server
 
-    # A supervisor ends it as Ctrl-C does, also in the background: its server goes with it.
+    # SIGTERM from a supervisor ends it like Ctrl-C, together with its server.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     given = {"intrinsics": intrinsics, "depth_scale": depth_scale, "viewpoint": viewpoint}

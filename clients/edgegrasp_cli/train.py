@@ -123,7 +123,7 @@ def train(
 
 
 def _trainer(data: list[Path], asked: TrainFlags) -> "Trainer":
-    """What trains on the views of these folders."""
+    """The trainer for the views of these folders."""
     from edgegrasp_training.recipes import recipe
     from edgegrasp_training.teacher import Teacher
     from edgegrasp_training.training import Trainer
@@ -215,5 +215,5 @@ def import_checkpoint(
 
 
 def _command() -> str:
-    """The command as it was typed, for cards of data and of models."""
+    """The command line, for data and model cards."""
     return shlex.join(["edgegrasp", *sys.argv[1:]])

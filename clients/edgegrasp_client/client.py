@@ -43,11 +43,11 @@ Parameters = ParamSpec("Parameters")
 
 _LOOPS: dict[int, asyncio.AbstractEventLoop] = {}  # by process
 _STARTING = threading.Lock()
-_ASKED_OVER_GRPC: set[int] = set()  # this process, and those that it was forked from
+_ASKED_OVER_GRPC: set[int] = set()  # this process and its ancestors
 
 
 class AsyncGraspClient:
-    """Asks one server for grasps; use as an async context manager, or close it.
+    """Client of one server; use it as an async context manager, or close it.
 
     Args:
         address: "host:port" for gRPC, "http://host:port" or "https://..." for REST; or the socket
@@ -55,8 +55,8 @@ class AsyncGraspClient:
             "http+unix:/run/edgegrasp/http.sock" for REST.
         timeout: Seconds for one call with its retries, unless the call says otherwise; over REST
             for each of connecting, sending and waiting.
-        retry: Whether to try again, after short random delays, where the server is away or busy
-            or lost the worker of the request. Requests of a stream are sent once.
+        retry: Whether to try again, after short random delays, if the server is away or busy or
+            lost the request's worker. Requests of a stream are sent once.
         token: For a server that requires one; send it over TLS only.
         tls: How to verify the server; None: gRPC is not encrypted, and "https://..." trusts the
             authorities that httpx trusts.
@@ -106,7 +106,7 @@ class AsyncGraspClient:
             segment_ids: (N,) integers, which `segments` of a region name.
             view_ids: (N,) integers: which of several positions of `viewpoint` saw each row.
             timeout: Seconds to wait; None: the client's own.
-            options: As in DetectOptions; what is left out takes the server's default.
+            options: As in DetectOptions; options left out take the server's defaults.
 
         Raises:
             GraspClientError: As in edgegrasp_client.errors.
@@ -129,10 +129,10 @@ class AsyncGraspClient:
         timeout: float | None = None,
         **options: Unpack[DetectOptions],
     ) -> Scoring:
-        """Score edges or hand poses of one's own: the paper's grasp evaluation function.
+        """Score your own edges or hand poses (the paper's grasp evaluation function).
 
-        `edges` are (M, 2) integers, approach and contact point, rows of the cloud as sent; in their
-        place `hand_poses`, (M, 4, 4) T_cloud_hand. All else is as for `detect`.
+        `edges` are (M, 2) integers, approach and contact point, rows of the cloud as sent; or give
+        `hand_poses`, (M, 4, 4) T_cloud_hand. Everything else is as for `detect`.
 
         Returns:
             An evaluation for each edge or pose, in their order.
@@ -150,16 +150,15 @@ class AsyncGraspClient:
         *,
         timeout: float | None = None,
     ) -> AsyncGenerator[StreamAnswer, None]:
-        """Find grasps in one cloud after the other, over one stream.
+        """Find grasps in a sequence of clouds over one stream.
 
-        The next request is sent while earlier ones are at work; where the server is behind, this
-        does not run ahead of it. Over REST, each request waits for the answer before it, on one
-        connection.
+        The next request is sent while earlier ones are processed, but not faster than the server
+        accepts them. Over REST, each request waits for the previous answer, on one connection.
 
         Args:
-            requests: Read as they can be sent; an error in it ends the stream once what went
-                before is answered.
-            timeout: Seconds for each request that does not say; None: the client's own.
+            requests: Read as they can be sent; an exception from it ends the stream after the
+                earlier requests are answered.
+            timeout: Seconds for each request without its own; None: the client's.
 
         Yields:
             An answer to each request, in their order; the error of one does not end the stream.
@@ -180,7 +179,7 @@ class AsyncGraspClient:
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
     ) -> None:
-        """Tell a server with an `outcomes_file` what became of a grasp of a detection; over REST.
+        """Report the outcome of an executed grasp to a server with an `outcomes_file`; REST only.
 
         Raises:
             GraspClientError: As in edgegrasp_client.errors; over gRPC there is no such call.
@@ -190,14 +189,14 @@ class AsyncGraspClient:
         await self._retried(call, timeout)
 
     async def ready(self, *, timeout: float | None = None) -> bool:
-        """Whether the server answers requests: False if it is not there or still loading."""
+        """Whether the server can answer requests; False if it is unreachable or still loading."""
         return await self._transport.ready(self._seconds(timeout))
 
     async def wait_until_ready(self, timeout: float = 60.0) -> None:
-        """Return once the server answers requests.
+        """Wait until the server can answer requests.
 
         Raises:
-            DeadlineError: It did not within `timeout` seconds.
+            DeadlineError: It was not ready within `timeout` seconds.
         """
         end = time.monotonic() + timeout
         while not await self.ready(timeout=max(POLL_SECONDS, end - time.monotonic())):
@@ -207,7 +206,7 @@ class AsyncGraspClient:
 
     async def close(self) -> None:
         """Close the connection."""
-        self._retry = False  # a call that this cancels has no connection to try again on
+        self._retry = False  # calls cancelled here have no connection to retry on
         await self._transport.close()
 
     async def __aenter__(self) -> Self:
@@ -224,7 +223,7 @@ class AsyncGraspClient:
     async def _retried(
         self, call: Callable[[float], Awaitable[Answer]], timeout: float | None
     ) -> Answer:
-        """The answer of a call, made again while the server is away or busy and time is left."""
+        """Make a call, retrying while the server is away or busy and time is left."""
         left = self._seconds(timeout)
         end = time.monotonic() + left
         attempt = 0
@@ -235,7 +234,7 @@ class AsyncGraspClient:
                 delay = retry_delay(error, attempt)
                 if not self._retry or delay is None or time.monotonic() + delay >= end:
                     raise
-                # A request that a worker died of may be why: one more try.
+                # The request itself may have killed the worker, so it is retried only once.
                 attempt += RETRIES if isinstance(error, WorkerLostError) else 1
             await asyncio.sleep(delay)
             left = max(end - time.monotonic(), 0.0)
@@ -261,7 +260,7 @@ async def _named(
 def _waiting(
     method: Callable[Concatenate[AsyncGraspClient, Parameters], Coroutine[Any, Any, Answer]],
 ) -> "Callable[Concatenate[GraspClient, Parameters], Answer]":
-    """A method of the asynchronous client that returns its answer."""
+    """Runs a method of the asynchronous client and returns its result."""
 
     @wraps(method)
     def call(self: "GraspClient", /, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Answer:
@@ -271,7 +270,7 @@ def _waiting(
 
 
 class GraspClient:
-    """Asks one server for grasps; use as a context manager, or close it. Any thread may call it.
+    """Client of one server; use it as a context manager, or close it. Thread-safe.
 
     Arguments and methods are those of `AsyncGraspClient`.
     """
@@ -288,7 +287,7 @@ class GraspClient:
     ) -> None:
         if not is_rest(address):
             _ASKED_OVER_GRPC.add(os.getpid())
-            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait for ever, for threads of the parent's
+            if len(_ASKED_OVER_GRPC) > 1:  # gRPC would wait forever
                 fix = "Start processes by `spawn`, or ask over REST."
                 raise invalid("address", "gRPC in a fork of a process that has used it", fix)
 
@@ -315,7 +314,7 @@ class GraspClient:
     def detect_stream(
         self, requests: Iterable[StreamRequest], *, timeout: float | None = None
     ) -> Iterator[StreamAnswer]:
-        """As `AsyncGraspClient.detect_stream`; the requests are read in a thread of their own."""
+        """As `AsyncGraspClient.detect_stream`; the requests are read in a separate thread."""
         answers = self._client.detect_stream(_from_thread(requests), timeout=timeout)
 
         async def following() -> StreamAnswer | None:
@@ -327,7 +326,7 @@ class GraspClient:
         try:
             while (answer := _run(following())) is not None:
                 yield answer
-        finally:  # not waited for: the garbage collector may come here in the loop's own thread
+        finally:  # not awaited, since the garbage collector may call this in the loop's own thread
             asyncio.run_coroutine_threadsafe(end(), _loop())
 
     def __enter__(self) -> Self:
@@ -340,7 +339,7 @@ class GraspClient:
 
 
 def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of all clients of this process; a forked one has none of its parent's."""
+    """The event loop shared by all clients of this process; a forked process starts its own."""
     with _STARTING:
         if os.getpid() not in _LOOPS:
             loop = _LOOPS[os.getpid()] = asyncio.new_event_loop()
@@ -349,7 +348,7 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
-    """What the work gives; where its caller is interrupted, it is cancelled."""
+    """Run a coroutine and return its result; it is cancelled if the caller is interrupted."""
     running = asyncio.run_coroutine_threadsafe(work, _loop())
     try:
         return running.result()
@@ -359,7 +358,7 @@ def _run(work: Coroutine[Any, Any, Answer]) -> Answer:
 
 
 async def _from_thread(requests: Iterable[StreamRequest]) -> AsyncIterator[StreamRequest]:
-    """The requests; to wait for the next one holds up nothing, not even the program's end."""
+    """The requests, read in a daemon thread: waiting for one blocks nothing, not even exiting."""
     source = iter(requests)
 
     def read(found: "Future[StreamRequest | None]") -> None:

@@ -14,7 +14,7 @@ from edgegrasp_client.errors import OverloadedError, ServerUnavailableError, inv
 DEFAULT_ADDRESS = "127.0.0.1:50051"
 HTTP_OVER_UNIX = "http+unix:"
 
-RETRIES = 4  # of a call to a server that is away; a busy one is asked until the timeout
+RETRIES = 4  # attempts for a server that is away; a busy one is retried until the timeout
 FIRST_DELAY, LONGEST_DELAY = 0.1, 2.0  # seconds; each is twice the one before
 STOP_SECONDS = 15.0  # for a local server to drain
 
@@ -24,7 +24,7 @@ class Tls:
     """How to verify the server, and the client's own certificate; files in PEM."""
 
     ca: str | Path | None = None  # authorities to trust; None: those of the machine
-    certificate: str | Path | None = None  # one's own, for servers that ask for it
+    certificate: str | Path | None = None  # the client's own, for servers that require one
     key: str | Path | None = None  # of that certificate
 
     def __post_init__(self) -> None:
@@ -41,7 +41,7 @@ def is_rest(address: str) -> bool:
 def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
     """Seconds to wait after a failed attempt, counted from 0; None: it was the last.
 
-    The delays double and are drawn at random, so that clients refused together come back apart.
+    Delays double and are randomised, so that clients refused together do not return together.
     """
     longest = min(FIRST_DELAY * 2 ** min(attempt, 10), LONGEST_DELAY)
     jittered = random.uniform(longest / 2, longest)
@@ -51,7 +51,7 @@ def retry_delay(error: ServerUnavailableError, attempt: int) -> float | None:
 
 
 def token_metadata(token: str | None) -> tuple[tuple[str, str], ...]:
-    """What carries a token, in metadata and headers; raises InvalidRequestError if none can."""
+    """The metadata or headers with a token; raises InvalidRequestError for an unusable one."""
     if token is None:
         return ()
     if not (token.isascii() and token.isprintable() and token and " " not in token):
@@ -79,17 +79,17 @@ class Addresses(NamedTuple):
 
 @contextmanager
 def local_server(*flags: str, program: Sequence[str] = ()) -> Iterator[Addresses]:
-    """Run `edgegrasp serve` on free ports while the context lasts.
+    """Run `edgegrasp serve` on free ports for the duration of the context.
 
     Args:
         flags: Further flags of `edgegrasp serve`.
-        program: What to run as `edgegrasp`; empty: the one that is installed here.
+        program: The program to run; empty: the installed `edgegrasp`.
 
     Yields:
         Its addresses, once it is ready.
 
     Raises:
-        ServerUnavailableError: It is not installed here or does not start; it says why on stderr.
+        ServerUnavailableError: It is not installed or does not start; its stderr says why.
     """
     installed = Path(sysconfig.get_path("scripts")) / "edgegrasp"
     if not (program or installed.is_file()):

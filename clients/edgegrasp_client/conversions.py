@@ -1,4 +1,4 @@
-"""Grasps in the conventions of other programs; nothing of theirs is imported.
+"""Grasps in the conventions of other programs, none of which is imported.
 
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
 - Rotations as quaternions xyzw.
@@ -31,15 +31,15 @@ _AXES = {
 
 @dataclass(frozen=True)
 class HandFrame:
-    """A frame fixed to the hand: which of its axes point where, and where its origin lies.
+    """A frame fixed to the hand: the directions of its axes and its origin.
 
     Turning a parallel-jaw hand by 180 degrees about the approach gives the same grasp, so that
     `closing="x"` and `closing="-x"` are equally right.
     """
 
-    approach: str  # its axis along which the hand moves to the object: x, -x, y, -y, z or -z
+    approach: str  # its axis along the approach: x, -x, y, -y, z or -z
     closing: str  # its axis along our y, the closing direction
-    origin_z: float = 0.0  # metres from the origin of our hand frame to its own, along our z
+    origin_z: float = 0.0  # metres from our hand frame's origin to its own, along our z
 
     def __post_init__(self) -> None:
         for axis in (self.approach, self.closing):
@@ -130,7 +130,7 @@ def moveit_grasp(
     Build the message with `rosidl_runtime_py.set_message_fields(Grasp(), fields)`.
 
     Args:
-        grasp: What the server answered.
+        grasp: A grasp of the server's answer.
         frame_id: Name of the cloud's frame.
         name: The message's `id`.
         stamp: When the cloud was taken, `sec` and `nanosec`: a frame that moves with the hand is
@@ -138,9 +138,10 @@ def moveit_grasp(
         joints: The gripper's joints.
         T_hand_link: (4, 4) pose in our hand frame of the end effector's parent link, whose pose
             MoveIt wants, such as PANDA_LINK8; None: it is the hand frame.
-        approach_distance: Metres of straight way in.
-        retreat_distance: Metres of straight way out.
-        retreat_direction: (3,) way out, cloud frame; None: back along the approach.
+        approach_distance: Metres of straight approach.
+        retreat_distance: Metres of straight retreat.
+        retreat_direction: (3,) direction of the retreat, cloud frame; None: back along the
+            approach.
 
     Returns:
         The message's fields; orientations are the four fields x, y, z, w.
@@ -190,7 +191,7 @@ def isaac_grasps(
     """Grasps as the text of an `isaac_grasp` file.
 
     Args:
-        grasps: What the server answered, best first.
+        grasps: Grasps of the server's answer, best first.
         object_frame: Name of the object's frame, such as `/World/mug`.
         gripper_frame: Name of the gripper's frame, such as `/World/panda_hand`.
         T_object_cloud: (4, 4) pose of the cloud's frame in the object's; None: they are the same.

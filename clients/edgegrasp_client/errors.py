@@ -1,4 +1,4 @@
-"""What can go wrong, the same over either transport.
+"""Exceptions of the client, the same over both transports.
 
 GraspClientError
   + InvalidRequestError         the cloud or an option is wrong: field, value, fix
@@ -16,7 +16,7 @@ GraspClientError
 
 
 class GraspClientError(Exception):
-    """Base of every error the client raises on purpose."""
+    """Base of every error that the client raises on purpose."""
 
 
 class InvalidRequestError(GraspClientError):
@@ -45,7 +45,7 @@ class PayloadTooLargeError(InvalidRequestError):
 
 
 class AccessDeniedError(GraspClientError):
-    """The server asks for a token: there is none, it is unknown, or it does not allow this."""
+    """The server requires a token, and it is missing, unknown or without the needed permission."""
 
 
 class ServerUnavailableError(GraspClientError):
@@ -61,7 +61,7 @@ class OverloadedError(ServerUnavailableError):
 
 
 class WorkerLostError(ServerUnavailableError):
-    """The process that worked on the request died or was killed."""
+    """The worker process of the request died or was killed."""
 
 
 class DeadlineError(GraspClientError):
@@ -106,7 +106,7 @@ def error_of_kind(
     *,
     retry_after: float | None = None,
 ) -> GraspClientError:
-    """The exception for an error the server describes."""
+    """The exception for an error reported by the server."""
     error = _BY_KIND.get(kind, ProtocolError)
     if issubclass(error, OverloadedError) and retry_after is not None:
         return error(message, retry_after)
@@ -116,5 +116,5 @@ def error_of_kind(
 
 
 def invalid(field: str, value: str, fix: str) -> InvalidRequestError:
-    """The exception for what the client refuses before it is sent."""
+    """The exception for a request that the client refuses before sending it."""
     return InvalidRequestError(f"{field}: got {value}. {fix}", field, value, fix)

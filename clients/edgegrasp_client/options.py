@@ -1,4 +1,4 @@
-"""Options of a request; what is left out, or None, takes the server's default.
+"""Options of a request; those left out or None take the server's defaults.
 
 docs/options.md says what each means.
 """

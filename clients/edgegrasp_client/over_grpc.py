@@ -37,10 +37,10 @@ Answer = TypeVar("Answer")
 CHANNEL_OPTIONS = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
-    ("grpc.lb_policy_name", "round_robin"),  # of all servers that a name stands for
+    ("grpc.lb_policy_name", "round_robin"),  # balance over all servers of a name
     ("grpc.initial_reconnect_backoff_ms", 100),  # servers restart within seconds
     ("grpc.max_reconnect_backoff_ms", 1000),
-    # A server that vanished without a word is found out, and streams to it end.
+    # Detects servers that vanished, and ends streams to them.
     ("grpc.keepalive_time_ms", 30_000),
     ("grpc.keepalive_timeout_ms", 10_000),
 )
@@ -61,7 +61,7 @@ _BY_CODE: dict[grpc.StatusCode, type[GraspClientError]] = {
     grpc.StatusCode.PERMISSION_DENIED: AccessDeniedError,
     grpc.StatusCode.UNAVAILABLE: ServerUnavailableError,
     grpc.StatusCode.CANCELLED: ServerUnavailableError,
-    grpc.StatusCode.INTERNAL: ServerUnavailableError,  # of a proxy: our servers say more
+    grpc.StatusCode.INTERNAL: ServerUnavailableError,  # from a proxy; our servers send more detail
     grpc.StatusCode.UNKNOWN: ServerFailedError,
 }
 
@@ -111,7 +111,7 @@ class GrpcTransport:
                         request=message_of(request.request),
                         timeout=timeout if request.timeout is None else request.timeout,
                     )
-            except Exception as error:  # gRPC reads this elsewhere, and would only log it
+            except Exception as error:  # gRPC would only log it
                 failed.append(error)
 
         call: Any = self._stub.DetectGraspsStream(messages(), metadata=self._metadata)
@@ -137,7 +137,7 @@ class GrpcTransport:
         except grpc.RpcError as error:
             if error.code() != grpc.StatusCode.UNIMPLEMENTED:
                 return False
-        try:  # a server without gRPC's health service, such as Ray's, answers a request or not
+        try:  # a server without gRPC's health service, such as Ray's: try a request
             return bool((await self.models(timeout)).models)
         except GraspClientError:
             return False
@@ -157,7 +157,7 @@ class GrpcTransport:
 
 
 def read_field(message: Message, name: str) -> Any:
-    """A field of an answer; None if it is absent. What the parsers of `results` read with."""
+    """A field of an answer; None if absent. Used by the parsers in `results`."""
     absent = message.DESCRIPTOR.fields_by_name[name].has_presence and not message.HasField(name)
     return None if absent else getattr(message, name)
 
@@ -216,11 +216,10 @@ def message_of(request: Request) -> Any:
 
 
 def fill(message: Message, value: object, path: str) -> None:
-    """Set a message to a plain value, written as the same thing is in JSON.
+    """Fill a message from a plain value in the form it has in JSON.
 
     Raises:
-        InvalidRequestError: The message cannot hold the value. Whether the value is a good one is
-            for the server to say.
+        InvalidRequestError: The message cannot hold the value. The server checks everything else.
     """
     if (form := _FORMS.get(type(message))) is not None:
         message, value = form(message, value, path)
@@ -265,12 +264,12 @@ def _extend(container: Any, values: object, path: str, messages: bool) -> None:
 
 
 def _known(message: Message) -> str:
-    internal = ("disabled", "ransac", "auto", "object_choice")  # JSON writes these in another way
+    internal = ("disabled", "ransac", "auto", "object_choice")  # JSON writes these differently
     return ", ".join(f.name for f in message.DESCRIPTOR.fields if f.name not in internal)
 
 
 def _options(message: Message, value: Any, path: str) -> Filled:
-    """One viewpoint may be given without a list around it, and objects as a choice of them."""
+    """One viewpoint may be given without a list, and objects as a choice of some."""
     if isinstance(value.get("objects"), Mapping):
         value = {**value, "object_choice": value["objects"]}
         del value["objects"]
@@ -330,7 +329,7 @@ def _collision(message: Message, value: Any, path: str) -> Filled:
 
 
 def _with_pose(message: Message, value: Any, path: str) -> Filled:
-    """A pose may also be rows, as arrays are sent."""
+    """A pose may also be given as rows, like an array."""
     for name, pose in value.items() if isinstance(value, Mapping) else ():
         if name.startswith("T_") and pose and all(isinstance(row, list) for row in pose):
             value = {**value, name: [number for row in pose for number in row]}

@@ -123,7 +123,8 @@ class RestTransport:
 def call_of(request: Request) -> Call:
     """The call of a request; raises InvalidRequestError for what HTTP cannot carry.
 
-    A point cloud file as body and options as query parameters, or a form where there is more.
+    Sends a point cloud file as the body and options as query parameters, or a form if there is
+    more.
     """
     cloud = request.cloud
     query = {name: _text(f"options.{name}", value) for name, value in request.options.items()}
@@ -171,7 +172,7 @@ def _base64(value: object) -> str:
 
 
 def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspClientError:
-    """The exception for an error the server describes."""
+    """The exception for an error reported by the server."""
     kind = str(problem.get("type", ""))
     if not kind.startswith(KIND_PREFIX):
         return _foreign(response)
@@ -181,12 +182,12 @@ def _described(problem: Mapping[str, Any], response: httpx.Response) -> GraspCli
 
 
 def _foreign(response: httpx.Response) -> GraspClientError:
-    """The exception for an answer of something else, such as a proxy in between."""
+    """The exception for an answer from something else, such as a proxy."""
     status = response.status_code
     what = f"{response.request.url} answered {status} {response.reason_phrase}"
     if status == httpx.codes.REQUEST_ENTITY_TOO_LARGE:
         return PayloadTooLargeError(f"{what}.")
-    retry_after = response.headers.get("retry-after", "")  # may also be a date, which is not read
+    retry_after = response.headers.get("retry-after", "")  # may also be a date, which is ignored
     if status == httpx.codes.TOO_MANY_REQUESTS or (status == 503 and retry_after.isdecimal()):
         return OverloadedError(f"{what}.", float(retry_after) if retry_after.isdecimal() else 1.0)
     if status in (500, 502, 503, 504):

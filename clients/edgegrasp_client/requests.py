@@ -1,6 +1,7 @@
 """What a caller asks: checked as far as it can be without the server, in the forms of the wire.
 
-Also what makes a request of a segmenter's mask, or of an object's cloud and its scene's.
+Also helpers that build a request from a segmentation mask, or from an object's cloud and its
+scene's.
 """
 
 import io
@@ -89,7 +90,7 @@ class Request:
         scores: Whether there is something to score.
 
     Raises:
-        InvalidRequestError: There is no cloud, or more than one; an array or an option is wrong.
+        InvalidRequestError: No cloud or more than one; or an array or option is wrong.
     """
 
     def __init__(
@@ -118,11 +119,11 @@ class StreamRequest:
 
     Attributes:
         request: The cloud and what comes with it.
-        request_id: What the answer is called; empty: the number of the request, from 0.
-        timeout: Seconds until nobody wants the answer any more; None: the stream's.
+        request_id: The id of the answer; empty: the number of the request, from 0.
+        timeout: Seconds after which the answer is no longer wanted; None: the stream's.
 
     Raises:
-        InvalidRequestError: There is no cloud, or more than one; an array or an option is wrong.
+        InvalidRequestError: No cloud or more than one; or an array or option is wrong.
     """
 
     def __init__(
@@ -145,14 +146,14 @@ class StreamRequest:
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as JSON has them: lists instead of arrays, and those left out that are None.
+    """Options in JSON form: lists instead of arrays, without those that are None.
 
-    Masks stay arrays, which each transport packs: (N,) bool.
+    Masks stay (N,) bool arrays, which each transport packs.
 
-    `suppression` and `support` alone have a None of their own: none.
+    For `suppression` and `support`, None has a meaning of its own: none.
 
     Raises:
-        InvalidRequestError: An option has no such name.
+        InvalidRequestError: An option's name is unknown.
     """
     known = DetectOptions.__annotations__
     for name in options:
@@ -179,11 +180,11 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
 
     Args:
         mask: (H, W) or (H, W, C), a value for each pixel of the depth image or row of the cloud,
-            as a segmentation network gives it; any channel but a fourth, which is transparency.
-        options: What else is asked; regions in it are narrowed.
+            as a segmentation network gives it; a fourth channel, transparency, is ignored.
+        options: Other options; regions in them are narrowed.
 
     Returns:
-        The options with both regions. What lies outside of the mask stays an obstacle.
+        The options with both regions. Points outside of the mask stay obstacles.
     """
     kept = mask[..., :3].any(axis=2) if mask.ndim == 3 else mask != 0
     asked = dict(options or {})
@@ -197,10 +198,10 @@ def on_mask(mask: Array, options: Mapping[str, Any] | None = None) -> DetectOpti
 def object_in_scene(
     object_points: ArrayLike, scene_points: ArrayLike
 ) -> tuple[Float32, NDArray[np.int32]]:
-    """One cloud of an object and of the scene around it, which are sent apart.
+    """Merge the cloud of an object with the cloud of the scene around it.
 
     Args:
-        object_points: (N, 3) metres, what is to be grasped.
+        object_points: (N, 3) metres, the object to grasp.
         scene_points: (M, 3) metres, the same frame; with the object or without it.
 
     Returns:
@@ -227,7 +228,7 @@ class CloudFile(NamedTuple):
 
 
 def float32_points(cloud: Cloud) -> Float32 | None:
-    """The cloud as (N, 3) float32 if it is an array of N points; None if it is not."""
+    """The cloud as (N, 3) float32 if it is an array of N points, else None."""
     if not isinstance(cloud, np.ndarray) or cloud.dtype not in (np.float32, np.float64):
         return None
     if cloud.ndim != 2 or cloud.shape[1] != 3:
@@ -237,7 +238,7 @@ def float32_points(cloud: Cloud) -> Float32 | None:
 
 
 def cloud_file(cloud: Cloud) -> CloudFile:
-    """The cloud as a file; an array of a wrong shape is sent as it is, for the server to refuse.
+    """The cloud as a file; an array of a wrong shape is sent as is, and the server refuses it.
 
     Raises:
         InvalidRequestError: It is neither an array of numbers nor a readable file of a known

@@ -1,4 +1,4 @@
-"""What a server answers, as typed values, and how they are read from either transport."""
+"""The server's answers as typed values, and their parsers for both transports."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, is_dataclass
@@ -39,7 +39,7 @@ class ArmPlan:
     reachable: bool  # whether it gets there and straight on, and to the place, touching nothing
     pregrasp_joints: Float64 | None  # (J,) where it is reachable
     grasp_joints: Float64 | None  # (J,) where it is reachable
-    trajectory: ArmTrajectory | None  # where it was asked for and found in time
+    trajectory: ArmTrajectory | None  # if it was asked for and found in time
     place_joints: Float64 | None = None  # (J,) where it lets go; None without a place
     T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) the hand there, base frame
 
@@ -53,22 +53,22 @@ class Grasp:
         Float32, (4, 4)
     ]  # hand link frame: z out of the palm, y the closing direction
     T_cloud_tcp: Annotated[Float32, (4, 4)]  # tool centre point, same axes
-    width: float  # metres to open to before the approach; the maximum where an end is hidden
+    width: float  # metres to open to before the approach; the maximum if an end is hidden
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
     collision_free: bool  # whether the open hand touches nothing at the grasp and on its way
     clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
-    object: int | None = None  # number of the object that the contact is on; None: of none
-    arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
-    id: int | None = None  # the same in every answer that follows it; None without `previous`
+    object: int | None = None  # number of the object that the contact is on; None: no object
+    arm: ArmPlan | None = None  # None: no robot was given, or time ran out
+    id: int | None = None  # the same in all answers that follow it; None without `previous`
 
     def pregrasp(self, distance: float = 0.05) -> Float32:
-        """The hand's pose (4, 4) `distance` metres back, where the straight way in begins."""
+        """The hand's pose (4, 4) `distance` metres back, where the straight approach begins."""
         return self.retreat(distance)
 
     def retreat(self, distance: float = 0.1, direction: ArrayLike | None = None) -> Float32:
-        """The hand's pose (4, 4) after a straight way out.
+        """The hand's pose (4, 4) after a straight retreat.
 
         Args:
             distance: Metres.
@@ -93,7 +93,7 @@ class FoundSupport:
 
 @dataclass(frozen=True)
 class GripperOutline:
-    """The gripper that grasps are for, as far as drawing it needs; metres along the hand's z."""
+    """The gripper of the grasps, as needed for drawing it; metres along the hand's z."""
 
     name: str
     palm_z: float  # the palm's surface between the fingers
@@ -102,15 +102,15 @@ class GripperOutline:
 
 @dataclass(frozen=True, eq=False)
 class DetectedObject:
-    """An object that grasps are for; cloud frame, metres."""
+    """A recognised object; cloud frame, metres."""
 
     number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
-    points: int  # voxels of the processed cloud that are seen of it
+    points: int  # its number of voxels in the processed cloud
     center: Float32  # (3,) of the smallest upright box around them
     half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
-    quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
-    best_score: float | None  # of the grasps returned; None: there is none on it
-    confidence: float | None  # probability that it is an object; None: the caller named it
+    quaternion: Float32  # (4,) x, y, z, w: rotates the box's axes into the cloud's
+    best_score: float | None  # of the grasps returned; None: it has none
+    confidence: float | None  # probability that it is an object; None: given by the caller
     # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
     # nobody can say.
     reason: str | None
@@ -123,12 +123,12 @@ class Tracking:
     """How an answer follows the one before, which was sent as `previous`."""
 
     first: str  # what became of the first grasp: "started", "kept", "replaced" or "lost"
-    next_id: int  # above all ids and numbers so far
+    next_id: int  # above all ids and numbers used so far
 
 
 @dataclass(frozen=True, eq=False)
 class DebugInfo:
-    """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
+    """The processed cloud and every candidate with its outcome. V points, E candidates."""
 
     points: Annotated[Float32, (-1, 3)]  # (V, 3) metres, cloud frame
     normals: Annotated[Float32, (-1, 3)]  # (V, 3) unit
@@ -145,7 +145,7 @@ class DebugInfo:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Ranked grasps of one cloud, and how they came about."""
+    """Ranked grasps of one cloud, with counts and timings."""
 
     grasps: list[Grasp]
     counts: dict[str, int]  # points, candidates and grasps that passed each stage
@@ -169,8 +169,8 @@ class Detection:
 class Evaluation:
     """What the network says of one edge or hand pose."""
 
-    grasp: Grasp | None  # None where it defines none
-    reason: str | None  # why it defines none, in a word such as "too-long"
+    grasp: Grasp | None  # None if it defines no edge grasp
+    reason: str | None  # why it defines none, e.g. "too-long"
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +197,7 @@ class Model:
     gripper: str
     default: bool  # whether a request that names no model gets these
     hand_description: bool  # whether the network also sees the hand-frame description
-    device: str = ""  # where it computes: "cpu", or a GPU such as "cuda:0"
+    device: str = ""  # its device: "cpu", or a GPU such as "cuda:0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +223,7 @@ class StreamAnswer:
         return self.detection
 
 
-# The stages of the server, as it goes through them: gRPC carries counts and seconds in no order.
+# The server's stages in order, since gRPC maps have no order.
 _STAGES = (
     *("cloud", "points", "in_workspace", "above_support", "voxels", "kept", "in_approach_region"),
     *("approach_points", "pairs", "in_contact_region", "candidates", "in_direction"),

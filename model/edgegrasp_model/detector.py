@@ -69,7 +69,7 @@ NO_APPROACH_POINT = (
     "half of its points: around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
-MANY_HANDS = 30  # different ones that weights have learned from; then any will do
+MANY_HANDS = 30  # number of training grippers from which weights suit any gripper
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 PREFERRED = ("edgegrasp-plus", "edgegrasp", "edgegrasp-small", "vn-edgegrasp")
 DEVICE_NAMES = re.compile(r"auto|cpu|cuda(:\d+)?")
@@ -80,27 +80,27 @@ Batch = BallBatch | HandBatch
 
 @dataclass(frozen=True)
 class Prepared:
-    """A request with its scene; counts, warnings and seconds grow from stage to stage."""
+    """A request with its scene; each stage adds counts, warnings and seconds."""
 
     options: DetectOptions
     gripper: Gripper
     crop_radius: float  # metres
     selected: SelectedPoints
-    scene: Scene | None  # None where too few points are left
+    scene: Scene | None  # None if too few points are left
     counts: dict[str, int]
     warnings: list[str]
     seconds: dict[str, float]
-    followed: Followed | None = None  # objects of an earlier answer
+    followed: Followed | None = None  # objects followed from an earlier answer
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the seconds spent inside to those of a stage."""
+        """Add the time spent in the block to a stage."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
     def total_seconds(self) -> dict[str, float]:
-        """Seconds of each stage and of all."""
+        """Seconds of each stage and their total."""
         return self.seconds | {"total": sum(self.seconds.values())}
 
 
@@ -112,7 +112,7 @@ class Scored:
     logits: Float32
 
     def and_further(self, other: "Scored") -> "Scored":
-        """These and what was scored after them."""
+        """These joined with later ones."""
         logits = np.concatenate([self.logits, other.logits])
         return Scored(self.sample.and_further(other.sample), logits)
 
@@ -133,10 +133,10 @@ class GraspDetector:
 
         Args:
             network: Scores the candidates.
-            metadata: What its weights were trained for.
-            gripper: The one it was trained for, used where a request names none.
+            metadata: Describes the weights.
+            gripper: The one it was trained for, used if a request names none.
             device: Where it runs.
-            grippers: A user's own that requests may name, beside those that ship.
+            grippers: The user's own, which requests may name beside the shipped ones.
             max_voxels: Most voxels that a request's cloud may have.
         """
         self.max_voxels = max_voxels
@@ -159,7 +159,7 @@ class GraspDetector:
         Args:
             path: The file.
             device: Where the network runs; everything else runs on the processor.
-            grippers: A user's own that requests may name, beside those that ship.
+            grippers: The user's own, which requests may name beside the shipped ones.
             max_voxels: As for the constructor.
 
         Raises:
@@ -175,10 +175,10 @@ class GraspDetector:
         Args:
             cloud: (N, 3) float32 or float64 array, or (H, W, 3) with NaN holes, metres; or a
                 CloudInput. Its frame is the frame of the options and of the result.
-            options: What to ask for; the defaults where omitted.
+            options: What to ask for; the defaults if omitted.
 
         Returns:
-            Ranked grasps. None found is an answer too: the counts and warnings say why.
+            Ranked grasps. An empty list is a valid answer; its counts and warnings say why.
 
         Raises:
             InvalidRequest: The cloud or an option cannot be used; names field, value and fix.
@@ -189,18 +189,18 @@ class GraspDetector:
     def prepare(
         self, cloud: object, options: DetectOptions, max_voxels: int | None = None
     ) -> Prepared:
-        """First stage: the gripper, and the scene where enough of the cloud is left.
+        """First stage: choose the gripper, and build the scene if enough of the cloud is left.
 
-        `max_voxels`: fewer than the constructor's, where there is little time.
+        `max_voxels`: lower than the constructor's if time is short.
         """
         sent = check_cloud(cloud, options.num_approach_points or 1)
         return self._with_scene(sent, options, max_voxels)
 
     def evaluate(self, prepared: Prepared) -> Scored | None:
-        """Second stage: candidates, and the network's logits; None where there is no scene.
+        """Second stage: sample candidates and score them; None if there is no scene.
 
-        Half of the approach points first, then the other half on objects without a sure grasp,
-        then others where few hands are collision-free.
+        Starts with half of the approach points, then puts the other half on objects without a sure
+        grasp, then adds further ones if few hands are collision-free.
         """
         scene = prepared.scene
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:
@@ -222,7 +222,7 @@ class GraspDetector:
             scored = scored.and_further(self._score(prepared, more))
 
     def sampler(self, prepared: Prepared) -> Sampler:
-        """What draws the candidates of a request that has a scene."""
+        """The sampler of a request that has a scene."""
         assert prepared.scene is not None
         return Sampler(
             prepared.scene,
@@ -292,18 +292,18 @@ class GraspDetector:
         edges: object | None = None,
         hand_poses: object | None = None,
     ) -> Scoring:
-        """Score edges or hand poses of the caller's (the paper's grasp evaluation function).
+        """Score the caller's edges or hand poses (the paper's grasp evaluation function).
 
-        Options describe the scene, the hand and what it must not collide with. Regions,
-        directions and what concerns sampling and selection have no effect. The hand of an edge
+        Options describe the scene, the hand and the obstacles. Regions, approach directions, and
+        options on sampling and selection have no effect. The hand of an edge
         that would cut into the support plane is retracted where that helps, as in `detect`; given
         hand poses stay as they are.
 
         Args:
             cloud: As for `detect`.
             options: As for `detect`.
-            edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. They
-                stand for the points of the processed cloud that they went into.
+            edges: (M, 2) integers: rows of the cloud as sent, approach and contact point. Each
+                stands for the voxel that it belongs to.
             hand_poses: (M, 4, 4) T_cloud_hand. Exactly one of the two is given.
 
         Returns:
@@ -368,7 +368,7 @@ class GraspDetector:
         counts: dict[str, int] = {}
         gripper, warnings = choose_gripper(options, self.gripper, self.grippers), [*sent.warnings]
         radius = self.metadata.network.crop_radius
-        if options.gripper is not None:  # the ball has to hold every contact within reach
+        if options.gripper is not None:  # the ball has to contain every contact within reach
             radius = max(radius, gripper.max_opening / 2)
         hands = self.metadata.training.get("training_hands", 1)
         if gripper.name != self.gripper.name and hands < MANY_HANDS:
@@ -419,7 +419,7 @@ class GraspDetector:
 
     @property
     def sees_hands(self) -> bool:
-        """Whether scores are of hands where they are, not of edges wherever their hands are."""
+        """Whether the network scores the hand pose itself rather than the edge."""
         return self.metadata.network.architecture == "hand"
 
     def _score(self, prepared: Prepared, sample: Sample) -> Scored:
@@ -462,7 +462,7 @@ class GraspDetector:
 def _with_viewpoint(
     sent: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> DetectOptions:
-    """The options, with the camera at the origin where the cloud was probably seen from there."""
+    """The options, with the camera at the origin if the cloud was probably seen from there."""
     if options.viewpoint is not None:
         return options
     if seen_from_origin(sent.points, options.up):
@@ -482,7 +482,7 @@ class ModelCatalogue:
     """Named detectors, one of them the default.
 
     Attributes:
-        pace: That of the default detector on this machine, once warm.
+        pace: The default detector's, on this machine, once warm.
     """
 
     pace = Pace()
@@ -492,10 +492,10 @@ class ModelCatalogue:
 
         Args:
             detectors: By name; at least one.
-            default: Name to use where a request names none; empty: the best that is there.
+            default: Name to use if a request names none; empty: the best one loaded.
 
         Raises:
-            UnknownModel: There is no detector of the default's name.
+            UnknownModel: No detector has the default's name.
             InvalidCheckpoint: There is no detector at all.
         """
         if not detectors:
@@ -514,7 +514,7 @@ class ModelCatalogue:
         grippers: Sequence[Path] = (),
         max_voxels: int = MAX_VOXELS,
     ) -> Self:
-        """Load the weights that ship with the package, then a user's own, which win by name.
+        """Load the shipped weights, then the user's own, which replace those of the same name.
 
         Args:
             weights: `.safetensors` files, or folders of them; a model is named as its file.
@@ -545,7 +545,7 @@ class ModelCatalogue:
         return sorted(self._detectors)
 
     def get(self, name: str = "") -> GraspDetector:
-        """The detector of a name; of the default for an empty one.
+        """The detector of that name; the default for an empty name.
 
         Raises:
             UnknownModel: There is none.
@@ -556,7 +556,7 @@ class ModelCatalogue:
             raise UnknownModel(name or self.default, self._detectors) from None
 
     def describe(self) -> list[dict[str, Any]]:
-        """What each model is, as plain JSON values."""
+        """A description of each model, as plain JSON values."""
         return [
             {
                 "name": name,
@@ -574,9 +574,9 @@ class ModelCatalogue:
         ]
 
     def warm_up(self) -> None:
-        """Run every model once on a small made-up cloud, so that the first request is not slow.
+        """Run every model once on a small synthetic cloud, so that the first request is not slow.
 
-        A few candidates take every path that a request takes, in a tenth of the time.
+        Few candidates: they exercise every code path in a tenth of the time.
 
         Raises:
             InvalidCheckpoint: A network does not give the logits that it was written with.
@@ -599,7 +599,7 @@ class ModelCatalogue:
         seconds, voxels, sizes = [], [], (1_000, 200_000, 10_000)
         for size, side in zip(sizes, (0.02, 0.02, 1.5), strict=True):
             points = rng.uniform(-0.5, 0.5, (size, 3)) * (side, side, 0.001)
-            start = time.process_time()  # unlike the wall's, it is the same on a busy machine
+            start = time.process_time()  # unlike wall-clock time, it is the same on a busy machine
             counts = self.get().detect(points.astype(np.float32), options).counts
             seconds.append(time.process_time() - start)
             voxels.append(counts["voxels"])
@@ -611,7 +611,7 @@ class ModelCatalogue:
 
 
 def choose_device(name: str = "auto") -> torch.device:
-    """The device of a name, if it is there.
+    """The device of that name, if it exists.
 
     Args:
         name: `cpu`; `cuda`, the first GPU; `cuda:1` the second, and so on; `auto`: the first GPU

@@ -22,13 +22,13 @@ from edgegrasp_camera import InvalidRequest as InvalidRequest
 def invalid_fields(
     error: ValidationError, fields: object, prefix: str, known: Iterable[str] = ()
 ) -> InvalidRequest:
-    """Give the first fault of a validation error as field, value and fix.
+    """The first fault of a validation error, as field, value and fix.
 
     Args:
         error: Of pydantic.
         fields: What was validated.
         prefix: Name of the request field that holds it.
-        known: Fields that there are at the top, for one that is not.
+        known: Known top-level fields, listed when an unknown one is sent.
     """
     first = error.errors(include_url=False)[0]
     named = first["type"] in ("missing", "extra_forbidden")
@@ -47,9 +47,9 @@ def invalid_fields(
 
 
 def _path(location: Sequence[str | int], fields: object, named: bool) -> list[str]:
-    """A location in the request, without the names that pydantic gives to members of unions.
+    """A location in the request, without pydantic's names for members of unions.
 
-    Where `named`, the last part is a field that the request lacks or should not have.
+    If `named`, the last part is a missing or unexpected field.
     """
     path: list[str] = []
     here: Any = fields
@@ -65,7 +65,7 @@ def _path(location: Sequence[str | int], fields: object, named: bool) -> list[st
 
 
 def brief(value: object) -> str:
-    """A value as it goes into an error: short, however long or deep it is."""
+    """A value shortened for an error message."""
     text = _SHORT.repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
@@ -78,7 +78,7 @@ class _Short(reprlib.Repr):
         self.maxstring = self.maxlong = self.maxother = 90  # characters
 
     def repr_dict(self, value: dict[Any, Any], level: int) -> str:
-        """In the order it came in, which the base class changes."""
+        """In insertion order; the base class sorts."""
         if level <= 0:
             return "{...}"
         members = [

@@ -1,4 +1,4 @@
-"""Score the edges and hand poses that a caller gives (the paper's grasp evaluation function)."""
+"""Score edges and hand poses given by the caller (the paper's grasp evaluation function)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,13 +30,13 @@ from edgegrasp_model.results import Evaluation, NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
 
 BALLS_AT_A_TIME = 64
-FIRST_TOUCH = 0.004  # metres from the outermost point, within which points are touched first
+FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first
 FLIP = np.diag(np.array([-1.0, -1.0, 1.0, 1.0], dtype=np.float32))  # the same hand, y reversed
 
 
 @dataclass(frozen=True)
 class Scorer:
-    """A network as the evaluation sees it."""
+    """A network as `evaluate` uses it."""
 
     probability: Callable[[BallBatch | HandBatch], Floats]
     crop_radius: float  # metres
@@ -45,10 +45,10 @@ class Scorer:
 
 @dataclass(frozen=True)
 class Given:
-    """M edges or hand poses, E of which define an edge grasp."""
+    """M edges or hand poses, of which E define an edge grasp."""
 
     candidates: Candidates  # E of them; `pair` ascends and says which of the M each is
-    reason: list[NoGrasp | None]  # M: why it defines none
+    reason: list[NoGrasp | None]  # M: why it defines no edge grasp
     T_cloud_hand: Float32 | None = None  # (E, 4, 4) as given, canonical frame
 
 
@@ -60,7 +60,7 @@ def evaluate(
     scorer: Scorer,
     collide: CollisionCheck = collides,
 ) -> list[Evaluation]:
-    """Evaluate what a caller gives, in order.
+    """Evaluate the given edges or poses, in order.
 
     Args:
         scene: The scene.
@@ -68,7 +68,7 @@ def evaluate(
         gripper: The hand.
         request: What collides.
         scorer: The network.
-        collide: Says which hands collide.
+        collide: The collision check.
     """
     candidates = given.candidates
     view = hand_views(scene.cloud, candidates.T_cloud_hand, reach_of(gripper))
@@ -95,7 +95,7 @@ def evaluate(
 
 
 def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats:
-    """Scores (E,), ball by ball: there are as many balls as the caller has approach points."""
+    """Scores (E,), ball by ball; there is one ball for each approach point."""
     score = np.empty(len(candidates))
     points, normals = scene.cloud.points, scene.cloud.normals
     balls = np.unique(candidates.approach_index)
@@ -114,7 +114,7 @@ def _score_balls(scene: Scene, candidates: Candidates, scorer: Scorer) -> Floats
 
 
 def _contact_rows(candidates: Candidates, balls: Int64, crop: BallCrop, size: int) -> Int64:
-    """Rows (E,) of the crop that hold the candidates' contacts, each in its own ball."""
+    """Rows (E,) of the crop with the candidates' contacts, each in its own ball."""
     keys = crop.ball_of_point * size + crop.ball_rows  # ascending
     ball = np.searchsorted(balls, candidates.approach_index)
     return np.searchsorted(keys, ball * size + candidates.contact_index).astype(np.int64)
@@ -124,7 +124,7 @@ def check_edges(edges: object, rows: int) -> Int64:
     """Check (M, 2) rows of the cloud as sent.
 
     Raises:
-        InvalidRequest: Another type or shape, too many, or a row that the cloud does not have.
+        InvalidRequest: Wrong type or shape, too many, or a row that the cloud does not have.
     """
     fix = "Send integers of shape (M, 2): rows of the cloud, approach and contact point each."
     if not isinstance(edges, np.ndarray):
@@ -143,7 +143,7 @@ def check_hand_poses(poses: object) -> Float32:
     """Check (M, 4, 4) poses T_cloud_hand.
 
     Raises:
-        InvalidRequest: Another type or shape, too many, or one that is no rigid transform.
+        InvalidRequest: Wrong type or shape, too many, or a pose that is not a rigid transform.
     """
     fix = "Send floats of shape (M, 4, 4): T_cloud_hand."
     if not isinstance(poses, np.ndarray):
@@ -171,14 +171,14 @@ def _check_number(field: str, number: int) -> None:
 def from_edges(
     scene: Scene, edges: Int64, gripper: Gripper, crop_radius: float, margin: float
 ) -> Given:
-    """Candidates of edges, between the points of the processed cloud that their rows went into.
+    """Candidates of given edges, between the voxels that their rows belong to.
 
     Args:
         scene: The scene.
         edges: (M, 2) rows of the cloud as sent: approach and contact point.
         gripper: What has to fit.
         crop_radius: Metres around the approach point within which the contact has to be.
-        margin: Metres that hands are retracted to above the support plane, where that helps.
+        margin: Metres above the support plane to which hands are retracted.
     """
     point = scene.point_of_row[edges]
     reason: list[NoGrasp | None] = [NoGrasp.NO_POINT] * len(edges)
@@ -253,7 +253,7 @@ def from_hand_poses(
 
 
 def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int64:
-    """For each hand the point nearest to its axis, near its contact but not at it; -1: none.
+    """For each hand, the point nearest to its axis, near its contact but not at it; -1: none.
 
     Args:
         view: The cloud from M hands.
@@ -275,7 +275,7 @@ def _approach_points(view: HandView, contact: Int64, crop_radius: float) -> Int6
 
 
 def _least(group: Int64, key: Floats) -> tuple[Int64, Int64]:
-    """The groups that occur, ascending, and where in them the key is least."""
+    """The groups that occur, in ascending order, and the index of the least key in each."""
     order = np.lexsort((key, group))
     groups, first = np.unique(group[order], return_index=True)
     return groups, order[first]

@@ -27,8 +27,8 @@ class Gripper:
     tip_z: float  # fingertips of the open gripper, metres along z
     contact_z: float  # where an edge grasp puts its contact point, metres along z
     tcp_z: float  # origin of the TCP frame, metres along z
-    palm_z: float  # the hand's surface behind the space between the fingers, metres along z
-    pad_half_width: float  # half extent along x of the part of a finger that touches, metres
+    palm_z: float  # palm surface between the fingers, metres along z
+    pad_half_width: float  # half width along x of the finger's contact pad, metres
     hand_boxes: Boxes
     finger_boxes: Boxes  # one finger of the open gripper, its inner face at y = 0
     linkage: Linkage | None = None
@@ -42,19 +42,19 @@ class Gripper:
 
     @property
     def finger_depth(self) -> float:
-        """Greatest distance a contact can lie in front of the palm (the paper's G_d), metres."""
+        """Greatest distance of a contact in front of the palm (the paper's G_d), metres."""
         return self.contact_z - self.palm_z
 
     @cached_property
     def max_tip_z(self) -> float:
-        """The furthest the fingertips come as they close, metres along z."""
+        """Most forward position of the fingertips while closing, metres along z."""
         if self.linkage is None:
             return self.tip_z
-        upright = self.max_opening - 2 * self.linkage.reach  # links point straight ahead there
+        upright = self.max_opening - 2 * self.linkage.reach  # the links point straight ahead there
         return self.tip_z + float(self.tip_advance(upright))
 
     def tip_advance(self, opening: ArrayLike) -> Floats:
-        """How far the fingertips are ahead of where they are in the open gripper, metres.
+        """How far the fingertips have moved forward since the gripper was open, metres.
 
         Args:
             opening: (...) metres between the fingers.
@@ -71,9 +71,9 @@ class Gripper:
         return advance
 
     def contact_z_at(self, opening: ArrayLike) -> Float32:
-        """Where a contact lies along z once the fingers have closed to an opening.
+        """Position of a contact along z once the fingers have closed to an opening.
 
-        Always the same distance inside the fingertips, which a swinging finger brings forward.
+        A constant distance inside the fingertips, which move forward with a swinging finger.
 
         Args:
             opening: (...) metres between the fingers as they touch.
@@ -88,7 +88,8 @@ class Gripper:
 
         Args:
             opening: (...) metres.
-            advance: (...) metres the fingertips are ahead, where not as the opening has it.
+            advance: (...) metres that the fingertips have moved forward; None: as the opening
+                implies.
 
         Returns:
             (..., B, 2, 3) min and max corners, hand frame.
@@ -108,7 +109,7 @@ class Gripper:
         return self.boxes(self.max_opening)
 
     def opened_to(self, opening: float) -> "Gripper":
-        """The same gripper where it opens no further than to `opening` metres."""
+        """The same gripper, opening to at most `opening` metres."""
         ahead = float(self.tip_advance(opening))
         forward = tuple(
             ((low[0], low[1], low[2] + ahead), (high[0], high[1], high[2] + ahead))
@@ -160,19 +161,19 @@ def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:
 
 
 def load_gripper(name_or_path: str | Path = "panda") -> Gripper:
-    """Load a gripper that ships with the package by name, or a user's own by path.
+    """Load a shipped gripper by name, or a user's own by path.
 
     Raises:
-        InvalidGripper: There is no such file, or it does not describe a gripper.
+        InvalidGripper: The file does not exist or does not describe a gripper.
     """
     return gripper_from_fields(gripper_fields(name_or_path))
 
 
 def gripper_fields(name_or_path: str | Path) -> dict[str, Any]:
-    """What such a file says, ready for JSON and for a request's option `gripper`.
+    """The fields of a gripper file, ready for JSON and for the option `gripper` of a request.
 
     Raises:
-        InvalidGripper: There is no such file, or it does not describe a gripper.
+        InvalidGripper: The file does not exist or does not describe a gripper.
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
@@ -204,15 +205,15 @@ def _first_fault(error: ValidationError) -> str:
 
 
 def choose_gripper(options: DetectOptions, default: Gripper, own: Mapping[str, Gripper]) -> Gripper:
-    """The gripper a request asks for, opened as far as it asks for.
+    """The gripper of a request, at the opening it asks for.
 
     Args:
         options: gripper and collision.opening.
-        default: Used where the request names none.
-        own: A user's own, by name; they win over those that ship.
+        default: Used if the request names none.
+        own: The user's own, by name; they replace shipped ones of the same name.
 
     Raises:
-        InvalidRequest: There is none of that name, or it does not open that far.
+        InvalidRequest: No gripper has that name, or it does not open that far.
     """
     asked = options.gripper
     if asked is None:

@@ -1,9 +1,9 @@
-"""Describe each candidate by what the cloud looks like from its own hand.
+"""Describe each candidate by the cloud as seen in its own hand frame.
 
-Invariant under rotations, translations and reflections of the whole scene by construction: how
-many points the hand would hit, what lies between its fingers, from where it was seen, how the hand
-stands to gravity and support, how much of the space around it the camera did not see, which hand
-it is, and how far the object is seen to extend around it.
+Invariant under rotations, translations and reflections of the whole scene by construction. The
+numbers say how many points the hand would hit, what lies between its fingers, from where that was
+seen, how the hand is oriented to gravity and support, how much of the space around it the camera
+did not see, the hand's own measures, and the visible extent of the object around it.
 """
 
 from dataclasses import dataclass, replace
@@ -24,23 +24,23 @@ AXIS = 0.001  # metres from the approach axis, on which the approach point itsel
 SLAB = 0.004  # metres; thickness of the first layer each finger would meet
 FACING = 0.7  # cosine from which a normal faces a finger
 ABOVE = 0.001  # metres over the camera
-SEEN_LENGTH = 0.0465  # metres of the fingers, from their tips: the Panda's are no longer
+SEEN_LENGTH = 0.0465  # metres of finger length from the tips: as long as the Panda's
 # Metres beyond the pads' sides, the open fingers' inner faces, the palm and the tips.
 BESIDE, OUTSIDE, BEHIND, BEYOND_TIPS = 0.027, 0.06, 0.026, 0.012
-UNKNOWN_HEIGHT = 0.10  # metres; heights are cut off here, and unknown ones are this
-GAP = 0.007  # metres without a point in which what is between the fingers ends
+UNKNOWN_HEIGHT = 0.10  # metres; heights are clipped here, and unknown ones get this value
+GAP = 0.007  # metres; a gap this long ends what lies between the fingers
 HAND_DESCRIPTION_SIZE = 87
-HEIGHTS = slice(58, 61)  # of them: heights over the support plane
-BEYOND = slice(65, 67)  # of them: unseen metres from what each finger meets first outward
+HEIGHTS = slice(58, 61)  # which of them are heights over the support plane
+BEYOND = slice(65, 67)  # which of them are unseen metres outward from each finger's first contact
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What hands look at, in one frame, metres: N points, and what is known of where they lie."""
+    """The scene as hands see it, in one frame, metres: N points and what is known about them."""
 
     cloud: Cloud  # with normals
     up: Float32  # (3,) away from gravity
-    support: SupportPlane | None = None  # heights are measured from it
+    support: SupportPlane | None = None  # heights are measured from this plane
     viewpoints: Float32 | None = None  # (W, 3) the cameras
     # (N,) where a side of the workspace cuts objects off: what is between the fingers there may be
     # wider than it seems. None: nowhere.
@@ -54,14 +54,14 @@ class Surroundings:
         return self.viewpoints[0] if self.viewpoints is not None and one else None
 
     def mirror_sides(self, T_cloud_hand: Float32) -> Float32:
-        """1 or -1 (E,): what a hand's x is multiplied by to have the camera on its positive side.
+        """1 or -1 (E,): the factor on a hand's x that puts the camera on its positive side.
 
-        A hand and what it would grasp may be mirrored without changing the outcome. 1 for all where
-        there is not exactly one camera.
+        Mirroring a hand and its object does not change the outcome. 1 for all unless there is
+        exactly one camera.
         """
         if self.viewpoint is None:
             return np.ones(len(T_cloud_hand), dtype=np.float32)
-        # Straight ahead of a hand that comes from the camera, up decides, not rounding.
+        # If a hand approaches straight from the camera, up decides instead of rounding errors.
         toward = self.viewpoint + ABOVE * UP - T_cloud_hand[:, :3, 3]
         along_x = np.einsum("ed,ed->e", toward, T_cloud_hand[:, :3, 0])
         return np.where(along_x < 0.0, -1.0, 1.0).astype(np.float32)
@@ -76,15 +76,16 @@ def describe_hands(
 ) -> Float32:
     """The hand-frame description of each candidate.
 
-    Of several cameras, nothing but what none of them saw is described.
+    With several cameras, only the space that none of them saw is described.
 
     Args:
         around: What they look at.
         candidates: E candidates.
         gripper: Fingers open to its maximum.
-        view: `hand_views` of the same candidates, within `reach_of` the gripper, where the caller
-            has it already.
-        size: How many numbers are read. The extents, the last ones, are left out if none is.
+        view: `hand_views` of the same candidates, within `reach_of` the gripper, if the caller has
+            it already.
+        size: How many numbers the network reads; the extents, which come last, are skipped if it
+            reads none.
 
     Returns:
         (E, HAND_DESCRIPTION_SIZE), or without the extents: counts (logarithm of 1 + n), metres
@@ -105,7 +106,7 @@ def describe_hands(
         *_directions(hands, mirrored, around.viewpoint, up),
         *unseen.parts,
         *_stance(around, candidates, gripper),
-        # Older networks read no further: what is new goes here, at the end.
+        # Older networks read only the first numbers, so new ones are appended here.
         *unseen.ways,
         *unseen.depths,
         *unseen.beyond,
@@ -122,7 +123,7 @@ def describe_hands(
 def points_around_fingers(
     around: Surroundings, T_cloud_hand: Float32, gripper: Gripper, view: HandView, limit: int
 ) -> tuple[Float32, Int64]:
-    """The points that each hand sees around its fingers, x toward the only camera's side.
+    """The points around the fingers of each hand; with one camera, x points to its side.
 
     Args:
         around: What they look at.
@@ -155,15 +156,15 @@ def points_around_fingers(
 
 
 def seen_part(gripper: Gripper) -> Gripper:
-    """The same hand with its palm at most so far behind its fingertips.
+    """The same hand with its palm at most a given distance behind its fingertips.
 
-    The ends of the fingers hold an object: relative to them, hands of any length look alike.
+    The finger ends hold the object, so relative to them hands of any length look alike.
     """
     return replace(gripper, palm_z=max(gripper.palm_z, gripper.tip_z - SEEN_LENGTH))
 
 
 def without_support(description: Floats) -> Floats:
-    """The description (E, F) that the same hands have where the support plane is not known."""
+    """The description (E, F) of the same hands without a known support plane."""
     unknown = description.copy()
     unknown[:, HEIGHTS] = UNKNOWN_HEIGHT
     return unknown
@@ -177,17 +178,17 @@ def _measures(gripper: Gripper) -> list[float]:
 
 
 class _Seen(NamedTuple):
-    """What E hands see of the cloud. A count n is given as the logarithm of 1 + n."""
+    """What E hands see of the cloud. Counts n are given as log(1 + n)."""
 
     hits: Float32  # (E, 7) as `_count_hits` orders them
     between: Float32  # (E, 29) as `_measure_between` orders them
-    cut_off: Float32  # (E,) between the fingers, where a side of the workspace cuts objects off
-    first_met: Float32  # (E, 2) greatest and least y between the fingers; 0 where nothing is
+    cut_off: Float32  # (E,) points between the fingers where the workspace cuts objects off
+    first_met: Float32  # (E, 2) greatest and least y between the fingers; 0 if nothing is there
     runs: Float32  # (E, 3) as `_runs_along` orders them
 
 
 class _Hand(NamedTuple):
-    """The open gripper as the loops read it; metres."""
+    """The open gripper as the compiled loops read it; metres."""
 
     boxes: Float32  # (B, 2, 3) of the hand
     fingers: Float32  # (F, 2, 3) of the finger on the side of positive y
@@ -224,7 +225,7 @@ def _look(
 def _directions(
     T_cloud_hand: Float32, mirrored: Float32, viewpoint: Float32 | None, up: Float32
 ) -> list[Float32]:
-    """Where the camera and up are, on axes (E, 3, 3); a camera that is not known is nowhere."""
+    """Directions of the camera and of up on axes (E, 3, 3); 0 for an unknown camera."""
     toward = np.zeros((len(mirrored), 3), dtype=np.float32)
     if viewpoint is not None:
         toward = viewpoint - T_cloud_hand[:, :3, 3]
@@ -234,7 +235,7 @@ def _directions(
 
 
 def _stance(around: Surroundings, candidates: Candidates, gripper: Gripper) -> list[Float32]:
-    """The edge itself, and how the hand stands to gravity and to the support plane."""
+    """The edge itself, and the hand's orientation and height over gravity and support plane."""
     cloud, support, up = around.cloud, around.support, around.up / np.linalg.norm(around.up)
     pose = candidates.T_cloud_hand
     contact = cloud.points[candidates.contact_index]  # (E, 3)
@@ -290,7 +291,7 @@ def _look_from_each(
 
 @compiled("contract")
 def _count_hits(x: Float32, y: Float32, z: Float32, hand: _Hand, hits: Float32) -> None:
-    """Count points in the open fingers, in the hand, near each finger, on the way in, ahead."""
+    """Count points in the open fingers, in the hand, near each finger, on the approach, ahead."""
     on_way = _in_any(hand.boxes, x, y, z, 0.0, np.inf)
     for finger in range(2):
         outward = y if finger == 0 else -y
@@ -321,7 +322,7 @@ def _in_any(
 
 @compiled("contract")
 def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Float32) -> None:
-    """Extent, middle and normals of points (3, P), z from the palm, that the fingers would meet.
+    """Extent, middle and normals of points (3, P), z from the palm, that the fingers would touch.
 
     Those between the pads: their number; greatest, least and mean x, y and z. All, up to three
     pads wide: their number; greatest, least and mean x. Between the pads: the mean size of the
@@ -354,7 +355,7 @@ def _measure_between(points: Float32, normals: Float32, hand: _Hand, numbers: Fl
 
 @compiled("contract")
 def _extent(values: Float32, empty: np.float32, numbers: Float32) -> None:
-    """Greatest, least and mean; 0, `empty` and half of it where there is no value."""
+    """Greatest, least and mean; if there is no value: 0, `empty` and half of `empty`."""
     numbers[0], numbers[1], numbers[2] = 0.0, empty, empty / 2
     if len(values):
         numbers[0], numbers[1], numbers[2] = values.max(), values.min(), _mean(values)
@@ -362,7 +363,7 @@ def _extent(values: Float32, empty: np.float32, numbers: Float32) -> None:
 
 @compiled("contract")
 def _mean(values: Float32) -> float:
-    """0 where there is none."""
+    """0 if there is none."""
     total = 0.0
     for i in range(len(values)):
         total += values[i]
@@ -371,9 +372,9 @@ def _mean(values: Float32) -> float:
 
 @compiled("contract")
 def _runs_along(y: Float32, ends: Float32, runs: Float32) -> None:
-    """The longest part of y without a point; how long what each finger meets goes on without a gap.
+    """The longest empty stretch of y, and the gapless length of what each finger touches first.
 
-    Also the greatest and the least y, which stay 0 where there is no point.
+    Also the greatest and the least y, which stay 0 without points.
     """
     along = np.sort(y)
     if len(along) == 0:
@@ -412,7 +413,7 @@ def _around_fingers(
         near = bounds[e] + np.flatnonzero(inside & (z > low[2]) & (z < high[2]))
         count[e] = min(len(near), limit)
         for slot in range(count[e]):
-            # Where there are too many, those at even distances in the cloud's order.
+            # If there are too many, an even selection in the cloud's order.
             p = near[((slot + 1) * len(near) - 1) // limit if len(near) > limit else slot]
             for d in range(3):
                 points[e, slot, d] = columns[d, p] - origin[d]

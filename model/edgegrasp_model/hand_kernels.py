@@ -5,8 +5,8 @@ import numpy as np
 from edgegrasp_camera.arrays import Bools, Float32, Float64, Floats, Int64
 from edgegrasp_model.kernels import columns_of, compiled
 
-BLOCK = 64  # points at a time that are passed over where none can be near
-SLACK = 1e-5  # metres that float32 may be off, many times over
+BLOCK = 64  # points per block; blocks out of reach are skipped
+SLACK = 1e-5  # metres; a generous bound of float32 errors
 
 
 def points_in_hand_boxes(
@@ -72,18 +72,18 @@ def free_way(points: Float32, T_cloud_hand: Float32, boxes: Float64, behind: flo
 def extents_between(
     points: Float32, rows: Int64, first: Int64, last: Int64, T_cloud_hand: Float32, pads: Float32
 ) -> Float32:
-    """From where to where hands have something between their pads.
+    """Least and greatest y of the points between the pads of some hands.
 
     Args:
         points: (N, 3) of the cloud.
         rows: (P,) of points to look at, group after group.
         first: (E,) places in `rows` where the group of each hand begins.
-        last: (E,) and ends.
+        last: (E,) and where they end.
         T_cloud_hand: (E, 4, 4).
         pads: (2, 2) least and greatest x and z of the pads, hand frame.
 
     Returns:
-        (E, 2) least and greatest y of those points; infinite, and less than nothing, of none.
+        (E, 2) least and greatest y of those points; (inf, -inf) if there is none.
     """
     turn, shift = _to_hand(T_cloud_hand)
     extent = np.empty((len(turn), 2), dtype=np.float32)
@@ -98,11 +98,11 @@ def distance_behind(
     places: Float32,
     cell: float,
 ) -> Float32:
-    """How far places of some hands lie behind the first surface that a camera saw.
+    """How far some places of hands lie behind the first surface that a camera saw.
 
     Args:
-        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle one ahead; inf
-            where nothing was seen.
+        surface: (2 H + 1, 2 H + 1) metres from the camera in each cell, the middle cell straight
+            ahead; inf where nothing was seen.
         turn: (E, 3, 3) from each hand's frame to the camera's: across, down, ahead.
         shift: (E, 3) of each hand in the camera's frame.
         places: (S, 3) hand frame.
@@ -120,19 +120,19 @@ def distance_behind(
 def non_max_suppression(
     T_cloud_tcp: Float32, order: Int64, near: float, angle: float, most: int
 ) -> tuple[Int64, Int64]:
-    """Keep the first of each group of near duplicates.
+    """Non-maximum suppression: keep the first of each group of near duplicates.
 
     A hand and the same hand turned by 180 degrees about its approach count as one.
 
     Args:
         T_cloud_tcp: (E, 4, 4).
         order: (M,) rows, the best first.
-        near: Metres between two TCPs,
-        angle: and radians between two hands within which they are duplicates.
+        near: Metres between two TCPs within which they are near,
+        angle: and radians between two hands within which near ones are duplicates.
         most: How many to keep.
 
     Returns:
-        (at most `most`,) rows kept, in order, and the rows that are near one of them.
+        (at most `most`,) rows kept, in order, and the rows dropped as duplicates of one of them.
     """
     turn = np.ascontiguousarray(T_cloud_tcp[:, :3, :3])
     place = np.ascontiguousarray(T_cloud_tcp[:, :3, 3])
@@ -144,7 +144,7 @@ def non_max_suppression(
 
 
 def _to_hand(T_cloud_hand: Float32) -> tuple[Float32, Float32]:
-    """Turn (E, 3, 3) and shift (E, 3) from the cloud's frame to hand frames."""
+    """Rotations (E, 3, 3) and translations (E, 3) from the cloud's frame to hand frames."""
     turn = np.ascontiguousarray(T_cloud_hand[:, :3, :3].transpose(0, 2, 1))
     return turn, -(turn @ T_cloud_hand[:, :3, 3:])[:, :, 0]
 
@@ -173,7 +173,7 @@ def _count_between(
     columns: Float32, k: int, turn: Float32, shift: Float32, low: Float32, high: Float32
 ) -> int:
     """How many points of block k lie between two corners of a hand's frame."""
-    # In functions of their own, and of arrays without steps, such loops take 16 points at a time.
+    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
     start, stop = k * BLOCK, (k + 1) * BLOCK
     xs, ys, zs = columns[0, start:stop], columns[1, start:stop], columns[2, start:stop]
     found = 0
@@ -207,7 +207,7 @@ def _least_between(
 
 @compiled("contract")
 def _blocks(columns: Float32) -> Float32:
-    """Spheres (K, 4) around BLOCK points at a time: middle and radius."""
+    """Bounding spheres (K, 4) of BLOCK points at a time: middle and radius."""
     count = columns.shape[1]
     sphere = np.zeros(((count + BLOCK - 1) // BLOCK, 4), np.float32)
     for k in range(len(sphere)):
@@ -237,7 +237,7 @@ def _around_all(boxes: Float32) -> tuple[Float32, Float32]:
 
 @compiled("contract")
 def _may_reach(sphere: Float32, turn: Float32, shift: Float32, low: Float32, high: Float32) -> bool:
-    """Whether a point of a block may lie between two corners of a hand's frame."""
+    """Whether a point of a block may lie in a box of the hand frame, given by two corners."""
     x, y, z = _position(sphere[0], sphere[1], sphere[2], turn, shift)
     r = sphere[3]
     inside: bool = (
@@ -361,7 +361,7 @@ def _until_met(
             front = high[2]
             low[2] -= behind
             for k in range(len(sphere)):
-                high[2] = front + nearest  # what is further away changes nothing
+                high[2] = front + nearest  # farther boxes change nothing
                 if _may_reach(sphere[k], turn[e], shift[e], low, high):
                     least = _least_between(columns, k, turn[e], shift[e], low, high, ahead)
                     nearest = min(nearest, least - front)

@@ -1,4 +1,4 @@
-"""The cloud as it is seen from some hands."""
+"""Cloud points in the frames of hands, limited to those within reach."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,13 +17,13 @@ APPROACH_LENGTH = 0.05  # metres of straight approach that the hand description 
 def reach_of(
     gripper: Gripper, around: float = NEAR, back: float = APPROACH_LENGTH, lift: float = 0.0
 ) -> Float32:
-    """What is within reach of a gripper's boxes and of their straight ways.
+    """Bounds of what a gripper's boxes and their straight motions can reach.
 
     Args:
         gripper: Open to its maximum.
         around: Metres on every side of a box; never less than NEAR.
-        back: Metres of way along -z; never less than APPROACH_LENGTH.
-        lift: Metres of way in a direction that is not known.
+        back: Metres of motion along -z; never less than APPROACH_LENGTH.
+        lift: Metres of motion in an unknown direction.
 
     Returns:
         (2, 3) lowest and highest corner, hand frame.
@@ -38,7 +38,7 @@ def reach_of(
 
 @dataclass(frozen=True)
 class HandView:
-    """Cloud points in the hand frames of some hands, those out of reach left out."""
+    """Cloud points in hand frames, without those out of reach."""
 
     candidate: Int64  # (P,) ascending
     row: Int64  # (P,) row of the cloud
@@ -47,7 +47,7 @@ class HandView:
 
     @cached_property
     def columns(self) -> Float32:
-        """The positions with x, y, z in rows (3, P): a row at a time is many times faster."""
+        """The positions as rows x, y, z (3, P), which is many times faster to process."""
         return np.ascontiguousarray(self.position.T)
 
     @cached_property
@@ -57,7 +57,7 @@ class HandView:
 
 
 def hand_views(cloud: Cloud, T_cloud_hand: Float32, reach: Float32) -> HandView:
-    """See the cloud from each hand.
+    """Transform the cloud into each hand's frame, keeping points within reach.
 
     Args:
         cloud: N points.

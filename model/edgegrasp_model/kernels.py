@@ -1,6 +1,6 @@
 """Loops over the points of a cloud, compiled to machine code by Numba.
 
-NumPy needs many passes over large arrays for these; here each takes one point at a time, in the
+NumPy would need many passes over large arrays; these loops take one point at a time and stay in the
 processor's cache.
 """
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 
-ROUNDING = 1e-4  # share of a squared distance that float32 may be off, many times over
+ROUNDING = 1e-4  # share of a squared distance; a generous bound of float32 errors
 STRIP_CELLS = 4  # cells of a strip's histogram in the gap that ends it
-JACOBI_SWEEPS = 6  # of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
-DIAGONAL = 1e-12  # share of a matrix's trace that its other elements together may be
+JACOBI_SWEEPS = 6  # rounds of Jacobi's method for a symmetric 3 x 3 matrix; more change nothing
+DIAGONAL = 1e-12  # off-diagonal sum, as a share of the trace, at which Jacobi's method stops
 
 
 def least_spread(points: Float32 | Float64, rows: NDArray[np.integer]) -> Float32:
@@ -51,17 +51,17 @@ def nearest_in_groups(points: Float32, bounds: Int64, k: int) -> Int64:
 def extents_across(
     points: Float32, rows: Int64, first: Int64, last: Int64, frame: Float32, strip: Float32
 ) -> Float32:
-    """How far the surface goes on to both sides of an edge, along a strip across it.
+    """How far the surface extends to both sides of an edge, along a strip across it.
 
     Args:
         points: (N, 3) of the cloud.
         rows: (P,) of points to look at, group after group.
         first: (M,) places in `rows` where the group of each edge begins.
-        last: (M,) and ends.
+        last: (M,) and where they end.
         frame: (M, 4, 3) of each edge the point it is at; across the strip, out of the object
             along it, and ahead of the hand, unit vectors.
         strip: (4,) its half width and its length, how far ahead of the edge its points may be, and
-            the gap that ends it, metres.
+            the gap length that ends it, metres.
 
     Returns:
         (M, 2) least and greatest distance from the edge into the object.
@@ -74,14 +74,14 @@ def extents_across(
 def level_spread(
     points: Float32, rows: Int64, toward: Float32, radius: float, drop: float
 ) -> tuple[Float32, Float32, Float32]:
-    """How the surface around points lies, seen from some direction.
+    """How the neighbourhood of each point is distributed, seen from some direction.
 
     Args:
         points: (N, 3) of the cloud.
         rows: (M,) of the points to look at.
         toward: (M, 3) unit, toward the viewpoint.
         radius: Metres around each point in which others count,
-        drop: unless they lie further below it, metres.
+        drop: and how much lower they may lie, metres.
 
     Returns:
         The direction orthogonal to `toward` in which they spread least, (M, 3) unit; how far (M,)
@@ -115,7 +115,7 @@ def columns_of(points: Float32) -> Float32:
 
 
 def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function when it is first called, and keep it on disk where that is possible.
+    """Compile a function on its first call, and cache it on disk if possible.
 
     Args:
         freedom: What the compiler may change in float arithmetic, LLVM's fast-math flags.
@@ -126,7 +126,7 @@ def compiled(*freedom: str) -> Callable[[Callable[..., Any]], Callable[..., Any]
         try:
             kept: Callable[..., Any] = numba.njit(cache=True, **options)(function)
             return kept
-        except RuntimeError:  # no folder to keep it in: neither beside the file nor the user's own
+        except RuntimeError:  # no folder is writable, neither beside the file nor the user's own
             fresh: Callable[..., Any] = numba.njit(**options)(function)
             return fresh
 
@@ -197,7 +197,7 @@ def _nearest(columns: Float32, bounds: Int64, nearest: Int64) -> None:
         best[:] = np.inf
         for i in range(len(xs)):
             px, py, pz = xs[i], ys[i], zs[i]
-            # The k nearest of the row before lie at most this far from here: a safe limit.
+            # The k nearest of the previous row bound the distance to this row's k nearest.
             step = 0.0
             if i > 0:
                 step = np.float64(px - xs[i - 1]) ** 2
@@ -265,8 +265,8 @@ def _along_strips(
 def _into_strip(
     columns: Float32, first: int, last: int, frame: Float32, strip: Float32, depth: Float32
 ) -> None:
-    """How far into the object points of a group lie; as far as a strip is long outside of it."""
-    # In functions of their own, and of arrays without steps, such loops take 16 points at a time.
+    """Distance of a group's points into the object; the strip's length for points outside of it."""
+    # As separate functions on contiguous arrays, such loops are vectorised to 16 points at a time.
     xs, ys, zs = columns[0, first:last], columns[1, first:last], columns[2, first:last]
     origin, across, out, ahead = frame[0], frame[1], frame[2], frame[3]
     half, length, drop, gap = strip[0], strip[1], strip[2], strip[3]
@@ -333,7 +333,7 @@ def _level_spread(
 
 @compiled("contract")
 def _set_level_axes(up: Float32, axes: Float32) -> None:
-    """Up and two level directions: one from the axis that is the furthest from up, up x that."""
+    """Up and two level directions, from the axis that is farthest from up."""
     first = 0
     for d in range(1, 3):
         first = d if abs(up[d]) < abs(up[first]) else first
@@ -351,7 +351,7 @@ def _set_level_axes(up: Float32, axes: Float32) -> None:
 def _moments(
     points: tuple[Float32, Float32, Float32], middle: Float32, axes: Float32, reach: Float32
 ) -> tuple[np.float32, ...]:
-    """How many points are near, and sums of their level places s, t, of s s, s t and t t."""
+    """How many points are near, and the sums of their level coordinates s, t, s s, s t and t t."""
     count, a, b, aa, ab, bb = np.zeros(6, np.float32)
     xs, ys, zs = points
     for i in range(len(xs)):

@@ -1,4 +1,4 @@
-"""What a caller may ask of one detection: the one definition of every option.
+"""The options of one detection; every option is defined here.
 
 The command line's flags, the OpenAPI document and the table in the documentation are made from
 these models; the gRPC messages and the client's types have the same fields, which a test compares.
@@ -34,13 +34,13 @@ FARTHEST = 1e7  # metres from the origin, any way: beyond every place on Earth
 
 
 def _no_text_or_truth(value: object) -> object:
-    """Refuse what Python would convert to a number, such as true and "3"."""
+    """Refuse values that Python would convert to numbers, such as true and "3"."""
     if isinstance(value, bool | str | bytes):
         raise ValueError("must be a number")
     return value
 
 
-# Stands last in an annotation: pydantic writes wrong schemas for bounds that come after it.
+# Must come last in an annotation: pydantic writes wrong schemas for bounds after it.
 numeric = BeforeValidator(_no_text_or_truth)
 Integer = Annotated[int, numeric]
 Number = Annotated[float, numeric]
@@ -51,7 +51,7 @@ MAX_SHAPES = 64
 MAX_ROWS = 5_000_000
 Length = Annotated[float, Field(gt=0.0, le=1000.0), numeric]
 HandLength = Annotated[float, Field(gt=0.0, le=1.0), numeric]  # metres
-SAME = 1e-6  # metres below which two lengths of a gripper are the same
+SAME = 1e-6  # metres; lengths of a gripper that differ by less are the same
 NearHand = Annotated[float, Field(ge=-1.0, le=1.0), numeric]  # metres
 Corner = Annotated[
     tuple[NearHand, NearHand, NearHand],
@@ -61,7 +61,7 @@ Boxes = tuple[tuple[Corner, Corner], ...]  # (min corner, max corner) each
 MAX_APPROACH_POINTS = 256
 MAX_CANDIDATES = 16_000
 MAX_VIEWS = 64
-MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an earlier answer; points of an object
+MAX_PREVIOUS, MAX_SURFACE = 64, 128  # grasps or objects of an answer; points of an object
 CollisionMode = Literal["avoid", "penalise", "ignore"]
 
 
@@ -100,7 +100,7 @@ Quaternion = Annotated[
 
 
 class Strict(BaseModel):
-    """Base of every option object: unknown fields are refused, values do not change."""
+    """Base of every option object: unknown fields are refused, instances are frozen."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -164,9 +164,9 @@ class Indices(Strict):
 
 
 def _byte_for_each(value: object) -> bytes:
-    """Truth values, however they are sent, as one byte for each: 0 or 1."""
+    """Boolean values in any accepted form, as one byte each: 0 or 1."""
     if isinstance(value, (list, tuple)):
-        # As objects: an array of text would give every element the room of the longest.
+        # As objects, since a text array gives every element the size of the longest.
         values: list[Any] = np.array(value, dtype=object).ravel().tolist()
         if set(map(type, values)) <= {bool}:
             return bytes(values)
@@ -457,7 +457,7 @@ class ObjectChoice(Strict):
 
 
 def _row_by_row(value: object) -> object:
-    """The numbers of a matrix in one list, whether it was sent as one or as rows."""
+    """The numbers of a matrix as one flat list, sent flat or as rows."""
     nested = isinstance(value, (list, tuple)) and all(isinstance(r, (list, tuple)) for r in value)
     return [number for row in value for number in row] if nested else value  # type: ignore[attr-defined]
 
@@ -591,7 +591,7 @@ def _mode_as_object(value: object) -> object:
 
 
 def _one_of_one(value: object) -> object:
-    """A list of one vector is that vector, so that both are the same request."""
+    """A list of one vector becomes that vector, so both are the same request."""
     if isinstance(value, (list, tuple)) and len(value) == 1 and isinstance(value[0], (list, tuple)):
         return value[0]
     return value
@@ -603,7 +603,7 @@ def _viewpoints(value: object) -> str:
 
 
 def _support_kind(value: object) -> str | None:
-    """`plane` where no kind is named."""
+    """`plane` if no kind is named."""
     if isinstance(value, Mapping):
         kind = value.get("kind", "plane")
         return kind if isinstance(kind, str) else None
@@ -762,7 +762,7 @@ class DetectOptions(Strict):
 
     @property
     def follows_only(self) -> bool:
-        """Whether only the grasps of an earlier answer are asked for."""
+        """Whether only the grasps of an earlier answer are wanted."""
         return self.previous is not None and not self.previous.search
 
 
@@ -778,7 +778,7 @@ def parse_options(fields: object) -> DetectOptions:
 def parse(schema: type[Schema], fields: object, name: str, known: Iterable[str] = ()) -> Schema:
     """Check plain values against a schema; raises InvalidRequest that names the field.
 
-    `known`: fields to name where one at the top is not known.
+    `known`: names to list when a top-level field is unknown.
     """
     try:
         return schema.model_validate(fields)

@@ -31,11 +31,11 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
 from edgegrasp_model.unseen import DepthMap, unseen_space
 
-COLLIDING = 0.5  # what the score of a colliding grasp is multiplied by in the ranking
-GOOD_SCORE = 0.5  # from which an object has a grasp to offer
-SURE_SCORE = 0.9  # from which the order `highest` goes by height (the paper's robot policy)
-HIDDEN = 0.004  # metres of unseen space from which on an object may go on there
-FLAT = 0.012  # metres of visible height below which the support may be in the way
+COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
+GOOD_SCORE = 0.5  # score from which an object has a good grasp
+SURE_SCORE = 0.9  # score from which the order `highest` goes by height (the paper's robot policy)
+HIDDEN = 0.004  # metres of unseen space into which an object may extend
+FLAT = 0.012  # metres of visible height below which the support may block grasps
 OUTCOMES = list(Outcome)
 
 
@@ -50,19 +50,19 @@ def select(
 ) -> tuple[Int64, NDArray[np.int8]]:
     """Order the scored candidates, drop low scores and near duplicates, keep the first top_k.
 
-    By score, the best good grasp of each object comes before a second one of any.
+    By score; but the best good grasp of each object comes before the second grasp of any.
 
     Args:
         scene: The scene.
         sample: E scored candidates.
         score: (E,) probabilities.
-        rating: (E,) the same, before outcomes of a robot rescaled them: what orders them.
+        rating: (E,) the same before rescaling by a robot's outcomes; these decide the order.
         gripper: The hand.
         options: min_score, order, suppression and top_k.
         counts: Gets the number of candidates left after each step.
 
     Returns:
-        The rows to return, best first, and what became of each candidate: (E,) codes.
+        The rows to return, best first, and the outcome of each candidate: (E,) codes.
     """
     hands = sample.candidates.T_cloud_hand
     T_cloud_tcp = hands @ gripper.T_hand_tcp
@@ -111,7 +111,7 @@ def ranked(
 
     Args:
         score: (E,) probabilities.
-        collision_free: (E,) the others' scores are worth COLLIDING as much.
+        collision_free: (E,) the scores of the others are multiplied by COLLIDING.
         order: By score; by height where the score is SURE_SCORE or more, then the others by
             score; or collision-free ones first, by clearance, then by score.
         height: (E,) of the TCP along up, for `highest`.
@@ -135,7 +135,7 @@ def grasps_in_cloud(
     collision_free: Bools,
     clearance: Float32,
 ) -> list[Grasp]:
-    """Candidates E, all arrays (E,), as grasps in the frame of the cloud."""
+    """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
     width = openings(scene, candidates.T_cloud_hand, gripper)
@@ -158,9 +158,9 @@ def grasps_in_cloud(
 
 
 def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
-    """Opening (E,) to approach with, metres: what is seen between the fingers, and some clearance.
+    """Opening (E,) to approach with, metres: the visible extent between the fingers, and clearance.
 
-    The gripper's maximum where no camera saw on which side of a finger the object ends.
+    The gripper's maximum if no camera saw where the object ends on the side of a finger.
     """
     met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
     width = required_openings(met, gripper)
@@ -169,14 +169,14 @@ def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
 
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:
-    """Between which hands (E,) the object may go on unseen; `met` is what they meet first."""
+    """Hands (E,) beyond whose fingers the object may go on unseen; `met`: what they touch first."""
     depths = DepthMap.of_each(scene.cloud.points, scene.viewpoints, UP)
     beyond = unseen_space(depths, T_cloud_hand, met, seen_part(gripper)).beyond
     return np.asarray(np.maximum(*beyond) > HIDDEN)
 
 
 def found_support(support: Support | None) -> FoundSupport | None:
-    """A support as it is returned to the caller."""
+    """The support plane as the caller gets it."""
     if support is None:
         return None
     residual = None if math.isnan(support.residual) else support.residual
@@ -191,7 +191,7 @@ def detected_objects(
     score: Floats,
     gripper: Gripper,
 ) -> list[DetectedObject]:
-    """The scene's objects, the largest first: the best grasp on each, or why there is no good one.
+    """The scene's objects, largest first, with their best grasp or why they have no good one.
 
     Args:
         scene: The scene.
@@ -267,7 +267,7 @@ def _smallest_rectangle(plan: Float64) -> tuple[Float64, ...]:
     """The smallest rectangle around points (M, 2): unit axes (2, 2), lowest corner, size (2,)."""
     try:
         corners = plan[ConvexHull(plan).vertices]
-    except (QhullError, ValueError):  # too few points, or all in a line
+    except (QhullError, ValueError):  # too few points, or all on a line
         corners = plan
     edges = np.roll(corners, -1, axis=0) - corners
     edges = edges[np.linalg.norm(edges, axis=1) > 0] if len(corners) > 1 else edges[:0]

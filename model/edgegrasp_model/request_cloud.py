@@ -1,8 +1,7 @@
-"""Make the cloud of a request, in whichever form it was sent, into arrays.
+"""Decode the cloud of a request, in any of its forms, into arrays.
 
-A request's fields are those of the JSON body on both transports. A value is JSON; or a `File`, as
-a form or a message carries it; or bytes, little-endian numbers that a message carries. Whether the
-arrays suit is for the detector to say.
+Both transports give the fields of the JSON body. A value is JSON, a `File` from a form or a
+message, or bytes of little-endian numbers from a message. The detector checks the arrays.
 """
 
 import base64
@@ -36,7 +35,7 @@ from edgegrasp_model.options import (
     rigid,
 )
 
-# Points and arrays beside them, where they come packed: numbers a row, and their type.
+# Packed points and per-point arrays: numbers per row, and their type.
 PACKED = {
     "points": (3, "float32"),
     "normals": (3, "float32"),
@@ -45,7 +44,7 @@ PACKED = {
     "view_ids": (1, "int32"),
 }
 PER_POINT = tuple(PACKED)[1:]
-GIVEN = ("edges", "hand_poses")  # what a caller may want scored
+GIVEN = ("edges", "hand_poses")  # what a caller may have scored
 SOURCES = ("points", "cloud", "point_cloud2", "depth_images")  # `cloud` is a File
 
 
@@ -101,7 +100,7 @@ def decode_cloud(
 
 
 def _source(fields: Mapping[str, Any]) -> str:
-    """Which of SOURCES a request has."""
+    """The one of SOURCES that a request has."""
     sources = [name for name in SOURCES if fields.get(name) is not None]
     if not sources:
         fix = "Send points in metres, point_cloud2, depth_images or a file."
@@ -115,13 +114,14 @@ def _source(fields: Mapping[str, Any]) -> str:
 
 
 def decode_points(points: object, max_points: int) -> Array:
-    """Read points as `decode_array` does; [null, null, null] in an organised list is a hole.
+    """Read points like `decode_array`; [null, null, null] in an organised list is a hole.
 
     Returns:
         (N, 3) float32 of bytes; float64 of lists, in the shape that they have.
 
     Raises:
-        InvalidRequest: No whole number of points, no list, or lists that are no array of numbers.
+        InvalidRequest: Not a whole number of points, not a list, or lists that are not an array of
+            numbers.
         PayloadTooLarge: More than `max_points` points.
     """
     array = decode_array("points", points, max_points)
@@ -136,11 +136,11 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
     """Read an array: packed numbers, an .npy or .png file, or lists.
 
     Returns:
-        Of bytes (N, 3) float32 or (N,) int32, as PACKED says; of lists int64 where all numbers
-        are whole, else float64; of a file whatever is in it.
+        From bytes (N, 3) float32 or (N,) int32, as PACKED says; from lists int64 if all numbers are
+        whole, else float64; from a file whatever it contains.
 
     Raises:
-        InvalidRequest: A broken number, no such file, or lists that are no array of numbers.
+        InvalidRequest: A broken number, an invalid file, or lists that are not an array of numbers.
         PayloadTooLarge: More than `max_points` rows in a file.
     """
     if isinstance(value, File):
@@ -161,7 +161,7 @@ def decode_array(field: str, value: object, max_points: int) -> Array:
 
 def _numbers(field: str, values: list[Any], holes: bool) -> Array:
     """Lists as an array: int64 or float64; with `holes`, None is NaN in lists three deep."""
-    # As objects: an array of text would give every element the room of the longest.
+    # As objects, since a text array gives every element the size of the longest.
     try:
         array = np.array(values, dtype=object)
         numbers = array.ravel().tolist()
@@ -190,7 +190,7 @@ def _numbers(field: str, values: list[Any], holes: bool) -> Array:
 
 
 def _from_base64(value: object) -> object:
-    """JSON has no bytes; gRPC does."""
+    """JSON carries bytes as base64, gRPC as they are."""
     return base64.b64decode(value, validate=True) if isinstance(value, str) else value
 
 
@@ -224,7 +224,7 @@ PoseRow = tuple[Finite, Finite, Finite, Finite]
 
 
 def _by_name(value: object) -> object:
-    """Intrinsics by name, of four numbers or of a matrix."""
+    """Intrinsics by name, from four numbers or a matrix."""
     return intrinsics_of(value)._asdict() if isinstance(value, list) else value
 
 

@@ -1,4 +1,4 @@
-"""What one request returns."""
+"""The answer to one request."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -8,28 +8,28 @@ import numpy as np
 
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 
-OBSTACLE, SUPPORT, UNLABELLED = -1, -2, -3  # labels of rows of a cloud that are no object's
+OBSTACLE, SUPPORT, UNLABELLED = -1, -2, -3  # labels of rows of the cloud that belong to no object
 
 
 class Outcome(StrEnum):
-    """What became of a candidate."""
+    """The outcome of a candidate."""
 
     RETURNED = "returned"
     DIRECTION = "direction"  # the hand would move in a way that is not allowed
     SUPPORT = "support"  # it would go below the support plane
-    NOT_CHECKED = "not-checked"  # left out at random before the collision check
+    NOT_CHECKED = "not-checked"  # dropped at random before the collision check
     COLLISION = "collision"  # the hand would meet the cloud, the support or an obstacle
-    NOT_SCORED = "not-scored"  # near another one, or left out at random, beyond num_candidates
+    NOT_SCORED = "not-scored"  # beyond num_candidates: near another one, or dropped at random
     LOW_SCORE = "low-score"  # below min_score
     SUPPRESSED = "suppressed"  # near a better one
     BEYOND_TOP_K = "beyond-top-k"
 
 
 class NoGrasp(StrEnum):
-    """Why an edge or a hand pose that a caller gave defines no edge grasp."""
+    """Why a given edge or hand pose defines no edge grasp."""
 
     NO_POINT = "no-point"  # a point of it was removed: workspace, support plane or outlier
-    TOO_SHORT = "too-short"  # approach and contact point fall together
+    TOO_SHORT = "too-short"  # approach and contact point coincide
     TOO_LONG = "too-long"  # the contact lies beyond half the opening
     NO_DIRECTION = "no-direction"  # the edge runs along the normal
     TOO_DEEP = "too-deep"  # the contact lies deeper than the fingers are long
@@ -37,16 +37,16 @@ class NoGrasp(StrEnum):
 
 
 class Ungraspable(StrEnum):
-    """Why an object has no grasp that is more likely to hold than not."""
+    """Why an object has no good grasp."""
 
-    TOO_WIDE = "too-wide"  # what is seen of it is wider than the hand opens, on all sides
+    TOO_WIDE = "too-wide"  # its visible part is wider than the hand opens, on all sides
     TOO_FLAT = "too-flat"  # most hands would cut into the support, or come from below
-    BLOCKED = "blocked"  # every hand would hit something, or may where no camera looked
-    HIDDEN = "hidden"  # no camera sees where it ends beyond the fingers
+    BLOCKED = "blocked"  # every hand would hit something, or could in unseen space
+    HIDDEN = "hidden"  # no camera saw where it ends beyond the fingers
 
 
 class Following(StrEnum):
-    """What became of the first grasp of `previous`."""
+    """The outcome of the first grasp of `previous`."""
 
     STARTED = "started"  # there was none
     KEPT = "kept"  # it is the first again, moved with its object
@@ -78,7 +78,7 @@ class ArmPlan:
     reachable: bool  # whether it gets there and straight on, and to the place, touching nothing
     pregrasp_joints: Float64 | None = None  # (J,) where it is reachable
     grasp_joints: Float64 | None = None  # (J,) where it is reachable
-    trajectory: ArmTrajectory | None = None  # where it was asked for and found in time
+    trajectory: ArmTrajectory | None = None  # if it was asked for and found in time
     place_joints: Float64 | None = None  # (J,) where it lets go; None without a place
     T_base_place: Float64 | None = None  # (4, 4) the hand there, base frame
 
@@ -89,24 +89,24 @@ class Grasp:
 
     score: float  # probability that the grasp holds
     T_cloud_hand: Float32  # (4, 4) hand link frame: z out of the palm, y the closing direction
-    T_cloud_tcp: Float32  # (4, 4) tool centre point, same axes
-    width: float  # metres to open to before the approach; the maximum where an end is hidden
+    T_cloud_tcp: Float32  # (4, 4) tool centre point (TCP), same axes
+    width: float  # metres to open to before the approach; the maximum if an end is hidden
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
-    collision_free: bool  # whether the open hand meets nothing at the grasp and on its ways
+    collision_free: bool  # whether the open hand is free at the grasp, on approach and retreat
     clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
-    object: int | None = None  # number of the object that the contact is on; None: of none
-    arm: ArmPlan | None = None  # None: no robot was asked about, or there was no time for it
-    id: int | None = None  # the same in every answer that follows it; None without `previous`
+    object: int | None = None  # number of the object that the contact is on; None: no object
+    arm: ArmPlan | None = None  # None: no robot was given, or time ran out
+    id: int | None = None  # the same in all answers that follow it; None without `previous`
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """How an answer follows the one before."""
+    """How an answer continues an earlier one."""
 
     first: Following
-    next_id: int  # above all ids and numbers so far
+    next_id: int  # above all ids and numbers used so far
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class FoundSupport:
 
 @dataclass(frozen=True)
 class GripperOutline:
-    """The gripper that grasps are for, as far as drawing it needs; metres along the hand's z."""
+    """The gripper of the grasps, as needed for drawing it; metres along the hand's z."""
 
     name: str
     palm_z: float  # the palm's surface between the fingers
@@ -130,22 +130,22 @@ class GripperOutline:
 
 @dataclass(frozen=True)
 class DetectedObject:
-    """An object that grasps are for; cloud frame, metres."""
+    """A recognised object; cloud frame, metres."""
 
     number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
-    points: int  # voxels of the processed cloud that are seen of it
+    points: int  # its number of voxels in the processed cloud
     center: Float32  # (3,) of the smallest upright box around them
     half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
-    quaternion: Float32  # (4,) x, y, z, w: turns the box's axes into the cloud's
-    best_score: float | None  # of the grasps returned; None: there is none on it
-    confidence: float | None  # probability that it is an object; None: the caller named it
-    reason: Ungraspable | None  # why it has no good grasp; None: it has one, or nobody can say
-    surface: Float32 | None = None  # (K, 3) points by which it is found again; with `previous`
+    quaternion: Float32  # (4,) x, y, z, w: rotates the box's axes into the cloud's
+    best_score: float | None  # of the grasps returned; None: it has none
+    confidence: float | None  # probability that it is an object; None: given by the caller
+    reason: Ungraspable | None  # why it has no good grasp; None: it has one, or unknown
+    surface: Float32 | None = None  # (K, 3) points that `previous` finds it by; sent if tracking
 
 
 @dataclass(frozen=True)
 class DebugInfo:
-    """The processed cloud and every candidate, whatever became of it. V points, E candidates."""
+    """The processed cloud and every candidate with its outcome. V points, E candidates."""
 
     points: Float32  # (V, 3) metres, cloud frame
     normals: Float32  # (V, 3) unit
@@ -162,7 +162,7 @@ class DebugInfo:
 
 @dataclass(frozen=True)
 class Detection:
-    """Ranked grasps of one cloud, and how they came about."""
+    """Ranked grasps of one cloud, with counts and timings."""
 
     grasps: list[Grasp]
     counts: dict[str, int]  # points, candidates and grasps that passed each stage, in order
@@ -179,9 +179,9 @@ class Detection:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What the network says of one edge or hand pose that a caller gave."""
+    """The score of one edge or hand pose given by the caller."""
 
-    grasp: Grasp | None  # None where it defines none
+    grasp: Grasp | None  # None if it defines no edge grasp
     reason: NoGrasp | None  # why it defines none
 
 
@@ -197,7 +197,7 @@ class Scoring:
 
 
 class Pace(NamedTuple):
-    """Processor time that a detection takes at least, seconds; 0: not measured."""
+    """Least processor time of a detection, seconds; 0: not measured."""
 
     point: float = 0.0  # for each point of the cloud
     voxel: float = 0.0  # for each voxel in which grasps are searched

@@ -1,7 +1,7 @@
 """Follow grasps from one answer to the next: `previous` in, ids and moved grasps out.
 
-Nothing is kept between requests. An answer gives some points on the surface of each object; sent
-back, they are registered with the next cloud, and the grasps on the object move as they do.
+Nothing is kept between requests. An answer contains points on the surface of each object; when they
+are sent back, they are registered with the next cloud and the object's grasps move with them.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,34 +36,34 @@ from edgegrasp_model.results import (
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import UNKNOWN
 
-MARGIN = 0.1  # of the score, by which another grasp has to be better
+MARGIN = 0.1  # of the score, by which another grasp must be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first
-SLACK = 0.006  # metres by which the hand of a followed grasp may overlap what is seen
-AROUND = 0.03  # metres around followed objects in which they are looked for
-FOREIGN = 0.5  # metres from the cloud beyond which `previous` is in another frame
-# Registration: in each step, points further from the cloud than this are left out, metres.
+SLACK = 0.006  # metres by which the hand of a followed grasp may overlap the cloud
+AROUND = 0.03  # metres around followed objects in which they are searched
+FOREIGN = 0.5  # metres from the cloud beyond which `previous` must be in another frame
+# Registration: in each step, points farther from the cloud than this are left out, metres.
 STEPS = (*(0.03,) * 4, *(0.015,) * 4, *(0.008,) * 4)
-SPACING = 0.004  # metres along the surface to the nearest point within which it goes on there
-TANGENT = 0.3  # weight of distances beyond that, beside 1 of those across the surface
-# Points' worth of not turning and not shifting: where the shape does not say, it stays.
+SPACING = 0.004  # metres to the nearest point along the surface within which the surface continues
+TANGENT = 0.3  # weight of distances beyond that, relative to 1 across the surface
+# Prior for no motion, in points: where the shape leaves motion undetermined, the object stays.
 STIFF = (0.5,) * 3 + (0.3,) * 3
 FEWEST = 6  # points that say how an object moved
-FOUND, GOOD = 0.5, 0.75  # share of an object's points that lie on the cloud: it is there; well seen
-ON_OBJECT = 0.012  # metres from an object's points to what belongs to it
+FOUND, GOOD = 0.5, 0.75  # share of its points on the cloud: found; well seen
+ON_OBJECT = 0.012  # metres from an object's points within which points belong to it
 
 
 @dataclass(frozen=True)
 class Followed:
-    """The objects of `previous` that a scene shows again, by their numbers."""
+    """The objects of `previous` that were found again, by their numbers."""
 
     moved: dict[int, Float64]  # (4, 4) T_now_before of each, cloud frame
-    surface: dict[int, Float32]  # (K, 3) its points as they lie now; taken anew where few fit
+    surface: dict[int, Float32]  # (K, 3) its points now; taken anew if few fit
     named: dict[int, int]  # numbers in the scene: numbers in the answer
     next_id: int
 
 
 def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOptions:
-    """The options with which the scene is built: around what is followed where no search is asked.
+    """The options for building the scene: without a search, only around followed objects.
 
     Args:
         options: Of the request, with `previous`.
@@ -71,7 +71,7 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
         points: (N, 3) the cloud.
 
     Raises:
-        InvalidRequest: `previous` is of another gripper, or in another frame.
+        InvalidRequest: `previous` is for another gripper, or in another frame.
     """
     previous = options.previous
     assert previous is not None
@@ -101,13 +101,12 @@ def narrowed(options: DetectOptions, gripper: str, points: Float32) -> DetectOpt
 
 
 def follow(scene: Scene, previous: Previous, given: bool) -> tuple[Scene, Followed]:
-    """Find the objects of an earlier answer, and give what is seen of them their numbers.
+    """Find the objects of an earlier answer again, and give their points their numbers.
 
     Args:
-        scene: Its objects are numbered as they were found; or all that is seen is one of them,
-            where no search is asked for.
+        scene: The new scene; without a search, all its points belong to one object.
         previous: The earlier answer.
-        given: Whether the caller numbered the objects.
+        given: Whether the caller gave the objects' numbers.
     """
     points, number = scene.points_in_cloud, scene.object_of_point
     seen = np.flatnonzero(number >= 0)
@@ -156,14 +155,14 @@ def merged(
     up: Float64,
     score: Callable[[Float32, Collision, CollisionCheck], list[Evaluation]],
 ) -> tuple[list[Grasp], Tracking]:
-    """The grasps of an earlier answer where they are now, and others; the same one first.
+    """The earlier answer's grasps at their new poses, then others; the kept grasp comes first.
 
     Args:
         found: Grasps of this cloud alone, best first.
-        followed: How the objects have moved.
+        followed: The objects' motion.
         options: Of the request, with `previous`.
         up: (3,) unit, cloud frame.
-        score: Evaluates poses (M, 4, 4) T_cloud_hand by a rule and a check of collisions.
+        score: Evaluates poses (M, 4, 4) T_cloud_hand with a given collision check.
     """
     previous = options.previous
     assert previous is not None
@@ -173,7 +172,7 @@ def merged(
         before = np.reshape([one.T_cloud_hand for one in old], (-1, 4, 4))
         move = [np.eye(4) if one.object is None else followed.moved[one.object] for one in old]
         rule = options.collision.model_copy(update={"margin": options.collision.margin - SLACK})
-        # A hand that may overlap what is seen was checked for the rest when it was found.
+        # A small overlap is allowed, since the hand was fully checked when it was found.
         collide = hits if rule.margin < 0.0 else collides
         there = zip(old, score((move @ before).astype(np.float32), rule, collide), strict=True)
         kept = [replace(e.grasp, id=one.id, object=one.object) for one, e in there if e.grasp]
@@ -195,7 +194,7 @@ def merged(
 
 
 def untracked(previous: Previous | None) -> Tracking | None:
-    """What is said of `previous` where nothing is seen."""
+    """The tracking state if nothing is seen."""
     if previous is None:
         return None
     became = Following.LOST if previous.grasps else Following.STARTED
@@ -203,7 +202,7 @@ def untracked(previous: Previous | None) -> Tracking | None:
 
 
 def _order(grasps: list[Grasp], options: DetectOptions, up: Float64, kept: int) -> list[int]:
-    """Rows of grasps, best first, without those near one of the first `kept` or a better one."""
+    """Rows of grasps, best first, without duplicates of the first `kept` or of a better one."""
     if not grasps:
         return []
     rule = options.suppression or Suppression()
@@ -240,10 +239,10 @@ class Surface(NamedTuple):
 
 
 def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
-    """How an object has moved: (4, 4) T_now_before; and the share of its points found there.
+    """An object's motion (4, 4) T_now_before, and the share of its points found at the new pose.
 
-    Iterated closest points, mostly across the surface; distances along it count only where an
-    object ends. Small motions between two images need no other start than where it was.
+    Iterative closest points (ICP), mostly across the surface; distances along it count only where
+    an object ends. Motions between two images are small, so it starts at the old pose.
 
     Args:
         before: (K, 3) points on its surface.
@@ -285,18 +284,18 @@ def registered(before: Float64, cloud: Surface) -> tuple[Float64, float]:
 
 
 def sampled(points: Float32) -> Float32:
-    """Up to MAX_SURFACE of points (N, 3), evenly spread in their order."""
+    """Up to MAX_SURFACE of points (N, 3), at even steps in their order."""
     rows = np.linspace(0, len(points) - 1, min(MAX_SURFACE, len(points))).astype(np.int64)
     return points[rows]
 
 
 def with_surfaces(objects: list[DetectedObject], followed: Followed) -> list[DetectedObject]:
-    """The objects, with the points by which they are found again."""
+    """The objects with the surface points that `previous` finds them by."""
     return [replace(one, surface=followed.surface.get(one.number)) for one in objects]
 
 
 def relabelled(labels: Int64, named: Mapping[int, int]) -> Int64:
-    """Labels (R,) of rows, with the numbers of objects in the answer; what has none: OBSTACLE."""
+    """Labels (R,) of rows by the answer's object numbers; OBSTACLE where there is none."""
     table = np.full(labels.max(initial=0) + 1, OBSTACLE)
     for before, now in named.items():
         table[before] = now

@@ -1,4 +1,4 @@
-"""What no camera saw around a hand, and how far what they saw of an object extends."""
+"""Space around a hand that no camera saw, and the visible extent of objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,44 +15,45 @@ from edgegrasp_model.kernels import compiled
 from edgegrasp_model.options import Corner
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
-SPLAT = 2  # cells around its own that a point covers: as far as the next point of the cloud
-BEHIND = 0.004  # metres behind a surface that may still be the surface
-DEEP = 0.02  # metres further behind at which space counts as wholly unknown
-FAR = 0.10  # metres behind a surface; what is farther is no different
-UNKNOWN_SHARE = 0.25  # of a palm or way in, unseen, from which on the hand may hit something
+SPLAT = 2  # cells around its own that a point covers, up to the next point of the cloud
+BEHIND = 0.004  # metres behind a surface that still count as the surface
+DEEP = 0.02  # metres farther behind at which space counts as fully unknown
+FAR = 0.10  # metres behind a surface; distances are clipped here
+UNKNOWN_SHARE = 0.25  # unseen share of palm or approach that counts as a collision
 WAY = 0.05  # metres of straight approach on which a finger sweeps space
 LINE = 27  # places on the closing line, from beyond one finger to beyond the other
 NOTHING = np.float32(np.inf)
-STEEP = 1e-3  # sine of the angle to up below which up says nothing about the map
+STEEP = 1e-3  # sine of the angle to up below which up cannot orient the map
 HALF = 256  # most cells from the middle of the map to its edge: some 0.5 m
-FARTHEST = 10 * HALF  # stands for everything farther away
+FARTHEST = 10 * HALF  # stands for everything beyond
 NUM_EXTENTS = 11
-EXTENT_POINTS = 256  # of an object, at most, that its extents are measured with
-FARTHEST_EXTENT = 0.25  # metres; what goes on farther is no different
+EXTENT_POINTS = 256  # most points of an object that its extents are measured with
+FARTHEST_EXTENT = 0.25  # metres; extents are clipped here
 
 
 class UnseenSpace(NamedTuple):
-    """What was not seen of E hands and of the space around them; all is 0 where all was seen.
+    """Unseen parts of E hands and of the space around them; all 0 if everything was seen.
 
     Of two fingers, the one on the side of positive y comes first.
     """
 
     parts: list[Float32]  # (E,) each: the unseen share of each of `probes`
-    ways: list[Float32]  # (E,) each: and of the space that each finger sweeps on its way in
+    ways: list[Float32]  # (E,) each: of the space that each finger sweeps on the approach
     depths: list[Float32]  # (E,) each: metres that each fingertip is behind a surface
-    beyond: list[Float32]  # (E,) each: unseen metres from what each finger meets first outward
-    free: Float32  # (E,) metres between those two in which nothing is
+    beyond: list[Float32]  # (E,) each: unseen metres outward from what each finger touches first
+    free: Float32  # (E,) metres of empty space between those two
 
 
 def unseen_space(
     depths: Sequence["DepthMap"], T_cloud_hand: Float32, first_met: Float32, gripper: Gripper
 ) -> UnseenSpace:
-    """Ask depth maps about the hands of some candidates.
+    """Evaluate the depth maps at the hands of some candidates.
 
     Args:
-        depths: What each camera saw; none where they are unknown: then all counts as seen.
+        depths: What each camera saw; empty if the cameras are unknown, then everything counts as
+            seen.
         T_cloud_hand: (E, 4, 4), in the maps' frame.
-        first_met: (E, 2) greatest and least y of what is between the fingers, hand frame.
+        first_met: (E, 2) greatest and least y of the points between the fingers, hand frame.
         gripper: Fingers open to its maximum.
     """
     if not depths:
@@ -79,9 +80,9 @@ def unseen_space(
 
 
 def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: Gripper) -> Bools:
-    """Which hands (E,) would have their palm, or a finger on its way in, in unseen space.
+    """Which hands (E,) would put their palm, or a finger during the approach, into unseen space.
 
-    Behind a surface, only the ends of the fingers may reach where nobody looked.
+    Behind a surface, only the finger ends may reach into unseen space.
     """
     entered = np.zeros(len(T_cloud_hand), dtype=np.bool_)
     for places in (probes(gripper)[-1], *_ways(gripper)) if depths else ():
@@ -91,13 +92,13 @@ def enters_unseen(depths: Sequence["DepthMap"], T_cloud_hand: Float32, gripper: 
 
 
 def _behind_all(depths: Sequence["DepthMap"], T_cloud_hand: Float32, places: Float32) -> Float32:
-    """Metres (E, S) that places (S, 3) of hands lie behind what every camera saw first."""
+    """Metres (E, S) that places (S, 3) of hands lie behind the first surface of every camera."""
     behind: Float32 = np.min([depth.behind(T_cloud_hand, places) for depth in depths], axis=0)
     return behind
 
 
 def unseen(behind: Float32) -> Float32:
-    """How far metres (...) behind the first surface are space nobody saw: 0 seen, 1 deep."""
+    """How unknown space is, by its distance (...) behind the first surface: 0 seen, 1 unknown."""
     share: Float32 = np.clip((behind - np.float32(BEHIND)) / np.float32(DEEP), 0.0, 1.0)
     return share
 
@@ -173,14 +174,14 @@ def visible_extents(
     gripper: Gripper,
     up: Float32,
 ) -> Float32:
-    """How large the object between the fingers looks, and how far it goes on beyond them.
+    """The visible size of the object between the fingers, and how far it extends beyond them.
 
     Args:
         points: (N, 3).
-        number: (N,) the object that each point belongs to; None: all to one.
+        number: (N,) the object of each point; None: one object.
         contact_index: (E,) rows of `points`: the object of that point is measured.
         T_cloud_hand: (E, 4, 4) hands.
-        side: (E,) 1 or -1, what x is multiplied by.
+        side: (E,) 1 or -1, the factor on x.
         gripper: Fingers open to its maximum.
         up: (3,) away from gravity.
 
@@ -254,7 +255,7 @@ def _extents(
 
 
 class CameraFrame(NamedTuple):
-    """How a camera looks at a cloud: what directions the cells of its depth map stand for."""
+    """A camera's view of a cloud: the directions of its depth map's cells."""
 
     viewpoint: Float32  # (3,)
     axes: Float32  # (3, 3) rows: across, down, toward the middle of the cloud
@@ -262,7 +263,7 @@ class CameraFrame(NamedTuple):
 
     @classmethod
     def toward(cls, middle: ArrayLike, viewpoint: ArrayLike, up: ArrayLike) -> Self:
-        """A camera that looks at the middle (3,) of a cloud; `up` (3,) turns with the scene."""
+        """A camera that looks at the middle (3,) of a cloud; `up` (3,) fixes its roll."""
         way = np.asarray(middle, dtype=np.float64) - np.asarray(viewpoint, dtype=np.float64)
         distance = max(float(np.linalg.norm(way)), 1e-6)
         ahead = way / distance
@@ -274,7 +275,7 @@ class CameraFrame(NamedTuple):
         return cls(np.asarray(viewpoint, dtype=np.float32), axes, CELL / distance)
 
     def seen(self, positions: Float32) -> tuple[Int64, Float32]:
-        """The cells (N, 2) that positions (N, 3) lie in, the middle one 0, and how far they are."""
+        """The cells (N, 2) of positions (N, 3), from the middle one, and their distances."""
         along = (positions - self.viewpoint) @ self.axes.T  # (N, 3)
         tangents = along[:, :2] / np.maximum(along[:, 2:], np.float32(1e-6))
         cell = np.clip(np.floor(tangents / np.float32(self.cell)), -FARTHEST, FARTHEST)
@@ -290,9 +291,9 @@ class DepthMap:
 
     @classmethod
     def of_each(cls, points: Float32, viewpoints: Float32 | None, up: Float32) -> list[Self]:
-        """What each of some cameras (W, 3) saw of a cloud (N, 3); none where they are unknown.
+        """The depth map of each camera (W, 3) for a cloud (N, 3); empty if the cameras are unknown.
 
-        A point blocks the sight of all of them, whichever saw it.
+        A point blocks the view of every camera, whichever saw it.
         """
         if viewpoints is None or len(points) == 0:
             return []
@@ -300,12 +301,12 @@ class DepthMap:
 
     @classmethod
     def of_cloud(cls, points: Float32, viewpoint: Float32, up: Float32) -> Self:
-        """What a camera there saw of a cloud.
+        """The depth map of a camera at `viewpoint`.
 
         Args:
             points: (N, 3), at least one, metres.
             viewpoint: (3,) in the same frame.
-            up: (3,) turns the map, so that it turns with the scene.
+            up: (3,) fixes the map's roll, so that it rotates with the scene.
         """
         frame = CameraFrame.toward(points.mean(axis=0, dtype=np.float64), viewpoint, up)
         cell, distance = frame.seen(points)
@@ -327,7 +328,7 @@ class DepthMap:
 
 @compiled()
 def _cover(depth: Float32, cell: Int64, distance: Float32) -> None:
-    """Write the distances of points (N,) into the cells (N, 2) around theirs; the nearest stays."""
+    """Write distances (N,) into the cells (N, 2) around each point's, keeping the nearest."""
     for n in range(len(cell)):
         for i in range(max(cell[n, 0] - SPLAT, 0), min(cell[n, 0] + SPLAT + 1, len(depth))):
             for j in range(max(cell[n, 1] - SPLAT, 0), min(cell[n, 1] + SPLAT + 1, len(depth))):

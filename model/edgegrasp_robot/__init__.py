@@ -1,4 +1,4 @@
-"""From grasps to the joints and the motion of an arm; needs the extra `robot`."""
+"""From grasps to joint positions and motions of an arm; needs the extra `robot`."""
 
 from edgegrasp_robot.picks import detect_picks, plan_picks, with_robot
 from edgegrasp_robot.robot import Robot, load_robot, load_robots, robot_names

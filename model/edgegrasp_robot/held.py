@@ -17,7 +17,7 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.surroundings import CELL, Load, moved
 
 STEP = 0.005  # metres along the way
-BESIDE = 0.01  # metres: what is nearer than that to the held object touches it already
+BESIDE = 0.01  # metres; points nearer to the held object already touch it
 MEETS = 0.003  # metres between points that touch
 SINKS = 0.001  # metres that the held object may go down toward the support
 HIDDEN = 0.03  # metres that the foot of an object may be hidden from the camera
@@ -77,7 +77,7 @@ def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> b
 
 
 def _lowest(scene: Scene, points: Float64) -> float:
-    """How high the lowest of points (N, 3), cloud frame, is over the support; 0 without one."""
+    """Height of the lowest of points (N, 3), cloud frame, over the support; 0 without a support."""
     if scene.support is None:
         return 0.0
     return float(scene.support.heights(scene.frame.points(points)).min())

@@ -31,27 +31,28 @@ from edgegrasp_robot.surroundings import (
     surrounded,
 )
 
-TRIED = 200  # grasps that the arm may be asked for, in their order
+TRIED = 200  # most grasps that are tried with the arm, in their order
 PLACES = 6  # in a region, that the arm may be asked for with one grasp
 LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
-SPARE = 4  # more than asked for that are brought within reach, as some may get no motion
-LINE_STEP = 0.05  # metres between the poses of a straight way; each costs more than its checks
-MAX_JUMP = 1.0  # radians that a joint turns between two of them at most
-OFF_LINE = 0.002  # metres that the hand leaves a straight way by at most
-SHARE = 0.99  # of the limits, as splines overshoot a little
+SPARE = 4  # grasps tried beyond top_k, as some may get no motion
+LINE_STEP = 0.05  # metres between poses of a straight motion
+MAX_JUMP = 1.0  # most radians that a joint turns between two of them
+OFF_LINE = 0.002  # most metres between the hand and its straight line
+SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
 DT = 0.01  # seconds between the rows of a trajectory
 FINE = 0.002  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
 CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
-TRAVEL_COST = 0.02  # of a score, for each radian of the joint that turns the most
+TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
 def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
-    """The options of the detection whose grasps `plan_picks` chooses from.
+    """The options for the detection that `plan_picks` chooses from.
 
     Raises:
-        InvalidRequest: The joints are not the robot's, or an option does not go with an arm.
+        InvalidRequest: The joints do not match the robot, or an option cannot be combined with an
+            arm.
     """
     asked = options.robot
     assert asked is not None
@@ -77,7 +78,7 @@ def with_robot(options: DetectOptions, robot: Robot) -> DetectOptions:
 def detect_picks(
     detector: GraspDetector, cloud: CloudInput, options: DetectOptions, robot: Robot
 ) -> Detection:
-    """Find grasps, and say how the robot gets there; raises as the detector and `plan_picks`."""
+    """Detect grasps and plan motions to them; raises as the detector and `plan_picks`."""
     prepared = detector.prepare(cloud, with_robot(options, robot))
     detection = detector.finish(prepared, detector.evaluate(prepared))
     return plan_picks(detection, prepared.scene, cloud.points, options, robot)
@@ -91,14 +92,14 @@ def plan_picks(
     robot: Robot,
     until: float = float("inf"),
 ) -> Detection:
-    """Say of grasps how the arm gets there, and put those that it reaches first.
+    """Plan the arm's way to grasps, and put reachable grasps first.
 
     Args:
-        detection: What the options of `with_robot` gave.
-        scene: That of the detection; None: too little is left of the cloud for one.
+        detection: The detection made with the options of `with_robot`.
+        scene: The detection's scene; None: too little is left of the cloud.
         points: (..., 3) metres, the whole cloud as it was sent; NaN: no reading.
         options: As they were sent.
-        robot: The one that they name.
+        robot: The robot that they name.
         until: When to stop, on `time.monotonic()`.
 
     Returns:
@@ -107,7 +108,7 @@ def plan_picks(
         scores the nearer ones.
 
     Raises:
-        InvalidRequest: The arm cannot stand where the options put it.
+        InvalidRequest: The arm collides where the options put it.
     """
     asked = options.robot
     assert asked is not None
@@ -137,7 +138,7 @@ def plan_picks(
 
 @dataclass(frozen=True)
 class _Pick:
-    """A grasp, and what is known of the arm's way there."""
+    """A grasp and the arm's plan for it."""
 
     grasp: Grasp
     plan: ArmPlan | None
@@ -171,7 +172,7 @@ class _Ik(NamedTuple):
 
 
 def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> list[_Pick]:
-    """The picks, in their order, up to `most` of those within reach with trajectories."""
+    """The picks in order, with trajectories for up to `most` reachable ones."""
     tried: list[_Pick] = []
     for pick in picks:
         enough = sum(one.tier == 0 for one in tried) == most
@@ -182,7 +183,7 @@ def _with_motions(arm: "_Arm", picks: list[_Pick], most: int, until: float) -> l
 
 
 class _Arm:
-    """The arm of one request, within its surroundings."""
+    """The arm of one request, in its surroundings."""
 
     def __init__(
         self,
@@ -211,7 +212,7 @@ class _Arm:
         self._ignoring = self._solver(robot.straight, restarts=2, check=False)
 
     def reach(self, grasp: Grasp) -> _Pick:
-        """Joints at the pregrasp and on straight to the grasp."""
+        """Joints at the pregrasp and along the straight approach."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
@@ -228,7 +229,7 @@ class _Arm:
         return _Pick(grasp, ArmPlan(False), "arm_collision" if free else "out_of_reach")
 
     def motion(self, pick: _Pick) -> _Pick:
-        """Add a trajectory that has been checked, where one is found."""
+        """Add a collision-checked trajectory, if one is found."""
         assert pick.plan is not None
         assert pick.line is not None
         free, straight = self._robot.scene, self._robot.straight
@@ -319,7 +320,7 @@ class _Arm:
             return [*parts, self._timed(scene, put.away, True)]
 
     def _solver(self, scene: core.Scene, restarts: int, check: bool = True) -> _Ik:
-        """Inverse kinematics that a seed decides, and no clock."""
+        """An inverse kinematics solver that depends on a seed and not on time."""
         options = SimpleIkOptions(
             GROUP, max_iters=40, max_time=10.0, max_restarts=restarts, step_size=0.5,
             max_linear_error_norm=CLOSE, max_angular_error_norm=CLOSE_ANGLE,
@@ -343,7 +344,7 @@ class _Arm:
         return bool(((joints >= self._robot.lower) & (joints <= self._robot.upper)).all())
 
     def _follow(self, ik: _Ik, poses: Sequence[Float64], first: Float64) -> list[Float64] | None:
-        """Joints along a straight way, each near to those before, and nothing in between."""
+        """Joints along a straight motion, each close to the last, collision-free in between."""
         line = [first]
         for pose in poses[1:]:
             joints = self._solve(ik, pose, line[-1])
@@ -357,12 +358,12 @@ class _Arm:
     def _retreat(
         self, grasp: Grasp, line: Sequence[Float64], held: Held | None = None
     ) -> list[Float64] | None:
-        """Joints along the way out, on which what is held meets nothing."""
+        """Joints along the retreat, on which the held points touch nothing."""
         rules = self._options.collision
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
         back = rules.retreat_length == 0.0 or rules.retreat_direction == "back"
         direction = -T_base_hand[:3, 2] if back else self._up
-        # The hand's way in is known to be free, and the way out that was asked for.
+        # The detector has already checked the hand's approach and retreat.
         length = rules.retreat_length or rules.approach_length
         way = self._T_base_cloud[:3, :3].T @ direction * length
         held = held or held_by(grasp, self._scene, self._robot.gripper)
@@ -371,7 +372,7 @@ class _Arm:
         return self._follow(self._along, _straight(T_base_hand, direction, 0.0, length), line[-1])
 
     def _free_path(self, scene: core.Scene, start: Float64, end: Float64) -> list[Float64] | None:
-        """Joints between which straight motions of the joints touch nothing."""
+        """Joints between which linear joint motions are collision-free."""
         names = self._robot.joint_names
         options = RRTOptions(
             GROUP, max_nodes=3000, rrt_connect=True, collision_check_step_size=PATH_STEP
@@ -382,7 +383,7 @@ class _Arm:
             path = planner.plan(
                 core.JointConfiguration(names, start), core.JointConfiguration(names, end)
             )
-        except RuntimeError:  # as many nodes as there may be, and no path
+        except RuntimeError:  # the node limit was reached without a path
             return None
         rules = core.PathShortcuttingOptions(
             GROUP, max_step_size=PATH_STEP, seed=self._options.seed % 2**31
@@ -393,7 +394,7 @@ class _Arm:
     def _timed(
         self, scene: core.Scene, joints: Sequence[Float64], straight: bool = False
     ) -> core.JointTrajectory | None:
-        """A path with times, from rest to rest, checked all along."""
+        """A time-parameterised path from rest to rest, checked along its whole length."""
         path = core.JointPath()
         path.joint_names, path.positions = self._robot.joint_names, list(joints)
         mode = SplineFittingMode.Cubic if straight else SplineFittingMode.Adaptive
@@ -426,7 +427,7 @@ def _straight(T_base_hand: Float64, direction: Float64, begin: float, end: float
 
 
 def _preferred(picks: Sequence[_Pick], joints: Float64, options: DetectOptions) -> list[_Pick]:
-    """Those within reach first; by score less what the way there costs, unless ordered else."""
+    """Reachable grasps first; by score minus the cost of the motion, or in the order asked for."""
 
     def key(pick: _Pick) -> tuple[int, float]:
         if pick.plan is None or pick.plan.pregrasp_joints is None or options.order != "score":
@@ -444,7 +445,7 @@ def _told(
     asked: RobotArm,
     seconds: float,
 ) -> Detection:
-    """The detection with the picks as its grasps, and what became of them counted."""
+    """The detection with the picks as its grasps, and counts of their outcomes."""
     grasps = [replace(pick.grasp, arm=pick.plan) for pick in picks]
     moving = sum(pick.tier == 0 for pick in picks)
     within = sum(pick.tier <= 1 for pick in picks)

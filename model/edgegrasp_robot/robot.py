@@ -1,4 +1,4 @@
-"""Robots: a file that names an arm's model and the gripper on it, and what is loaded from it."""
+"""Robots: the robot file, which names an arm's model and its gripper, and the loaded robot."""
 
 import tempfile
 import tomllib
@@ -26,7 +26,7 @@ Element = ElementTree.Element
 
 ROBOT_FOLDER = Path(__file__).parent / "robots"
 GROUP, HAND = "arm", "edgegrasp_hand"  # names in the planner's model
-CAREFUL = 2.0  # per second squared: acceleration where nobody says more
+CAREFUL = 2.0  # per second squared: acceleration limit if none is given
 MOVING = ("revolute", "continuous", "prismatic")
 Joints = Annotated[tuple[Finite, ...], Field(max_length=16)]
 
@@ -36,7 +36,7 @@ class InvalidRobot(EdgeGraspError):  # noqa: N818
 
 
 class HandPose(Strict):
-    """Where the hand frame of the gripper is in the flange's frame."""
+    """Pose of the gripper's hand frame in the flange frame."""
 
     position: Vector
     quaternion: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -75,7 +75,7 @@ class Robot:
 
     name: str
     gripper: Gripper
-    hand: GripperGeometry  # the same, as options have it
+    hand: GripperGeometry  # the same, in the form of options
     base_frame: str
     flange_frame: str
     T_flange_hand: Float64  # (4, 4)
@@ -106,7 +106,7 @@ class Robot:
         return np.array(poses)
 
     def describe(self) -> dict[str, Any]:
-        """What a caller needs to know, as plain JSON values."""
+        """The public description, as plain JSON values."""
         return {
             "name": self.name,
             "gripper": self.gripper.name,
@@ -122,7 +122,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Model:
-    """What the planner's scenes are made of."""
+    """What the planner's scenes are built from."""
 
     arm: str  # URDF without what is beyond the flange, and with the meshes' absolute paths
     urdf: str  # the same with the gripper's boxes
@@ -158,7 +158,7 @@ def load_robots(files: Sequence[Path]) -> dict[str, Robot]:
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
-    """Load a robot that ships with the package by name, or a user's own by path.
+    """Load a shipped robot by name, or a user's own by path.
 
     Raises:
         InvalidRobot: A file or a frame is missing, a field is wrong, or the arm touches itself at
@@ -166,7 +166,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     """
     path = Path(name_or_path)
     if path.suffix != ".toml":
-        path = ROBOT_FOLDER / f"{path.name}.toml"  # settings have made a path of a name
+        path = ROBOT_FOLDER / f"{path.name}.toml"  # settings turn names into paths
     if not path.is_file():
         raise InvalidRobot(
             f"robot: got {str(name_or_path)!r}. Use one of {robot_names()} or a .toml file."
@@ -236,12 +236,12 @@ def _load(path: Path, file: RobotFile) -> Robot:
 
 
 def touching(scene: core.Scene, model: Model, joints: Float64, around: Sequence[str] = ()) -> str:
-    """Two that touch at joints (J,), as words; the scene is of no use afterwards.
+    """The pair that touches at joints (J,), in words; the scene cannot be used afterwards.
 
     Args:
-        scene: Of the robot and what is around it.
+        scene: The robot and its surroundings.
         model: The robot's.
-        joints: Where it has collisions.
+        joints: A configuration in collision.
         around: Names of the obstacles.
     """
     for row, link in enumerate(model.links):
@@ -253,7 +253,7 @@ def touching(scene: core.Scene, model: Model, joints: Float64, around: Sequence[
 
 
 def _located(path: Path, field: str, name: str, packages: Sequence[str]) -> Path:
-    """The file that a field or a mesh names."""
+    """The path of a file named by a field or mesh."""
     if name.startswith("package://"):
         places = [Path(folder) / name.removeprefix("package://") for folder in packages]
     else:
@@ -344,7 +344,7 @@ def _cut_beyond(root: Element, flange: str) -> set[str]:
 
 
 def _fix_other_joints(root: Element, moving: Sequence[str]) -> None:
-    """Let the arm's joints alone move; those that turn without end turn once each way."""
+    """Fix all joints but the arm's; continuous joints are limited to one turn each way."""
     for joint in root.findall("joint"):
         if joint.get("name") not in moving:
             joint.set("type", "fixed")
@@ -387,7 +387,7 @@ def _check_meshes(path: Path, root: Element, packages: Sequence[str]) -> None:
 
 
 def _allowed(srdf: Element, root: Element, beyond: set[str]) -> list[tuple[str, str]]:
-    """Pairs of links that may touch; what is said of links beyond the flange is of the hand."""
+    """Pairs of links that may touch; links beyond the flange count as the hand."""
     links = {link for link in _links(root) if _has_shape(root, link)}
     pairs = set()
     for one in srdf.findall("disable_collisions"):

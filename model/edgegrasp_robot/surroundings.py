@@ -1,4 +1,4 @@
-"""What an arm must not touch: the seen cloud, the support, obstacles; and where it may start."""
+"""Obstacles of an arm (cloud, support, boxes of the request), and the check of its start."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,9 +19,9 @@ from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.robot import HAND, Robot, touching
 
 CELL = 0.01  # metres, side of a voxel
-AROUND = 2.0  # metres from the arm's base: what is beyond is left out
-SEEN_SELF = 0.02  # metres from the arm within which the camera sees the arm itself
-INSIDE = 10  # voxels of objects that may lie within the arm, as the camera errs
+AROUND = 2.0  # metres from the arm's base; farther points are left out
+SEEN_SELF = 0.02  # metres; points this near to the arm are the arm itself
+INSIDE = 10  # voxels of objects that may lie inside the arm, given camera errors
 SLAB = (6.0, 6.0, 0.5)  # metres, of the support
 FOOT = 0.015  # metres of what is held, at its foot, that may touch what it is put on
 NEAR = 0.02  # metres from what is held, within which voxels are its own
@@ -58,8 +58,8 @@ class Surroundings(NamedTuple):
         """Every obstacle."""
         if not len(self.voxels):
             return self.boxes
-        # Columns as coal's octrees have them: center, size, how probably it is occupied, and from
-        # which probability on it counts; octomap knows no certainty.
+        # Columns of coal's octrees: centre, size, probability of being occupied, and the threshold;
+        # octomap allows no certainty.
         cells = np.tile([0.0, 0.0, 0.0, CELL, 0.97, 0.5], (len(self.voxels), 1))
         cells[:, :3] = self.voxels
         return [*self.boxes, ("the cloud", core.OcTree(list(cells), CELL), self.T_base_scene)]
@@ -103,9 +103,9 @@ def surrounded(
     asked: RobotArm,
     boxes: Sequence[Box | OrientedBox],
 ) -> Iterator[Surroundings]:
-    """Put what is around the robot into its scenes, and take it away afterwards.
+    """Add the surroundings to the robot's scenes, and remove them afterwards.
 
-    The hand may touch it in `robot.straight`: there it goes where the detection found it free.
+    The hand may touch them in `robot.straight`, since the detection has checked it there.
 
     Args:
         robot: The robot.
@@ -118,7 +118,7 @@ def surrounded(
         What it put there.
 
     Raises:
-        InvalidRequest: It touches something where it is, or stands within an object.
+        InvalidRequest: The start is in collision, or the base stands inside an object.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
@@ -149,7 +149,7 @@ def surrounded(
 
 
 def _add(planned: core.Scene, robot: Robot, around: Sequence[Obstacle]) -> None:
-    """Put obstacles into a scene; they and the links that no joint moves may touch each other."""
+    """Add obstacles to a scene; they may touch each other and links that no joint moves."""
     T_root_base = planned.forwardKinematics(robot.home, robot.base_frame)
     for name, shape, pose in around:
         add = planned.addBoxGeometry if isinstance(shape, core.Box) else planned.addOcTreeGeometry
@@ -163,7 +163,7 @@ def _add(planned: core.Scene, robot: Robot, around: Sequence[Obstacle]) -> None:
 def _own_objects(
     robot: Robot, joints: Float64, scene: Scene, T_base_cloud: Float64
 ) -> set[int | None]:
-    """Numbers of objects that are the arm itself, as the camera sees it."""
+    """Numbers of detected objects that are the arm itself."""
     of_object = scene.object_of_point >= 0
     number = scene.object_of_point[of_object]
     objects = moved(T_base_cloud, scene.points_in_cloud[of_object])
@@ -217,7 +217,7 @@ def _voxels(
     flat = np.asarray(points).reshape(-1, 3)
     if scene.support is None:
         kept = np.isfinite(flat).all(axis=1)
-    else:  # in single precision, as most of an image is of the support
+    else:  # in single precision, since most of an image is support
         plane = np.append(scene.support.normal, -scene.support.offset)
         plane = (plane @ scene.frame.T_canonical_cloud).astype(flat.dtype)
         kept = flat @ plane[:3] > CELL / 2 - plane[3]  # NaN is not

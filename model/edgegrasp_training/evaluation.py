@@ -1,4 +1,4 @@
-"""How well scores separate grasps that hold from those that do not, and the model card.
+"""Evaluation of scores against outcomes, and the model card.
 
 `python -m edgegrasp_training.evaluation data/held-out --weights A.safetensors B.safetensors`
 compares weights of hand networks on labelled views that none of them has learned from: by kind of
@@ -29,8 +29,8 @@ from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.views import find_views, load_view, scene_of, split_by_scene, table
 
 TENTHS = tuple(round(0.1 * number, 1) for number in range(11))
-EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # of the ranges of scores in a comparison
-CURVE_ROWS = 20  # of the learning curve in the card, about
+EDGES = (0.0, 0.1, 0.3, 0.5, 0.8, 0.9, 0.95, 1.0)  # edges of the score ranges in a comparison
+CURVE_ROWS = 20  # approximate number of rows of the learning curve in the card
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Evaluation:
 
 
 def evaluate_scores(logit: Float32, label: Float32) -> Evaluation:
-    """All figures of some scores.  # (E,), (E,)."""
+    """All figures for scores and outcomes. # (E,), (E,)."""
     accuracy = float(np.mean((logit > 0) == (label > 0.5)))
     loss, rank = cross_entropy(logit, label), auroc(logit, label)
     return Evaluation(loss, accuracy, rank, fit_temperature(logit, label), logit, label)
@@ -90,7 +90,7 @@ class Range(NamedTuple):
 def reliability(
     score: Floats, held: NDArray[np.generic], edges: tuple[float, ...] = TENTHS
 ) -> dict[float, Range]:
-    """What held in each range of scores that has any, by its lower edge.  # (E,), (E,)."""
+    """Outcomes in each non-empty range of scores, by its lower edge. # (E,), (E,)."""
     place = np.digitize(score, edges[1:-1])
     ranges = {low: place == k for k, low in enumerate(edges[:-1])}
     return {
@@ -101,7 +101,7 @@ def reliability(
 
 
 def calibration_error(score: Floats, held: NDArray[np.generic]) -> float:
-    """Mean distance of score and share that held, over ten ranges of equal width."""
+    """Expected calibration error (ECE) over ten ranges of equal width."""
     ranges = reliability(score, held).values()
     return sum(each.number * abs(each.score - each.held) for each in ranges) / len(score)
 
@@ -111,7 +111,7 @@ def write_model_card(
 ) -> None:
     """Write a card in Markdown.
 
-    The evaluation is that before calibration.
+    The evaluation is from before calibration.
     """
     network = {name: value for name, value in asdict(metadata.network).items() if value != ()}
     facts = network | {"voxel_size": metadata.voxel_size, "gripper": metadata.gripper}
@@ -156,7 +156,7 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
 
     Raises:
         InvalidCheckpoint: Weights cannot be read.
-        ValueError: They are not of hand networks.
+        ValueError: They are not weights of hand networks.
     """
     networks = [load_checkpoint(path) for path in weights]
     if any(metadata.network.architecture != "hand" for _, metadata in networks):
@@ -181,7 +181,7 @@ def score_views(paths: list[Path], weights: list[Path]) -> Scored:
 
 
 def reliability_tables(scored: Scored, names: list[str]) -> str:
-    """Markdown: figures of each group of grasps, and how many of each range of scores held."""
+    """Markdown: figures for each group of grasps, and the share that held by score."""
     groups = {"all": np.ones(len(scored.held), dtype=bool)}
     groups |= {f"{kind} scenes": scored.kind == kind for kind in np.unique(scored.kind)}
     groups |= {"far side hidden": scored.far_side_hidden, "far side seen": ~scored.far_side_hidden}

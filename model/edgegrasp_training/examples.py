@@ -20,10 +20,10 @@ from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import UNTRIED, UP, LabelledView
 
 Rotations = Literal["any", "upright", "none"]
-SPARE_POINTS = 2  # times a hand's points are kept, for each step to pick from
-TRIED_WEIGHT = 4.0  # of a simulated label in the loss, beside a teacher's score of weight 1
-SHAKEN_SHARE = 0.2  # of a held grasp's label that depends on whether it survives shaking
-FIRM_SHARE = 0.78  # of the held grasps that survive shaking; stands in where it was not tried
+SPARE_POINTS = 2  # factor of points kept per hand, from which each step picks
+TRIED_WEIGHT = 4.0  # weight of a simulated label in the loss; a teacher's score has weight 1
+SHAKEN_SHARE = 0.2  # part of a successful grasp's label that depends on surviving shaking
+FIRM_SHARE = 0.78  # share of successful grasps that survive shaking; used if shaking was not tried
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,8 @@ from edgegrasp_training.views import LabelledView, different, support_as_array
 
 SCENE_STREAM, CAMERA_STREAM, NOISE_STREAM, CHOICE_STREAM, SHAPE_STREAM, HAND_STREAM = range(6)
 HOUSEHOLD_STREAM = 6
-APPROACH_POINTS = 12  # few balls with many labels each are cheapest to train on
-BIN_APPROACH_POINTS = 24  # walls are in the way of most hands there
+APPROACH_POINTS = 12  # few balls with many labels each are the cheapest to train on
+BIN_APPROACH_POINTS = 24  # walls block most hands there
 # Four in ten scenes are those of the benchmark of the paper.
 _P, _H, _B, _T = SceneKind.PACKED, SceneKind.PILE, SceneKind.BIN, SceneKind.TABLE
 MIXTURE = (_P, _H, _B, _T, _B, _P, _T, _H, _B, _T)
@@ -349,7 +349,7 @@ def _plane(rng: np.random.Generator) -> SupportPlane:
 
 
 def _objects_of(simulation: ClutterSimulation) -> Region:
-    """Where the objects are, without the obstacles around them."""
+    """Bounds of the objects, without the obstacles around them."""
     boxes = simulation.object_bounds + AIM_MARGIN
     around = []
     for box in simulation.surroundings.boxes:
@@ -387,7 +387,7 @@ def label(
     selected, scene, candidates = found
     T_world_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     results = [simulation.try_grasp(pose, shake=True) for pose in T_world_hand]
-    # What is far from every grasp says nothing about any.
+    # Points far from every grasp carry no information.
     behind = choose_gripper(query.request, load_gripper(), {}).tip_z - BEHIND_TIPS
     places = T_world_hand[:, :3, 3] + np.float32(behind) * T_world_hand[:, :3, 2]
     if len(places) == 0:  # a teacher's grasps are on the objects

@@ -1,4 +1,4 @@
-"""The hands that try grasps: the Panda's, that of a gripper file, or one drawn for each scene."""
+"""The hands that execute grasps: the Panda's, a gripper file's, or a random one per scene."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What can be asked of data generation and of training; the command line makes flags of it."""
+"""Options of data generation and training; the command line turns them into flags."""
 
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,7 @@
-"""Learning from the robot: weights recalibrated on grasps that were tried, held or not.
+"""Learning from the robot: recalibrate weights on the outcomes of executed grasps.
 
-Two numbers are fitted, p = sigmoid(scale * logit + shift) (Platt scaling): as much as some hundred
-outcomes can tell. The order of grasps stays; what changes is how far a score can be trusted.
+Fits two numbers, p = sigmoid(scale * logit + shift) (Platt scaling), which is as much as some
+hundred outcomes can determine. The order of grasps stays the same.
 """
 
 import json

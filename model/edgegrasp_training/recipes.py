@@ -24,7 +24,7 @@ GRIPPER = "panda"
 # Metres. In metres the positions in a ball are far smaller than its normals, and learned late. A
 # power of two, so that converting weights back to metres is exact.
 LENGTH_UNIT = 1 / 64
-GAIN = 3**0.5  # a dozen layers with PyTorch's initial weights would shrink signals to nothing
+GAIN = 3**0.5  # with PyTorch's initial weights a dozen layers would shrink signals to nothing
 RECIPES: dict[str, NetworkConfig] = {
     "edgegrasp": replace(EDGEGRASP, crop_radius=CROP_RADIUS),
     "edgegrasp-small": replace(EDGEGRASP_SMALL, crop_radius=CROP_RADIUS),
@@ -54,9 +54,9 @@ def prepare_to_train(network: nn.Module) -> None:
 
 
 def start_from(network: nn.Module, start: nn.Module) -> int:
-    """Give a network the weights of a trained one; a hand network may describe hands further.
+    """Copy the weights of a trained network; a hand network may read more numbers.
 
-    Numbers that the trained one does not read have no weight at first: both score alike.
+    Additional numbers start with weight 0, so both networks score alike.
 
     Args:
         network: To train; gets the weights.

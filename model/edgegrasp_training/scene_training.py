@@ -22,12 +22,12 @@ from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scen
 from edgegrasp_model.scene.segment import group, instance_traits, look
 from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
 
-UP_SHARE = 0.5  # of the images whose `up` the network is given
+UP_SHARE = 0.5  # share of the images for which the network gets `up`
 UP_ERROR = 0.02  # radians, standard deviation of the `up` that it is given
 BATCH = 16
 SIZES, SIZE_SHARES = ((240, 320), (192, 256), (144, 192)), (0.5, 0.3, 0.2)  # pixels, of batches
 CLOSER_SHARE = 0.5  # of the smaller images, a part of a stored image rather than all of it
-CROPPED_SHARE = 0.12  # of the images, of which only what is above the support and near is left
+CROPPED_SHARE = 0.12  # share of the images cropped to the objects' surroundings
 HELD_OUT = 2  # files, the first ones, that the network never learns from
 LEARNING_RATE = 3e-3
 WARM_UP = 200  # steps
@@ -38,7 +38,7 @@ APART = 4.0  # weight of a link between different objects
 
 
 class SceneBatch(NamedTuple):
-    """Images and what to say of them, at the output's resolution."""
+    """Images and training targets, at the output's resolution."""
 
     features: Tensor  # (B, CHANNELS, H, W)
     classes: Tensor  # (B, H/2, W/2) int64; -1 without a reading
@@ -148,7 +148,7 @@ def _cropped(
     plane: Float32,
     rng: np.random.Generator,
 ) -> Float32:
-    """The points above the support and near the objects alone, as callers cut clouds off."""
+    """Only the points above the support and near the objects, as callers crop clouds."""
     objects = points[(label >= OBJECT) & ~np.isnan(points[..., 2])]
     if len(objects) < 50:
         return points
@@ -207,9 +207,10 @@ def evaluate(network: SceneNet, images: SceneImages, limit: int = 200) -> dict[s
 
 
 def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
-    """Logistic regression of `instance_traits` on whether what the network finds is an object.
+    """Logistic regression from `instance_traits` to whether a found instance is an object.
 
-    An object is what mostly has pixels of one; of every second image `up` is known.
+    An instance counts as an object if most of its pixels belong to one; `up` is known for every
+    second image.
     """
     traits, right = [], []
     for row in range(len(images)):
@@ -232,9 +233,9 @@ def fit_confidence(network: SceneNet, images: SceneImages) -> list[float]:
 
 
 def batches(data: Path, images: SceneImages, rng: np.random.Generator) -> Iterator[SceneBatch]:
-    """Endless batches, each image once before any twice; one is made while another is learned.
+    """Endless batches in random order; the next one is prepared during each training step.
 
-    Files that come into the folder meanwhile are read too.
+    Files added to the folder meanwhile are read too.
     """
 
     def one(rows: Int64) -> SceneBatch:

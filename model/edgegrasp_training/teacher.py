@@ -1,4 +1,4 @@
-"""A trained network as teacher: it scores candidates that were not tried in simulation."""
+"""A trained network as a teacher, which scores candidates that were not executed in simulation."""
 
 import zlib
 from pathlib import Path

@@ -2,6 +2,6 @@
 
 import os
 
-# gRPC, which reads this as it is imported: the thread that waits for requests reads their bytes
-# itself. Its event engine has them pass through three more threads, 0.2 ms of every request.
+# gRPC reads this at import. Its default event engine passes requests through three more threads,
+# which costs 0.2 ms each.
 os.environ.setdefault("GRPC_EXPERIMENTS", "-event_engine_listener")

@@ -1,4 +1,4 @@
-"""Errors of the service, and the one table that gives every error its status."""
+"""Errors of the service, and the table that maps every error to its gRPC code and HTTP status."""
 
 import re
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ class ServiceError(EdgeGraspError):
 
 
 class Unauthenticated(InvalidRequest):
-    """There is no token, or none that the server knows; its value is in no message."""
+    """The token is missing or unknown; its value never appears in a message."""
 
 
 class PermissionDenied(InvalidRequest):
-    """A token is good for less than what is asked for."""
+    """The token does not permit the request."""
 
 
 class HeadersTooLarge(InvalidRequest):
-    """HTTP headers or gRPC metadata are over the server's limits."""
+    """HTTP headers or gRPC metadata exceed the server's limits."""
 
 
 class ReloadFailed(ServiceError):  # noqa: N818
-    """New weights cannot be used; the old ones still serve."""
+    """New weights cannot be used; the old ones stay in use."""
 
 
 class NotReady(ServiceError):  # noqa: N818
@@ -37,7 +37,7 @@ class NotReady(ServiceError):  # noqa: N818
 
 
 class Overloaded(ServiceError):  # noqa: N818
-    """As many requests as the server takes are in it already."""
+    """The server is full."""
 
     def __init__(self, message: str, retry_after: float = 1.0) -> None:
         super().__init__(message)
@@ -49,26 +49,26 @@ class RequestTimeout(InvalidRequest):
 
 
 class DeadlineExceeded(ServiceError):  # noqa: N818
-    """The caller's deadline passed before there was an answer."""
+    """The caller's deadline passed before the answer was ready."""
 
     def __init__(self, message: str = "The deadline passed before there was an answer.") -> None:
         super().__init__(message)
 
 
 class Cancelled(ServiceError):  # noqa: N818
-    """The caller is gone; nobody reads this."""
+    """The caller disconnected; this error is never read."""
 
 
 class WorkerLost(ServiceError):  # noqa: N818
-    """The process that worked on the request died or ran out of memory, and is replaced."""
+    """The worker process of the request died or ran out of memory, and is being replaced."""
 
 
 class HarmfulRequest(InvalidRequest):
-    """A request that ended the process that worked on it is not tried again for a while."""
+    """A request that killed its worker process is refused for a while."""
 
 
 class DiskFull(ServiceError):  # noqa: N818
-    """What a request asks to keep cannot be written."""
+    """The data to store cannot be written."""
 
 
 class DetectorFailed(ServiceError):  # noqa: N818
@@ -112,7 +112,7 @@ STATUS: dict[type[Exception], tuple[str, int]] = {
 
 @dataclass(frozen=True)
 class Problem:
-    """An error as both transports tell it; plain values, for it crosses between processes."""
+    """An error as both transports send it; plain values, as it crosses process boundaries."""
 
     kind: str  # the class's name in kebab case, e.g. "invalid-request"
     detail: str
@@ -125,7 +125,7 @@ class Problem:
 
 
 def report(error: Exception) -> Problem:
-    """Describe an error for the caller; one the table does not know tells nothing of itself."""
+    """Describe an error for the caller; an unknown error reveals nothing about itself."""
     if type(error) not in STATUS:
         error = DetectorFailed("The server failed; its log says why.")
     code, status = STATUS[type(error)]
@@ -151,11 +151,11 @@ def problem_document(problem: Problem) -> bytes:
 
 
 def _sendable(text: str) -> str:
-    """A caller's own words, short enough for gRPC's metadata and without half characters."""
+    """A caller's text, shortened for gRPC metadata and without lone surrogates."""
     text = text.encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= 200 else text[:197] + "..."
 
 
 def kind_of(error: type[Exception]) -> str:
-    """The name an error has on the wire: InvalidRequest is "invalid-request"."""
+    """The name of an error on the wire: InvalidRequest is "invalid-request"."""
     return re.sub(r"(?<!^)(?=[A-Z])", "-", error.__name__).lower()

@@ -1,4 +1,4 @@
-"""What is known of a request, and what is logged and counted of it."""
+"""Request state, logs and metrics."""
 
 import contextlib
 import ipaddress
@@ -36,11 +36,11 @@ class Call:
 
     transport: Transport
     method: str  # the gRPC method's name, for either transport
-    request_id: str = ""  # the caller's own where it is usable, or else a new one
+    request_id: str = ""  # the caller's own if usable, else a new one
     peer: str = ""  # address without port
     token: str = ""  # name of the token it came with
     is_admin: bool = False
-    long: bool = False  # a stream, whose duration says nothing
+    long: bool = False  # a stream, whose duration means nothing
     in_stream: bool = False  # one request of a stream
     start: float = field(default_factory=time.monotonic)  # as the event loop's clock
     deadline: float = float("inf")
@@ -58,29 +58,29 @@ class Call:
 
     @property
     def client(self) -> str:
-        """Whom its requests count for."""
+        """The client that its requests are counted for."""
         return self.token or network_of(self.peer)
 
     def limit(self, timeout: float) -> None:
-        """Bring the deadline forward to `timeout` seconds after the start, if it is later."""
+        """Set the deadline to at most `timeout` seconds after the start."""
         self.deadline = min(self.deadline, self.start + timeout)
 
     def end_stage(self, name: str) -> None:
-        """Note that a stage ended now, which began where the one before it ended."""
+        """Record the end of a stage, which began when the previous one ended."""
         self.stages[name] = time.monotonic() - self.start - sum(self.stages.values())
 
     def end(self) -> None:
-        """Note that it ended now, and with which code."""
+        """Record its end and its code."""
         self.seconds = time.monotonic() - self.start
         if self.transport == "http":
-            self.code = self.code or "499"  # the caller went away; as nginx logs it
+            self.code = self.code or "499"  # the caller disconnected; nginx's code
         else:
             self.code = "OK" if self.problem is None else self.problem.code
 
 
 @lru_cache(1024)
 def network_of(address: str) -> str:
-    """The address; of IPv6 its /64, all of which one machine may use."""
+    """The address; for IPv6 its /64 network, since one machine may use all of it."""
     try:
         found = ipaddress.IPv6Address(address)
     except ValueError:
@@ -93,17 +93,17 @@ CALL: ContextVar[Call | None] = ContextVar("call", default=None)  # of the runni
 
 
 def current_call() -> Call:
-    """The call that the running task works on."""
+    """The call of the running task."""
     call = CALL.get()
     assert call is not None, "outside of the middleware"
     return call
 
 
-# Logs: JSON lines; a thread writes them, so that no log can hold up a request
+# Logs: JSON lines, written by a thread so that logging never delays a request
 
-MAX_WAITING = 4096  # records; more than that, and new ones are dropped
+MAX_WAITING = 4096  # queued records; further ones are dropped
 STOP_SECONDS = 1.0
-PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # every few seconds; not worth a line
+PROBES = ("Live", "Ready", "HealthCheck", "Metrics")  # called every few seconds; not logged
 LOGGED = ("request_id", "transport", "method", "code", "peer", "token", "bytes_in", "bytes_out")
 
 requests = logging.getLogger("edgegrasp_service.requests")
@@ -154,10 +154,10 @@ class JsonFormatter(logging.Formatter):
 
 
 class LogQueue(logging.handlers.QueueHandler):
-    """Hands lines to a thread that writes them, and goes on where that fails.
+    """Passes lines to a writer thread; a failing stream does not stop the server.
 
     Attributes:
-        dropped: Lines that no one will read: the disk is full, the stream closed or not read.
+        dropped: Lines lost because the disk is full or the stream is closed or not read.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -170,18 +170,18 @@ class LogQueue(logging.handlers.QueueHandler):
         self._writer.start()
 
     def prepare(self, record: logging.LogRecord) -> str:
-        """The line of a record, while its request is known."""
+        """Format a record while its request is known."""
         call = CALL.get()
         if call is not None and not hasattr(record, "fields"):
             record.fields = {"request_id": call.request_id}
         return self.format(record)
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a line that cannot be formatted, or that there is no room for."""
+        """Count a line that cannot be formatted or queued."""
         self.dropped += 1
 
     def close(self) -> None:
-        """Write what is queued, unless nobody reads it."""
+        """Write the queued lines, unless the stream is stuck."""
         with contextlib.suppress(queue.Full):
             self._lines.put(None, timeout=STOP_SECONDS)
             self._writer.join(STOP_SECONDS)
@@ -193,7 +193,7 @@ class LogQueue(logging.handlers.QueueHandler):
 
 
 def write_line(stream: TextIO | None, line: str) -> bool:
-    """Write a line past the stream's buffer, which would keep it and fail again on closing.
+    """Write a line unbuffered: a failing stream's buffer would fail again on closing.
 
     Returns whether it was written; no stream: this process was started with it closed.
     """
@@ -209,7 +209,7 @@ def write_line(stream: TextIO | None, line: str) -> bool:
 
 
 def start_logging(settings: Settings, stream: TextIO | None) -> LogQueue:
-    """Send every record of this process to a stream; close what is returned when it ends."""
+    """Send every record of this process to a stream; close the returned queue at the end."""
     handler = LogQueue(stream)
     logging.basicConfig(level=settings.log_level.upper(), handlers=[handler], force=True)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
@@ -250,7 +250,7 @@ class Metrics:
         self._reloads = counter("reloads", "weights loaded anew", ("outcome",))
 
     def count_call(self, call: Call) -> None:
-        """Count a call that has ended; a request of a stream as a result of it."""
+        """Count a call that has ended; a request within a stream counts as a result."""
         if call.in_stream:
             self._results.labels(call.code).inc()
         else:
@@ -268,13 +268,13 @@ class Metrics:
         self._reloads.labels("succeeded" if succeeded else "failed").inc()
 
     def watch(self, name: str, meaning: str, value: Callable[[], float]) -> None:
-        """Show a number that is asked for when metrics are read."""
+        """Add a gauge whose value is computed when metrics are read."""
         self._gauge(name, meaning).set_function(value)
 
     def page(self, accept: str) -> tuple[bytes, str]:
         """All metrics as text, and its content type.
 
-        OpenMetrics to whom asks for it.
+        OpenMetrics if the client asks for it.
         """
         self._model_info.clear()
         for facts in self._models():

@@ -1,6 +1,6 @@
-"""Is the server of these settings ready? For the health check of a container.
+"""Health check for containers: is the server of these settings ready?
 
-usage: python -m edgegrasp_service.probe    exits with 0 where it is
+usage: python -m edgegrasp_service.probe exits with 0 if it is
 """
 
 import contextlib
@@ -17,9 +17,9 @@ REQUEST = b"GET /health/ready HTTP/1.1\r\nHost: localhost\r\nConnection: close\r
 
 
 def read_settings() -> dict[str, Any]:
-    """Those of NAMES that the server's file and environment give.
+    """The settings in NAMES, from the server's file and environment.
 
-    Not as `edgegrasp_service.settings` does it, whose Pydantic takes far longer than the check.
+    Does not use `edgegrasp_service.settings`: importing Pydantic takes far longer than the check.
     """
     path = os.environ.get("EDGEGRASP_CONFIG")
     given: dict[str, Any] = tomllib.loads(Path(path).read_text("utf-8")) if path else {}
@@ -35,8 +35,8 @@ def is_ready(
 ) -> bool:
     """Whether a server on this machine answers requests.
 
-    One that wants a client's certificate is asked for nothing more than to listen: it does once it
-    has started, ready or not.
+    A server that requires client certificates is only checked for listening, which it does once
+    started, ready or not.
     """
     try:
         with contextlib.ExitStack() as stack:
@@ -46,7 +46,7 @@ def is_ready(
             if tls_certificate is not None:
                 import ssl
 
-                # The certificate is for the name others call the server by; this asks itself.
+                # The certificate is for the server's public name, but this connects to localhost.
                 context = ssl._create_unverified_context()
                 connection = stack.enter_context(context.wrap_socket(connection))
             connection.sendall(REQUEST)

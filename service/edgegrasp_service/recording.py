@@ -1,4 +1,4 @@
-"""What is kept in files: requests with their answers, for `edgegrasp replay`; and outcomes."""
+"""Files that the server writes: recorded requests for `edgegrasp replay`, and outcomes."""
 
 import asyncio
 import errno
@@ -27,8 +27,8 @@ MAX_OUTCOMES = 64 * 2**20  # bytes at which their file takes no more
 class Recorder:
     """Writes each request and its answer to a file TIME-ID.job, as the messages of a worker.
 
-    Beyond `most` bytes of all files the oldest are deleted. What `hold` has no room for is not
-    recorded: it gets how many bytes wait to be written, and how many no longer do.
+    The oldest files are deleted beyond `most` bytes in total. `hold` reserves the bytes waiting to
+    be written and frees them (negative); requests it has no room for are not recorded.
 
     Raises:
         InvalidSettings: The folder cannot be made or read.
@@ -51,7 +51,7 @@ class Recorder:
         self._thread = ThreadPoolExecutor(1, "recorder")
 
     def record(self, job: Job, answer: Answer) -> None:
-        """Write one request and its answer, soon."""
+        """Queue one request and its answer for writing."""
         size = len(job.body) + len(answer.body)
         if not self._hold(size):
             logger.warning("%s is not recorded: the disk is too slow", job.request_id)
@@ -85,7 +85,7 @@ class Recorder:
 
 
 class TriedGrasp(BaseModel):
-    """A grasp that a robot tried."""
+    """A grasp that a robot executed."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -110,7 +110,7 @@ def append_outcome(tried: TriedGrasp, catalogue: Any, path: Path) -> None:
 
 
 def append_line(path: Path, line: bytes) -> None:
-    """Append a whole line, or nothing; what was left of half a line is removed.
+    """Append a whole line or nothing; an incomplete last line is removed first.
 
     Raises:
         PayloadTooLarge: The file is full.
@@ -119,7 +119,7 @@ def append_line(path: Path, line: bytes) -> None:
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         with os.fdopen(descriptor, "r+b", buffering=0) as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # workers write one after the other
+            fcntl.flock(file, fcntl.LOCK_EX)  # workers write one at a time
             end = file.seek(0, os.SEEK_END)
             if end > MAX_OUTCOMES:
                 raise PayloadTooLarge("outcomes", "more than the file takes", "Move the file away.")
@@ -135,7 +135,7 @@ def append_line(path: Path, line: bytes) -> None:
 
 
 def check_outcomes(path: Path) -> None:
-    """Raise InvalidSettings unless outcomes can be kept in a file."""
+    """Raise InvalidSettings unless outcomes can be written to the file."""
     try:
         append_line(path, b"")
     except (DiskFull, PayloadTooLarge) as error:

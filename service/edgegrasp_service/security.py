@@ -1,4 +1,4 @@
-"""Who may ask, and over what: bearer tokens, and TLS of both transports from the same files."""
+"""Access control: bearer tokens, and TLS for both transports from the same files."""
 
 import hashlib
 import re
@@ -18,7 +18,7 @@ HEADER = "authorization"
 FIX = "Send `authorization: Bearer TOKEN` with a token of this server."
 ADMIN_FIX = "Send an admin token; where the server has none, send its process SIGHUP instead."
 
-# RFC 6750's letters; fewer than 16 of them can be guessed.
+# RFC 6750's characters; fewer than 16 can be guessed.
 _TOKEN = re.compile(r"[A-Za-z0-9._~+/-]{16,512}=*")
 _NAMED = re.compile(r"(?:([\w.-]{1,64}):)?(.*)", re.DOTALL)  # a line of a token file
 
@@ -27,21 +27,21 @@ _NAMED = re.compile(r"(?:([\w.-]{1,64}):)?(.*)", re.DOTALL)  # a line of a token
 class Token:
     """A token that the server knows."""
 
-    name: str  # for logs; "NAME:" before a token in its file, or else where it was read
+    name: str  # for logs: "NAME:" before a token in its file, else where it was read
     digest: bytes  # SHA-256; the token itself is not kept
-    is_admin: bool = False  # good for reloading weights too
+    is_admin: bool = False  # also permits reloading weights
 
 
 class Tokens:
-    """Whether a request may do what it asks for.
+    """Checks the tokens of requests.
 
     Args:
-        known: Without one that is no admin's, nobody needs a token; without an admin's, nobody may
+        known: The tokens. Without ordinary tokens none is required; without admin tokens nobody may
             reload weights.
     """
 
     def __init__(self, known: Iterable[Token] = ()) -> None:
-        # Looked up by digest: what the time of that tells is nothing of a token.
+        # Looked up by digest, so that timing reveals nothing about a token.
         self._known = {token.digest: token for token in known}
 
     @property
@@ -50,15 +50,15 @@ class Tokens:
         return any(not token.is_admin for token in self._known.values())
 
     def check(self, authorization: str | None, *, admin: bool = False) -> Token | None:
-        """The token of a request that may go on; None: it needs none.
+        """The valid token of a request; None if none is needed.
 
         Args:
             authorization: Its header of that name.
-            admin: Whether it asks for what only an admin token is good for.
+            admin: Whether the call needs an admin token.
 
         Raises:
-            Unauthenticated: It has no token, or none that the server knows.
-            PermissionDenied: It has a token that is good for less.
+            Unauthenticated: The token is missing or unknown.
+            PermissionDenied: The token does not permit the call.
         """
         if not admin and not self.required:
             return None
@@ -78,10 +78,10 @@ class Tokens:
 
 
 def load_tokens(settings: Settings) -> Tokens:
-    """The tokens of the files that the settings name.
+    """The tokens in the files named by the settings.
 
     Raises:
-        InvalidSettings: A file cannot be read, or what it holds is no token.
+        InvalidSettings: A file cannot be read or has an invalid token.
     """
     tokens = _read_tokens("token_file", settings.token_file)
     return Tokens(tokens + _read_tokens("admin_token_file", settings.admin_token_file))
@@ -119,10 +119,10 @@ def _digest(token: str) -> bytes:
 
 
 class ServerTls:
-    """What each transport needs to speak TLS, with client certificates where a CA is set.
+    """TLS of both transports, with client certificates if a CA is set.
 
     Raises:
-        InvalidSettings: A file cannot be read, or certificate and key are no pair.
+        InvalidSettings: A file cannot be read, or certificate and key do not match.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -131,16 +131,16 @@ class ServerTls:
         self.use(self.read())
         self.grpc = grpc.dynamic_ssl_server_credentials(
             self._for_grpc,
-            lambda: self._for_grpc,  # asked for each connection
+            lambda: self._for_grpc,  # called for each connection
             require_client_authentication=settings.tls_client_ca is not None,
         )
 
     def use(self, certificates: "Certificates") -> None:
-        """Use these from the next connection on; those that are open stay as they are."""
+        """Use these for new connections; open ones are not affected."""
         self.http.current, self._for_grpc = certificates
 
     def read(self) -> "Certificates":
-        """The files as they are now; raises InvalidSettings."""
+        """Read the files; raises InvalidSettings."""
         settings = self._settings
         certificate, key, ca = settings.tls_certificate, settings.tls_key, settings.tls_client_ca
         assert certificate is not None
@@ -167,15 +167,15 @@ Certificates = tuple[ssl.SSLContext, grpc.ServerCertificateConfiguration]
 
 
 class _RenewableContext(ssl.SSLContext):
-    """A context that leaves each new connection to the one that is current then."""
+    """A context that delegates each new connection to the current context."""
 
     current: ssl.SSLContext
 
     def wrap_bio(self, *arguments: Any, **named: Any) -> ssl.SSLObject:
-        """As asyncio calls it when a connection comes in."""
+        """Called by asyncio for each new connection."""
         return self.current.wrap_bio(*arguments, **named)
 
 
 def _refuse_encrypted_key() -> str:
-    """Called for an encrypted key, in the place of a question on the terminal."""
+    """Called for an encrypted key, instead of a prompt on the terminal."""
     raise ValueError("the key is encrypted, and nobody is there to ask")

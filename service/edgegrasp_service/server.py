@@ -1,4 +1,4 @@
-"""The process that accepts: HTTP and gRPC in one event loop, in front of the workers."""
+"""The front process: HTTP and gRPC in one event loop, in front of the workers."""
 
 import asyncio
 import contextlib
@@ -37,21 +37,21 @@ from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
 logger = logging.getLogger(__name__)
 
-NOTICE_SECONDS = 0.25  # requests that come this soon after a stop are answered, not cut off
-CLOSE_SECONDS = 0.5  # for answers on their way, and watchers of health
-REPEAT_SECONDS = 10.0  # between two lines of the log about the same trouble with sockets
+NOTICE_SECONDS = 0.25  # seconds; requests that arrive this soon after a stop are still answered
+CLOSE_SECONDS = 0.5  # seconds for answers being sent, and for health watchers
+REPEAT_SECONDS = 10.0  # seconds between log lines about the same socket error
 
 
 class Server:
-    """Both transports of one service. Must be made in the running event loop.
+    """Both transports of one service. Must be created in the running event loop.
 
-    `observers` get every call, besides the metrics and the log.
+    `observers` receive every call, like the metrics and the log.
 
     Raises:
         InvalidSettings: A certificate or a token cannot be used.
 
     Attributes:
-        metrics: What /metrics shows.
+        metrics: The values of /metrics.
         service: The front without a transport.
         pool: The workers.
         http_url: e.g. "http://127.0.0.1:8000", once ports are open.
@@ -103,10 +103,10 @@ class Server:
         opened: Callable[[], None] = lambda: None,
         ready: Callable[[], None] = lambda: None,
     ) -> None:
-        """Open both ports, load the weights, answer until `stop` is set, then drain.
+        """Open both ports, load the weights, serve until `stop` is set, then drain.
 
         Args:
-            stop: Set to stop.
+            stop: Set it to stop the server.
             opened: Called when both ports answer; requests are refused as not ready.
             ready: Called when requests are answered.
 
@@ -156,7 +156,7 @@ class Server:
             ready()
 
     async def _drain(self, grpc_server: GrpcServer) -> None:
-        """Refuse new requests, and wait until those accepted are answered, or grace is over."""
+        """Refuse new requests; wait until accepted ones are answered or the grace period ends."""
         self.service.stopping.set()
         await grpc_server.set_serving(False)
         notice = min(NOTICE_SECONDS, self._settings.grace_seconds)
@@ -177,28 +177,28 @@ class Server:
             server_header=False,
             proxy_headers=False,
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
-            timeout_graceful_shutdown=1,  # there was grace before
+            timeout_graceful_shutdown=1,  # the grace period is already over
             ssl_context_factory=None if tls is None else lambda config, default: tls.http,
         )
         return _HttpServer(config)
 
 
 class _HttpServer(uvicorn.Server):
-    """Leaves signals to the process: both transports stop together."""
+    """Leaves signals to the process, so that both transports stop together."""
 
     capture_signals = contextlib.nullcontext  # type: ignore[assignment]
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen; more connections may wait than are accepted at once."""
+        """Listen, with a backlog larger than the number accepted at once."""
         await super().startup(sockets)
         for one in sockets or ():
             one.listen(BACKLOG)
 
 
 class _LoopErrors:
-    """Logs what the event loop complains of; trouble with sockets once in a while, in one line.
+    """Logs errors of the event loop; repeated socket errors are logged rarely, in one line.
 
-    Without file descriptors left, every connection that waits would have its traceback.
+    Without free file descriptors, every waiting connection would log a traceback.
     """
 
     def __init__(self) -> None:
@@ -206,7 +206,7 @@ class _LoopErrors:
 
     def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        # A socket that is closed before it accepts again has no descriptor: a ValueError.
+        # A socket that is closed before it accepts again has no descriptor and raises ValueError.
         if not isinstance(error, OSError) and "Invalid file descriptor" not in str(error):
             loop.default_exception_handler(context)
         elif loop.time() >= self._next:
@@ -236,7 +236,7 @@ async def _serve_until_signalled(settings: Settings, log: LogQueue) -> None:
     terminal = _at_a_terminal()
 
     def hang_up() -> None:
-        if terminal and not _at_a_terminal():  # it was closed, with nobody left to stop this
+        if terminal and not _at_a_terminal():  # stdout was closed
             stop.set()
         else:
             server.reloader.reload_soon()
@@ -258,7 +258,7 @@ def _at_a_terminal() -> bool:
 
 
 def warn(settings: Settings) -> None:
-    """Say what an operator may not have meant."""
+    """Warn about settings that an operator may not have intended."""
     try:
         local = ipaddress.ip_address(settings.host).is_loopback
     except ValueError:
@@ -284,13 +284,14 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         raise AddressInUse("HTTP", place, str(error.strerror)) from None
     if family != socket.AF_UNIX:
-        # Connections inherit it; asyncio sets it on its own sockets only. Answers waited for 40 ms.
+        # Connections inherit it; asyncio sets it only on its own sockets. Without it answers waited
+        # for 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listening
 
 
 def _remove_unused(path: str) -> None:
-    """Remove a Unix domain socket that a server has left, not one that a server listens on."""
+    """Remove a stale Unix domain socket, but not one that a server listens on."""
     with socket.socket(socket.AF_UNIX) as trying:
         if trying.connect_ex(path) == errno.ECONNREFUSED:
             Path(path).unlink(missing_ok=True)

@@ -11,10 +11,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from edgegrasp_service.errors import InvalidSettings
 
 MIB = 2**20
-UNIX = "unix:"  # begins a host that is a folder of sockets
+UNIX = "unix:"  # prefix of a host that is a folder of sockets
 PREFIX = "EDGEGRASP_"
 CONFIG_VARIABLE = PREFIX + "CONFIG"
-NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter are of the client's commands
+NO_SETTINGS = (CONFIG_VARIABLE, PREFIX + "CLIENT_")  # the latter belong to the client's commands
 LISTS = ("weights", "grippers", "robots", "allowed_hosts")
 
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -25,7 +25,7 @@ Timeout = Annotated[float, Field(gt=0.0, le=3600.0)]  # seconds
 
 
 class Settings(BaseModel):
-    """What an operator can set; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
+    """The server's settings; `EDGEGRASP_HTTP_PORT=8080` sets `http_port`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -121,9 +121,9 @@ class Settings(BaseModel):
 
 
 def load_settings(config: Path | None = None, **given: object) -> Settings:
-    """Settings from defaults, a TOML file, the environment and arguments, the latter winning.
+    """Settings from defaults, a TOML file, the environment and arguments, in rising priority.
 
-    Without `config`, the file is the one EDGEGRASP_CONFIG names, if it does.
+    Without `config`, the file is the one named by EDGEGRASP_CONFIG, if set.
 
     Raises:
         InvalidSettings: A value is of the wrong type or out of range, or a name is unknown.
@@ -164,7 +164,7 @@ def _located(name: str, value: Any, folder: Path) -> Any:
 
 
 def _read_environment() -> dict[str, Any]:
-    """The settings in EDGEGRASP_* variables, and names that are none; lists are JSON."""
+    """The settings in EDGEGRASP_* variables, including unknown names; lists are JSON."""
     fields: dict[str, Any] = {}
     for variable, text in os.environ.items():
         if not text or not variable.startswith(PREFIX) or variable.startswith(NO_SETTINGS):
@@ -178,7 +178,7 @@ def _read_environment() -> dict[str, Any]:
 
 
 def _sentence(error: ValidationError, sources: dict[str, dict[str, Any]]) -> str:
-    """The first thing wrong and where it is set."""
+    """The first error, and where the value was set."""
     first = error.errors(include_url=False)[0]
     message = first["msg"].removeprefix("Value error, ")
     if not first["loc"]:

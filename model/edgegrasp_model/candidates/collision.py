@@ -1,4 +1,4 @@
-"""Where the hand would hit something, how near it comes, and how far its fingers must open."""
+"""Collision checks of the hand, its clearance, and the opening that its fingers need."""
 
 from collections.abc import Callable
 
@@ -22,15 +22,15 @@ from edgegrasp_model.unseen import DepthMap, enters_unseen
 
 FINGER_CLEARANCE = 0.005  # metres left free between each finger and the object
 MIN_FIXED = 8  # voxels of background between the fingers that keep them from closing
-TOUCH = 1e-6  # metres; hands retracted from the support plane end this near to it
+TOUCH = 1e-6  # metres between the support plane and a hand that was retracted from it
 
 
 def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet the cloud, the support plane or an obstacle, or close on background.
+    """Which open hands collide with cloud, support plane or obstacles, or close on background.
 
-    In space that no camera saw they may meet something, and count as colliding too.
+    A hand that enters space which no camera saw counts as colliding too.
 
-    Checked at the grasp, on the straight way in and on the way out, with each box of the hand
+    Checked at the grasp, along the straight approach and along the retreat. Each box of the hand is
     grown by the margin on every side.
 
     Args:
@@ -51,7 +51,7 @@ def collides(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Col
 
 
 def hits(scene: Scene, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet the cloud, the support plane or an obstacle.  # (E,)."""
+    """Which open hands collide with the cloud, the support plane or an obstacle.  # (E,)."""
     hit = hits_cloud(scene.cloud, T_cloud_hand, gripper, request)
     if scene.support is not None:
         hit |= hits_support(T_cloud_hand, scene.support, gripper, request)
@@ -74,13 +74,13 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
 
 
 def reach_of_motion(gripper: Gripper, request: Collision) -> Float32:
-    """The part of the hand frame that the hand sweeps on its way in and out."""
+    """The part of the hand frame that the hand sweeps during approach and retreat."""
     lift = request.retreat_length if request.retreat_direction == "up" else 0.0
     return reach_of(gripper, around=request.margin, back=approach_sweep_length(request), lift=lift)
 
 
 def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
-    """Which open hands meet a point of the cloud.  # (E,)."""
+    """Which open hands contain a point of the cloud.  # (E,)."""
     boxes = inflated_boxes(gripper, request)
     swept = swept_boxes(boxes, request)
     hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
@@ -109,7 +109,7 @@ def hits_support(
 def hits_obstacles(
     T_cloud_hand: Float32, obstacles: SolidBoxes, gripper: Gripper, request: Collision
 ) -> Bools:
-    """Which open hands meet a box.  # (E,)."""
+    """Which open hands overlap a box.  # (E,)."""
     grown = inflated_boxes(gripper, request)
     at_rest = SolidBoxes.of_hands(T_cloud_hand, swept_boxes(grown, request))
     hit = _hits_any(at_rest, obstacles, None)
@@ -120,7 +120,7 @@ def hits_obstacles(
 
 
 def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
-    """Distance of each open hand at the grasp to what is nearest: cloud, support or obstacle.
+    """Distance from each open hand, at the grasp, to the nearest point, support or obstacle.
 
     Args:
         scene: Canonical frame.
@@ -128,8 +128,8 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
         gripper: Its boxes, fingers open to the maximum.
 
     Returns:
-        (E,) metres. Negative where something lies within a box of the hand: its depth below the
-        box's surface, the deepest.
+        (E,) metres. Negative where something lies inside a box of the hand: minus the greatest
+        depth below the box's surface.
     """
     boxes = gripper.open_boxes
     nearest = signed_distance_to_boxes(scene.cloud.points, T_cloud_hand, boxes)
@@ -141,7 +141,7 @@ def clearances(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32
 
 
 def approach_sweep_length(request: Collision) -> float:
-    """Metres behind the grasp that the straight way in or out sweeps."""
+    """Metres behind the grasp that the straight approach or retreat sweeps."""
     out = request.retreat_length if request.retreat_direction == "back" else 0.0
     return max(request.approach_length, out)
 
@@ -153,7 +153,7 @@ def inflated_boxes(gripper: Gripper, request: Collision) -> Float64:
 
 
 def swept_boxes(boxes: Float64, request: Collision) -> Float64:
-    """Boxes (B, 2, 3) that also cover the straight ways along the hand's z."""
+    """Boxes (B, 2, 3) extended over the straight approach and retreat along the hand's z."""
     swept = boxes.copy()
     swept[:, 0, 2] -= approach_sweep_length(request)
     return swept
@@ -174,7 +174,7 @@ def _nearest_obstacle(
     hands = SolidBoxes.of_hands(T_cloud_hand, boxes)
     for place in range(len(obstacles)):
         box = obstacles.take(np.full(len(hands), place))
-        # A bound that costs little leaves few boxes to measure exactly.
+        # A cheap lower bound leaves few boxes to measure exactly.
         gap = np.linalg.norm(box.center - hands.center, axis=1) - hands.radius - box.radius
         near = np.flatnonzero(gap < np.repeat(nearest, len(boxes)))
         distance = np.full(len(hands), np.inf)
@@ -198,7 +198,7 @@ def _hits_any(boxes: SolidBoxes, obstacles: SolidBoxes, sweep: Float64 | None) -
 
 
 def required_openings(met: Float32, gripper: Gripper) -> Float32:
-    """Opening that clears what lies between the fingers, with FINGER_CLEARANCE on each side.
+    """Opening that leaves FINGER_CLEARANCE between each finger and what lies between them.
 
     Args:
         met: (E, 2) as `met_first` returns it.

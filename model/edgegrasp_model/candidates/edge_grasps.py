@@ -29,14 +29,14 @@ def sample_approach_points(
     rng: np.random.Generator,
     before: Sequence[int] | Int64 = (),
 ) -> Int64:
-    """Rows of `count` different points, or of all where there are fewer.
+    """Choose `count` different points, or all of them if there are fewer.
 
     Args:
         points: (N, 3).
         count: How many to choose.
         method: `farthest` spreads them over the cloud from a random start; `uniform` takes any.
         rng: Source of the random choice.
-        before: (B,) rows that were chosen before, which are not chosen again.
+        before: (B,) rows chosen earlier, which are excluded.
 
     Returns:
         (min(count, N - B),) rows of `points`.
@@ -59,7 +59,7 @@ def sample_approach_points(
 
 
 class BallCrop(NamedTuple):
-    """Balls as rows of their cloud. P ball points in all, ball after ball."""
+    """Balls of points, as rows of their cloud: P rows in total, ball after ball."""
 
     ball_rows: Int64  # (P,) rows of the cloud, ascending within each ball
     ball_of_point: Int64  # (P,) ascending, 0..A-1
@@ -141,7 +141,8 @@ def edge_grasps(
     """The candidates among pairs of approach and contact points.
 
     r = p_c - p_a; its part orthogonal to n_c points from the hand to the object (paper section
-    III-A). The contact ends up at the gripper's contact_z, the approach point on the hand's axis.
+    III-A). The hand is placed so that the contact lies at the gripper's contact_z and the approach
+    point on the hand's axis.
 
     Args:
         cloud: The cloud with its normals.
@@ -150,7 +151,7 @@ def edge_grasps(
         gripper: Gives the opening, the fingers' depth and where the contact lies in the hand.
 
     Returns:
-        The pairs that define an edge grasp which fits the gripper.
+        The pairs that define an edge grasp within the gripper's opening and depth.
     """
     edge = measure_edges(cloud, approach_index, contact_index)
     pair = np.flatnonzero(
@@ -217,10 +218,10 @@ def edge_grasp_poses(
 def retract(
     candidates: Candidates, support: SupportPlane, gripper: Gripper, margin: float = 0.0
 ) -> tuple[Candidates, Bools]:
-    """Retract hands that would cut into the support plane along their approach, where that helps.
+    """Move hands that cut into the support plane back along their approach, if that frees them.
 
-    The contact may move from contact_z to TIP_MARGIN inside the fingertips and no further: flat
-    objects on a table are held by the tips.
+    The contact may move from contact_z to at most TIP_MARGIN inside the fingertips, so flat objects
+    on a table are held by the tips.
 
     Args:
         candidates: E of them.
@@ -229,8 +230,8 @@ def retract(
         margin: Metres that the hand stays above the plane.
 
     Returns:
-        The candidates, and which of their hands (E,) are above the plane now; the others are
-        unchanged.
+        The candidates, and a mask (E,) of those whose hand is above the plane now; the other hands
+        are unchanged.
     """
     clearance = support_clearance(candidates.T_cloud_hand, support, gripper) - margin
     rise = candidates.approach @ np.asarray(support.normal, dtype=np.float32)
@@ -245,7 +246,7 @@ def retract(
 def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gripper) -> Float32:
     """Height of the lowest corner of each hand, fingers open, over the support plane.
 
-    Fingers on a linkage count at their most forward position on the way to closed.
+    Fingers on a linkage are taken at their most forward position while closing.
 
     Args:
         T_cloud_hand: (E, 4, 4).
@@ -266,13 +267,13 @@ def support_clearance(T_cloud_hand: Float32, support: SupportPlane, gripper: Gri
     return clearance.astype(np.float32)
 
 
-MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; beyond, another approach point does better
+MIN_SHIFT, MAX_SHIFT = 0.001, 0.008  # metres; for larger shifts another approach point is better
 
 
 def centred_grasps(
     points: Float32, crop: BallCrop, candidates: Candidates, gripper: Gripper
 ) -> Candidates:
-    """Candidates for wide objects: hands moved along their closing direction.
+    """Extra candidates for wide objects: hands shifted along their closing direction.
 
     The hand of an edge grasp is centred on its approach point, and few sampled points lie in the
     middle of an object almost as wide as the hand opens. Its extent is taken from the points of

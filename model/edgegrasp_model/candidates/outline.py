@@ -1,7 +1,8 @@
-"""Grasps across an outline: the hand comes along up, or from the camera, and closes across an edge.
+"""Grasps across an outline: the hand comes from above or the camera and closes on a depth edge.
 
-Where depth breaks off, the side of an object is not seen, and an edge grasp would need the normal
-there. Here only the run of the outline counts, and what lies between, beside and below the fingers.
+At a depth edge the side of the object is not seen, so the normal that an edge grasp needs is
+missing. These grasps need only the direction of the outline and what lies between, beside and below
+the fingers.
 """
 
 from dataclasses import dataclass
@@ -24,21 +25,21 @@ from edgegrasp_model.kernels import extents_across, level_spread
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import UP
 
-OUTLINE_RADIUS = 0.016  # metres of surface that say where an outline runs
+OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
-THIN = 0.003  # metres of standard deviation across a rim, which is all outline
-LEAN, LEANING = np.float32(np.radians(30.0)), 8  # off above; directions around it
-DROP = 0.006  # metres below an edge from which a surface is another one
+THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
+LEAN, LEANING = np.float32(np.radians(30.0)), 8  # radians off vertical; directions around it
+DROP = 0.006  # metres below an edge from which a surface counts as another one
 GAP = 0.007  # metres without a point in which a surface ends
-ONE_VIEW = np.cos(np.radians(15.0))  # directions nearer to each other show the same outline
+ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline
 CLEARANCE = 0.002  # metres kept free ahead of the hand as it goes in
-MAX_INSERTION = 0.020  # metres further in than an edge grasp; deeper holds no better
+MAX_INSERTION = 0.020  # metres deeper than an edge grasp; more does not hold better
 LEVEL = 1e-6  # cosine below which a hand moves along the support
 
 
 @dataclass(frozen=True)
 class Outline:
-    """Where a cloud of N points breaks off as seen from a viewpoint."""
+    """The depth edges of a cloud of N points, as seen from a viewpoint."""
 
     toward: Float32  # (N, 3) unit, from each point to the viewpoint
     heading: Float32  # (N, 3) unit, orthogonal to `toward`: across the edge, out of the object
@@ -48,7 +49,7 @@ class Outline:
 def outlines(
     points: Float32, viewpoints: Float32 | None, rows: Int64, *, leaning: bool = False
 ) -> list[Outline]:
-    """The outlines of a cloud from above and, where that is another direction, from each camera.
+    """The outlines of a cloud from above and, if that is another direction, from each camera.
 
     Args:
         points: (N, 3) canonical frame, metres.
@@ -71,7 +72,7 @@ def outlines(
 
 
 def _outline(points: Float32, toward: Float32, rows: Int64) -> Outline:
-    """A point is on the outline where its neighbours, at its height or above, lie to one side."""
+    """A point is on the outline if its neighbours at its height or above all lie on one side."""
     heading, is_edge = np.zeros_like(points), np.zeros(len(points), dtype=bool)
     least, outward, spread = level_spread(points, rows, toward[rows], OUTLINE_RADIUS, DROP)
     heading[rows] = least
@@ -89,11 +90,11 @@ def outline_grasps(
     gripper: Gripper,
     margin: float = 0.0,
 ) -> Candidates:
-    """Hands that come from the viewpoint of an outline and close across it.
+    """Hands that approach from the outline's viewpoint and close across it.
 
     The contact point lies on the outline, the hand in the middle between it and the opposite edge
-    of the same surface, and the approach point between the fingers. The hand goes in until
-    something is right ahead of it, by at most MAX_INSERTION more than that of an edge grasp.
+    of the same surface, and the approach point between the fingers. The hand moves in until
+    something is right ahead of it, at most MAX_INSERTION deeper than an edge grasp.
 
     Args:
         points: (N, 3) the cloud.
@@ -138,7 +139,7 @@ def outline_grasps(
 def _extents(
     points: Float32, crop: BallCrop, pair: Int64, frame: Float32, gripper: Gripper
 ) -> Float32:
-    """How far the surface at contacts (M,) goes on between the pads, outward and inward (M, 2)."""
+    """How far the surface at contacts (M,) extends between the pads, outward and inward (M, 2)."""
     first, last = crop.bounds(crop.ball_of_point[pair])
     strip = np.array([gripper.pad_half_width, gripper.max_opening, DROP, GAP], dtype=np.float32)
     return extents_across(points, crop.ball_rows, first, last, frame, strip)
@@ -151,9 +152,9 @@ def _inserted(
     gripper: Gripper,
     margin: float,
 ) -> Candidates:
-    """The hands moved along their way until something is right ahead of them.
+    """The hands moved along their approach until something is right ahead of them.
 
-    Those for which that is before the contact is TIP_MARGIN inside the fingertips are left out.
+    Hands that stop before the contact is TIP_MARGIN inside the fingertips are left out.
     """
     least = gripper.contact_z + TIP_MARGIN - gripper.tip_z  # metres of way that it takes
     room = np.full(len(candidates), np.inf, dtype=np.float32)  # metres of way above the support

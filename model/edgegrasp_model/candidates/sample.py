@@ -27,15 +27,15 @@ from edgegrasp_model.results import Outcome
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
-FURTHER_ATTEMPTS = 3  # with other approach points, where few hands are free
-FEW = 16  # hands free of collision, of a scene
+FURTHER_ATTEMPTS = 3  # of further approach points, if few hands are collision-free
+FEW = 16  # collision-free hands of a scene
 POINTS_PER_APPROACH = 40  # voxels of an object for one approach point: some 8 square centimetres
 APPROACH_POINTS_EACH = 8, 64  # of an object
 MIN_APPROACH_POINTS, MAX_APPROACH_POINTS = 32, 64  # of a scene, for each view
-MOST_VIEWS = 4  # that bring further approach points
+MOST_VIEWS = 4  # of further approach points
 FEWEST_EACH = 4  # of an object, however many there are
 OVERSAMPLING = 4  # hands checked for collision, in multiples of num_candidates
-NEAR, TURNED = 0.004, math.radians(10)  # TCPs and turns of hands that one score stands for
+NEAR, TURNED = 0.004, math.radians(10)  # within which hands share one score
 CODE = {outcome: np.int8(code) for code, outcome in enumerate(Outcome)}
 TOP_DOWN_ANGLE = math.radians(30)  # between the hand's direction and straight down
 SIDE_ANGLE = math.radians(30)  # between the hand's direction and the horizontal
@@ -53,12 +53,12 @@ class Sample:
     crop: BallCrop
     candidates: Candidates  # E of them; `pair` is their contact's row in `crop`
     collision_free: Bools  # (E,)
-    drawn: Candidates  # all that there were, C of them
-    outcome: NDArray[np.int8]  # (C,) CODE of what became of each; RETURNED: it is to be scored
-    row: Int64  # (E,) places of the candidates among them
+    drawn: Candidates  # all of them, C
+    outcome: NDArray[np.int8]  # (C,) CODE of each one's outcome; RETURNED: it is to be scored
+    row: Int64  # (E,) indices of the candidates among them
 
     def and_further(self, other: "Sample") -> "Sample":
-        """This and what was sampled after it."""
+        """This sample joined with a later one."""
         ball = other.crop.ball_of_point + len(self.approach_index)
         crop = BallCrop(
             np.concatenate([self.crop.ball_rows, other.crop.ball_rows]),
@@ -81,7 +81,7 @@ class Sample:
 
 
 class Sampler:
-    """Draws the candidates of one request in rounds, collision-free where possible.
+    """Draws the candidates of one request in rounds, collision-free ones if possible.
 
     All rounds together give at most `num_candidates`; with `collision: avoid` none collides.
     """
@@ -103,8 +103,8 @@ class Sampler:
             gripper: What has to fit.
             crop_radius: Radius of the balls, metres.
             counts: Gets the number of candidates left after each constraint, over all rounds.
-            centre: Whether there are centred hands among them: for networks that see where a hand
-                is.
+            centre: Whether to add centred hands: for networks whose input depends on the hand's
+                position.
         """
         self.scene, self.options, self.gripper = scene, options, gripper
         self.crop_radius, self.counts, self.centre = crop_radius, counts, centre
@@ -117,31 +117,31 @@ class Sampler:
         self._used = self._rows[:0]
 
     def first(self) -> Sample:
-        """Candidates around half of the approach points; around all where their number is given."""
+        """Candidates around half of the approach points; around all if their number is given."""
         self._used = self._spread(self._first)
         return self._around(self._used)
 
     def second(self, sure: Int64 | None = None) -> Sample | None:
-        """Around the other half, all of it on objects that are not among `sure`, numbers (S,)."""
+        """Candidates around the other half, only on objects whose number is not in `sure` (S,)."""
         left = (self._wanted - self._first).sum()
         unsure = np.where(np.isin(self._objects, () if sure is None else sure), 0, self._wanted)
         more = self._spread(unsure * left // max(unsure.sum(), 1))
         return self._around(more) if len(more) else None
 
     def further(self) -> Iterator[Sample]:
-        """Around other approach points, as long as few hands are collision-free."""
+        """Candidates around further approach points, while few hands are collision-free."""
         usable = "checked" if self.options.collision.mode == "ignore" else "collision_free"
         for attempt in range(FURTHER_ATTEMPTS):
             if self.counts[usable] >= FEW or (attempt and self.counts[usable]):
                 return
             self._used = self._rows[:0]
             more = self._spread(self._wanted)
-            if attempt and len(self._rows) <= len(more):  # they would be the same ones
+            if attempt and len(self._rows) <= len(more):  # they would repeat the first ones
                 return
             yield self._around(more, leaning=True)
 
     def all(self) -> Sample:
-        """All rounds, whatever the candidates of the first are worth."""
+        """All rounds, whatever the scores of the first."""
         samples = [self.first(), self.second(), *self.further()]
         return reduce(Sample.and_further, [one for one in samples if one is not None])
 
@@ -183,7 +183,7 @@ def _checked(
     counts: dict[str, int],
     rng: np.random.Generator,
 ) -> tuple[Int64, Bools]:
-    """Some candidates that are still in (K,), and which of them (K,) do not collide."""
+    """Some of the remaining candidates (K,), and a mask (K,) of those that do not collide."""
     passed = np.flatnonzero(outcome == CODE[Outcome.RETURNED])
     row = passed[random_rows(len(passed), OVERSAMPLING * options.num_candidates, rng)]
     outcome[passed] = CODE[Outcome.NOT_CHECKED]
@@ -197,12 +197,12 @@ def _checked(
 
 
 def share_approach_points(scene: Scene, rows: Int64, options: DetectOptions) -> tuple[Int64, Int64]:
-    """How many approach points each object gets: small ones some, large ones more.
+    """How many approach points each object gets: a minimum, and more for large objects.
 
     Args:
         scene: Its cloud, and the object of each point.
         rows: (R,) points that may be chosen.
-        options: How many in all.
+        options: The total number.
 
     Returns:
         The numbers (O,) of the objects, and approach points (O,) of each.
@@ -234,7 +234,7 @@ def _constrained(
     *,
     leaning: bool,
 ) -> tuple[Candidates, NDArray[np.int8]]:
-    """The edge grasps of some balls; RETURNED: they satisfy all constraints but collision's."""
+    """The edge grasps of some balls; RETURNED: all constraints hold except collision."""
     add_count(counts, "approach_points", len(approach_index))
     add_count(counts, "pairs", len(crop.ball_rows))
     pair = np.flatnonzero(scene.contact_allowed[crop.ball_rows])
@@ -269,7 +269,7 @@ def _constrained(
 def different(
     T_cloud_hand: Float32, first: Bools, gripper: Gripper, options: DetectOptions
 ) -> Bools:
-    """Hands (E,) none of which suppression drops for another, whatever it is; `first` go before."""
+    """Hands (E,) that non-maximum suppression keeps whatever their scores; `first` come first."""
     rule = options.suppression
     near = 0.0 if rule is None else min(NEAR, rule.translation)
     turned = 0.0 if rule is None else min(TURNED, rule.rotation)
@@ -282,7 +282,7 @@ def different(
 def rows_to_score(
     free: Bools, new: Bools, options: DetectOptions, most: int, rng: np.random.Generator
 ) -> Int64:
-    """Ascending rows of at most so many new candidates, those free of collision first."""
+    """Ascending rows of at most so many new candidates, collision-free ones first."""
     if options.collision.mode == "ignore":
         rows = np.flatnonzero(new)
         return rows[random_rows(len(rows), most, rng)]
@@ -302,7 +302,7 @@ def random_rows(size: int, limit: int, rng: np.random.Generator) -> Int64:
 
 
 def add_count(counts: dict[str, int], name: str, number: int) -> None:
-    """Add to a count, which is 0 where it is not there yet."""
+    """Add to a count, which starts at 0."""
     counts[name] = counts.get(name, 0) + number
 
 

@@ -39,7 +39,7 @@ def nearest_in_ball(
 
 @dataclass(frozen=True)
 class BallBatch:
-    """Everything a ball network needs to score the edge grasps of one cloud, or of several.
+    """The input of a ball network: the balls and edge grasps of one cloud, or of several.
 
     P ball points in `num_balls` balls, E edge grasps. Metres; every ball in the axes of its cloud.
     """
@@ -67,7 +67,7 @@ class BallBatch:
     ) -> Self:
         """Packs a cloud and its balls.
 
-        Contacts are rows of the crop, not of the cloud: a contact has a ball.
+        Contacts are rows of the crop, not of the cloud, as each contact belongs to a ball.
         """
         centre = points[approach_index][crop.ball_of_point]
         return cls(
@@ -86,7 +86,7 @@ class BallBatch:
         """Join batches into one, as training does; scores come out in the same order."""
         first_point = np.cumsum([0, *(len(batch.points) for batch in batches)]).tolist()
         first_ball = np.cumsum([0, *(batch.num_balls for batch in batches)]).tolist()
-        points = list(zip(batches, first_point, strict=False))  # with the row each begins at
+        points = list(zip(batches, first_point, strict=False))  # with the row at which each begins
         balls = list(zip(batches, first_ball, strict=False))
         return BallBatch(
             points=torch.cat([batch.points for batch in batches]),
@@ -101,7 +101,7 @@ class BallBatch:
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
-        """A fixed batch of 32 edge grasps, to see whether a network computes as it did before."""
+        """A fixed batch of 32 edge grasps, to check that a network still gives the same logits."""
         rng = np.random.default_rng(0)
         points = rng.uniform(-0.06, 0.06, (200, 3)).astype(np.float32)
         normals = rng.normal(size=(200, 3))

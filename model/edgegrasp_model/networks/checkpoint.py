@@ -1,4 +1,4 @@
-"""Checkpoints: a network's weights and what is needed to use them, in one safetensors file.
+"""Checkpoints: a network's weights and metadata in one safetensors file.
 
 The file's metadata holds one JSON text under the key `edgegrasp`; nothing in it is ever executed.
 """
@@ -33,14 +33,14 @@ NETWORKS: dict[Architecture, Callable[[NetworkConfig], nn.Module]] = {
 
 
 def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Writes a checkpoint; a reader sees the old file or the new one, never half of it.
+    """Writes a checkpoint atomically: a reader sees the old file or the new one, never half of it.
 
     The same weights and metadata make the same bytes.
 
     Args:
         path: File to write, usually `<name>.safetensors`.
         network: Built from `metadata.network`.
-        metadata: What to say of it; its digest is not written.
+        metadata: Its description; the digest of the file is not written.
     """
     tensors = {name: value.contiguous().cpu() for name, value in network.state_dict().items()}
     values = asdict(metadata) | {
@@ -58,7 +58,7 @@ def save_checkpoint(path: Path, network: nn.Module, metadata: CheckpointMetadata
 def load_checkpoint(
     path: Path, device: torch.device | str = "cpu"
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Loads a checkpoint; the network comes in evaluation mode.
+    """Loads a checkpoint; the network is in evaluation mode.
 
     Raises:
         InvalidCheckpoint: The file is missing, truncated, damaged or foreign, a weight is not
@@ -88,14 +88,14 @@ def load_checkpoint(
 
 
 def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> None:
-    """Raise InvalidCheckpoint unless a network computes what it computed when it was written.
+    """Raise InvalidCheckpoint unless a network gives the logits stored in its checkpoint.
 
-    Compared on average: a near tie may fall the other way on another processor.
+    Compared on average, since a near tie may fall the other way on another processor.
     """
     found = np.asarray(reference_logits(network))
     expected = np.asarray(metadata.reference_logits or found)
     tolerance = MAX_DIFFERENCE * np.ptp(expected) + 1e-3
-    if not np.abs(found - expected).mean() <= tolerance:  # so written, NaN fails too
+    if not np.abs(found - expected).mean() <= tolerance:  # written this way, NaN fails too
         raise InvalidCheckpoint(
             f"checkpoint: the network of {metadata.name!r} does not give the logits it was written "
             "with. Check this installation of PyTorch and Numba, or restore the file from a copy."
@@ -103,7 +103,7 @@ def check_reference_logits(network: nn.Module, metadata: CheckpointMetadata) -> 
 
 
 def reference_logits(network: nn.Module) -> list[float]:
-    """The logits that a network gives a fixed made-up batch, whatever its architecture."""
+    """The logits of a network for a fixed synthetic batch, whatever its architecture."""
     config: NetworkConfig = network.config  # type: ignore[assignment]
     parameter = next(network.parameters())
     was_training = network.training
@@ -162,12 +162,12 @@ def build_network(config: NetworkConfig, generator: torch.Generator | None = Non
     From the generator, or without one from seed 0.
     """
     generator = torch.Generator().manual_seed(0) if generator is None else generator
-    # The layers first initialise themselves from the global stream: leave it as it was.
+    # Layers initialise themselves from the global random stream, which is restored here.
     with torch.random.fork_rng(devices=[]):
         network = NETWORKS[config.architecture](config)
     for module in network.modules():
         if isinstance(module, nn.Linear):
-            # PyTorch's own default, U(-1, 1) / sqrt(inputs), but from the given generator.
+            # PyTorch's default, U(-1, 1) / sqrt(inputs), drawn from the given generator.
             bound = module.in_features**-0.5
             nn.init.uniform_(module.weight, -bound, bound, generator=generator)
             if module.bias is not None:

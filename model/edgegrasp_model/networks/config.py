@@ -1,4 +1,4 @@
-"""What a network is: its architecture and widths, and what its checkpoint says of it."""
+"""The configuration of a network, and the metadata of its checkpoint."""
 
 from dataclasses import field
 from typing import Annotated, Any, Literal, Self
@@ -17,7 +17,7 @@ _LAYERS = {"conv_widths": 3, "global_widths_1": 3, "global_widths_2": 2}
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class NetworkConfig:
-    """Shape of a network: a smaller network is another config, not another class.
+    """Shape of a network; a smaller network is another config of the same class.
 
     Widths count channels; in `vn-edgegrasp` a channel is a 3-vector. The paper's networks read
     balls of points, `hand` the points around the fingers of each hand.
@@ -96,7 +96,7 @@ HAND = NetworkConfig(
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class CheckpointMetadata:
-    """What a checkpoint says of itself.
+    """Metadata of a checkpoint.
 
     `save_checkpoint` fills in `tensors_digest` and `reference_logits`, which `load_checkpoint`
     checks; it fills in the file's `digest`. Digests are SHA-256, in hex.
@@ -113,5 +113,5 @@ class CheckpointMetadata:
     temperature: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 1.0
     training: dict[str, Any] = field(default_factory=dict)  # provenance, as JSON values
     tensors_digest: str = ""  # of the weights alone
-    reference_logits: tuple[float, ...] = ()  # what the network says of a fixed made-up batch
-    digest: str = ""  # of the whole file; empty until it was loaded from one
+    reference_logits: tuple[float, ...] = ()  # the network's logits for a fixed synthetic batch
+    digest: str = ""  # of the whole file; empty unless loaded from one

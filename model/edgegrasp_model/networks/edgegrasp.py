@@ -124,7 +124,7 @@ class GlobalFeature(nn.Module):
 
 
 def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
-    """The maximum (P, width) of the messages of each point's neighbours, in memory used again."""
+    """The maximum (P, width) of the messages of each point's neighbours, in a reused buffer."""
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
     (count, k), width = neighbors.shape, u.shape[1]
     hidden = torch.zeros(CONVOLVED * k, width)

@@ -38,15 +38,15 @@ from edgegrasp_model.networks.layers import (
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 
-POINT_UNIT = 0.05  # metres; positions around the fingers are a few centimetres
-DROPOUT = 0.1  # share of what the classifier reads that a training step leaves out
-CONSTANT = 1e-6  # spread below which a number of the description counts as always the same
+POINT_UNIT = 0.05  # metres; scale of the positions around the fingers
+DROPOUT = 0.1  # dropout of the classifier's inputs
+CONSTANT = 1e-6  # standard deviation below which a number of the description counts as constant
 CHUNK = 32  # hands at a time, so that the work stays in cache
 
 
 @dataclass(frozen=True)
 class HandBatch:
-    """E edge grasps, each with what its own hand sees. Metres."""
+    """E edge grasps, each with what its hand sees. Metres."""
 
     description: Tensor  # (E, F) float32, F at least what the network reads
     points: Tensor  # (E, P, 6) float32, positions and normals around the fingers, hand frame
@@ -62,7 +62,7 @@ class HandBatch:
         view: HandView | None = None,
         description_size: int = HAND_DESCRIPTION_SIZE,
     ) -> Self:
-        """What the hands of some candidates see, at most `num_points` points of each."""
+        """What the hands of some candidates see, with at most `num_points` points each."""
         T_cloud_hand = candidates.T_cloud_hand
         view = view or hand_views(around.cloud, T_cloud_hand, reach_of(gripper))
         description = describe_hands(around, candidates, gripper, view, description_size)
@@ -77,7 +77,7 @@ class HandBatch:
 
     @classmethod
     def made_up(cls, config: NetworkConfig) -> Self:
-        """A fixed batch of 32 hands, to see whether a network computes as it did before."""
+        """A fixed batch of 32 hands, for checking that a network still computes the same logits."""
         rng = np.random.default_rng(0)
         description = rng.normal(size=(32, config.description_size))
         points = rng.normal(size=(32, config.hand_points, 6)) * (0.02, 0.02, 0.02, 1.0, 1.0, 1.0)
@@ -122,7 +122,8 @@ class HandNet(nn.Module):
         """Stores mean (F,) and standard deviation (F,) of the training data's descriptions."""
         size = self.config.description_size
         self.mean.copy_(mean[:size])
-        # What never varied, such as the only hand's opening, must say little where it does.
+        # A number that never varied in training, such as the only hand's opening, must have little
+        # weight.
         self.std.copy_(torch.where(std < CONSTANT, 1.0, std.clamp_min(1e-3))[:size])
 
     def forward(self, batch: HandBatch, left_out: torch.Generator | None = None) -> Tensor:
@@ -130,7 +131,7 @@ class HandNet(nn.Module):
 
         Args:
             batch: What E hands see.
-            left_out: In training, draws inputs that the classifier does not get; None: gets all.
+            left_out: In training, draws the inputs that dropout removes; None: no dropout.
         """
         known = batch.description[:, : self.config.description_size]
         description = (known - self.mean) / self.std  # (E, F)
@@ -149,7 +150,7 @@ class HandNet(nn.Module):
 
 
 def _around(encoder: PackedMlp, points: Tensor, count: Tensor) -> Tensor:
-    """Maximum and mean over the points (E, P, 6) that there are of their features: (E, 2 C)."""
+    """Maximum and mean of the features of the valid points of (E, P, 6): (E, 2 C)."""
     positions, normals = torch.split(points, 3, dim=2)
     unit = torch.cat((positions / POINT_UNIT, normals), dim=2)  # (E, P, 6)
     encoded = encoder(unit)  # (E, P, C)

@@ -1,4 +1,4 @@
-"""Conversion of the authors' checkpoints, which keep each part of a network in a file of its own.
+"""Conversion of the authors' checkpoints, which store each part of a network in its own file.
 
 Their layout (github.com/HaojHuang/Edge-Grasp-Network): `local_emd_model-ckpt-N.pt`,
 `global_emd_model-ckpt-N.pt`, `classifier_model-ckpt-N.pt` and, for the VN network, `std-ckpt-N.pt`.
@@ -22,7 +22,7 @@ from edgegrasp_model.networks.config import (
 )
 from edgegrasp_model.networks.edgegrasp import GRASP_WIDTH
 
-# Each file's prefix here, and then the parts of theirs under the names of ours.
+# The prefix of each file here, then their parts by our names.
 _FILES = {
     "local": "local_emd_model",
     "global": "global_emd_model",
@@ -69,7 +69,7 @@ def import_checkpoint(
     crop_radius: float = 0.05,
     gripper: str = "panda",
 ) -> tuple[nn.Module, CheckpointMetadata]:
-    """Reads a checkpoint in the authors' layout; a VN network where there is a `std` file.
+    """Reads a checkpoint in the authors' layout; with a `std` file it is a VN network.
 
     The folder holds the files of one checkpoint number N. Voxel size and crop radius, metres, are
     by default those of the authors' evaluation.
@@ -138,7 +138,7 @@ def _load_weights(path: Path) -> dict[str, Tensor]:
 
 
 def _renamed(theirs: dict[str, Tensor], parts: dict[str, str]) -> dict[str, Tensor]:
-    """Weights under our names; those without one stay as they are, for load_state_dict to name."""
+    """Weights under our names; unknown ones keep theirs, so that load_state_dict names them."""
     ours = {}
     for name, weight in theirs.items():
         module, _, kind = name.rpartition(".")

@@ -1,7 +1,7 @@
 """Layers, matrix products and chunks of rows that the networks share.
 
-In inference no bit of a row depends on the other rows: a candidate's score is the same whatever
-else is scored with it.
+In inference a row's result does not depend on the other rows, to the last bit: a candidate's score
+is the same whatever else is scored with it.
 """
 
 from collections.abc import Callable, MutableMapping, Sequence
@@ -16,12 +16,12 @@ from torch.utils.weak import WeakTensorKeyDictionary
 
 from edgegrasp_model.networks.balls import BallBatch
 
-# Products of fewer rows add up in an order that depends on how many there are.
+# Products of fewer rows are summed in an order that depends on their number.
 MIN_ROWS = 32
 ROWS = 512  # points at a time: 1,024 channels of them stay in cache
 CONVOLVED = 128  # points at a time in a graph convolution, each with its neighbours
 EDGE_ROWS = 256  # edge grasps at a time
-# Weights as oneDNN reads them, of a version each.
+# Weights packed for oneDNN, for one version of each.
 _PACKED: MutableMapping[Tensor, tuple[int, Tensor]] = WeakTensorKeyDictionary()
 
 
@@ -45,14 +45,14 @@ class SharedProduct:
         self._shared = row_linear(shared, shared_weight)  # (B, ..., outputs)
 
     def __call__(self, own: Tensor, shared_of_row: Tensor) -> Tensor:
-        """Maps own (M, ..., C1) and the rows (M,) of their shared parts to (M, ..., outputs)."""
+        """Maps `own` (M, ..., C1) and the rows (M,) of the shared parts to (M, ..., outputs)."""
         rows = self._own(own)
         rows += self._shared.index_select(0, shared_of_row)
         return rows
 
 
 def mlp(widths: Sequence[int]) -> nn.Sequential:
-    """Linear layers from widths[0] to widths[-1] with a ReLU between each two, for `PackedMlp`."""
+    """Linear layers from widths[0] to widths[-1] with ReLUs in between, for `PackedMlp`."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
@@ -61,7 +61,7 @@ def mlp(widths: Sequence[int]) -> nn.Sequential:
 
 def gather_rows(values: Tensor, index: Tensor) -> Tensor:
     """values[index] for values (M, ...) and an index (P, k): (P, k, ...)."""
-    # The backward of indexing itself is several times slower.
+    # The backward pass of plain indexing is several times slower.
     return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
 
 
@@ -69,7 +69,7 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
     """F.linear of values (M, ..., C)."""
     if torch.is_grad_enabled() or values.device.type != "cpu":
         return F.linear(values, weight, bias)
-    if len(weight) == 1:  # a product with a vector, which has an order of its own for each size
+    if len(weight) == 1:  # a matrix-vector product, whose order of summation depends on its size
         product = (values * weight[0]).sum(dim=-1, keepdim=True)
         return product if bias is None else product + bias
     if 0 < values.shape[:-1].numel() < MIN_ROWS:
@@ -80,9 +80,9 @@ def row_linear(values: Tensor, weight: Tensor, bias: Tensor | None = None) -> Te
 
 
 class PackedLinear:
-    """A linear layer on many chunks of rows, one after another, by the faster of two libraries.
+    """A linear layer applied to many chunks of rows in turn, by the faster of two libraries.
 
-    For as long as the weights stay as they are: one forward pass.
+    Valid while the weights do not change: for one forward pass.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class PackedLinear:
     def __call__(self, values: Tensor) -> Tensor:
         """Maps (M, ..., C) to (M, ..., outputs).
 
-        oneDNN prepares anew for each number of rows: let all chunks have the same.
+        oneDNN sets up again for each number of rows, so all chunks should have the same.
         """
         if self._packed is None:
             rows = row_linear(values, self._weight, self._bias)
@@ -139,7 +139,7 @@ def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
 def onednn_is_faster() -> bool:
     """Whether oneDNN multiplies in float32 about twice as fast as MKL, which is behind F.linear.
 
-    So it is on AMD processors with AVX-512, measured on an EPYC.
+    True for AMD processors with AVX-512, as measured on an EPYC.
     """
     ours = torch.backends.cpu.get_cpu_capability() == "AVX512" and "AMD" in _processor()
     there = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
@@ -153,7 +153,7 @@ def _processor() -> str:
 
 
 def float32_inference(values: Tensor) -> bool:
-    """Whether nothing but float32 on a processor is asked for."""
+    """Whether this is float32 inference on a processor."""
     return (
         values.device.type == "cpu"
         and values.dtype == torch.float32
@@ -163,10 +163,10 @@ def float32_inference(values: Tensor) -> bool:
 
 
 def _packed(weight: Tensor) -> Tensor | None:
-    """A weight as oneDNN reads it; None where the plain product serves."""
+    """A weight packed for oneDNN; None if the plain product is used."""
     if len(weight) == 1 or not (float32_inference(weight) and onednn_is_faster()):
         return None
-    version = -1 if weight.is_inference() else weight._version  # changes of those are not counted
+    version = -1 if weight.is_inference() else weight._version  # their changes are not counted
     if version < 0 or _PACKED.get(weight, (-1, weight))[0] != version:
         packed = torch.ops.mkldnn._reorder_linear_weight(weight.detach().contiguous())
         _PACKED[weight] = version, packed
@@ -174,12 +174,12 @@ def _packed(weight: Tensor) -> Tensor | None:
 
 
 class BallChunk(NamedTuple):
-    """p points of a few balls, one of which may go on in the next chunk."""
+    """p points of a few balls, the last of which may continue in the next chunk."""
 
     values: Tensor  # (p, ...)
     ball_of_point: Tensor  # (p,) int64
     balls: list[int]
-    sizes: list[int]  # rows of each of these balls, in order, then of what fills the chunk up
+    sizes: list[int]  # rows of each of these balls, in order, then of the padding
 
 
 def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[BallChunk]:
@@ -209,7 +209,7 @@ def ball_chunks(values: Tensor, batch: BallBatch, rows: int = ROWS) -> list[Ball
 def in_chunks(rows: int, *values: Tensor) -> list[tuple[Tensor, ...]]:
     """Splits values (M, ...) of equal length into chunks of `rows`.
 
-    In inference the last one is filled up with zeros. Off the processor it is one chunk.
+    In inference the last one is padded with zeros. On a GPU there is one chunk.
     """
     if values[0].device.type != "cpu":
         return [values]

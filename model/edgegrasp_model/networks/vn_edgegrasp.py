@@ -1,4 +1,4 @@
-"""VNEdgeGraspNet: EdgeGraspNet on vector neurons; its scores do not change when the cloud turns.
+"""VNEdgeGraspNet: EdgeGraspNet on vector neurons; scores are invariant to rotations.
 
 Huang et al., ICRA 2023, section IV-D, with the widths of the authors' release. Features are
 (M, 3, C): C vectors each; P points in B balls, E grasps. The map to the directions of a ReLU or of
@@ -31,7 +31,7 @@ _TINY = 1e-7  # keeps the division finite where a direction vanishes; the refere
 VN_CONVOLVED = 32  # points at a time in a graph convolution, each with its neighbours
 VN_ROWS = 256  # points at a time in the global layers
 
-# Sums may be reordered and divisions turned into products; NaN and infinity stay themselves.
+# Allows reordered sums and reciprocal divisions; NaN and infinity are preserved.
 _compiled = compiled("contract", "nsz", "arcp", "reassoc")
 
 
@@ -67,7 +67,7 @@ class VNEdgeGraspNet(nn.Module):
         frame_2, frame_3 = PackedLinear(self.frame_2.weights), PackedLinear(self.frame_3.weight)
         classifier, logits = PackedMlp(self.classifier), []
         for own, ball_of_edge in in_chunks(EDGE_ROWS, grasp, batch.ball_of_edge):
-            # Three vectors learned from the grasp turn with it: coordinates along them do not.
+            # Three learned vectors rotate with the grasp, so coordinates along them are invariant.
             frame = frame_3(relu(frame_2(relu(join(own, ball_of_edge)))))  # (e, 3, 3)
             vectors = torch.cat((own, ball.index_select(0, ball_of_edge)), dim=2)  # (e, 3, 512)
             invariant = (vectors.transpose(1, 2) @ frame).flatten(1)  # (e, 512, 3) -> (e, 1536)
@@ -157,7 +157,7 @@ class VNLinearReLU(nn.Module):
 
     @property
     def weights(self) -> Tensor:
-        """What gives vectors and directions: (2 outputs, inputs)."""
+        """The weight that gives vectors and directions: (2 outputs, inputs)."""
         return torch.cat((self.feature.weight, self.direction.weight))
 
 
@@ -175,14 +175,15 @@ class VNReLU(nn.Module):
 
 
 def _beside(weight: Tensor, direction: Tensor) -> Tensor:
-    """The weight (C, inputs) and its direction map composed with it, one above the other."""
+    """The weight (C, inputs), stacked on its composition with the direction map."""
     return torch.cat((weight, direction @ weight))
 
 
 def _with_reach(layer: nn.Linear, reach: nn.Linear) -> Tensor:
-    """Weights of vectors among which a maximum chooses, and of the directions it goes by.
+    """Weights of the vectors that a maximum chooses from, and of the directions that decide.
 
-    A choice has no gradient: training leaves the direction map as it was drawn, as the reference's.
+    A choice has no gradient, so training leaves the direction map at its random initialisation,
+    like the reference.
     """
     return torch.cat((layer.weight, (reach.weight @ layer.weight).detach()))
 
@@ -200,7 +201,7 @@ def relu(both: Tensor) -> Tensor:
 
 
 def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch) -> Tensor:
-    """The furthest (P, 3, C) of the messages of each point's neighbours, in memory used again."""
+    """The furthest (P, 3, C) of the messages of each point's neighbours, in a reused buffer."""
     (count, k), width = batch.neighbors.shape, len(offset) // 2
     points, neighbors = batch.points.numpy(), batch.neighbors.numpy()
     hidden = torch.zeros(VN_CONVOLVED * k, 3, width)
@@ -217,16 +218,16 @@ def _convolved(u: Tensor, offset: Tensor, output: PackedLinear, batch: BallBatch
 
 
 class Furthest:
-    """Per channel the vector of each group that reaches furthest along its direction."""
+    """For each channel, the vector of each group that reaches furthest along its direction."""
 
     def __init__(self, groups: int, width: int) -> None:
         self._best = torch.full((groups, width), -torch.inf)
         self._vectors = torch.zeros(groups, 3, width)
 
     def add(self, both: Tensor, groups: list[int], sizes: list[int]) -> None:
-        """Take in vectors and directions (p, 3, 2 width), so many of each of the groups.
+        """Add vectors and directions (p, 3, 2 width), with the number of rows of each group.
 
-        All at once, unless for float32 inference.
+        All at once unless in float32 inference.
         """
         if float32_inference(both):
             bounds = np.cumsum([0, *sizes[: len(groups)]])
@@ -243,7 +244,7 @@ class Furthest:
 
 
 def _furthest(both: Tensor, dim: int) -> Tensor:
-    """The furthest along one of the dimensions before the last two; the first of a tie."""
+    """The furthest along a dimension before the last two; the first one on ties."""
     vectors, directions = both.chunk(2, dim=-1)
     with torch.no_grad():
         reach = (vectors * directions).sum(dim=-2, keepdim=True)  # (..., 1, C)
@@ -290,13 +291,13 @@ def _relu_rows(both: Float32, result: Float32) -> None:
 def _furthest_rows(both: Float32, bounds: Int64, best: Float32, result: Float32) -> None:
     """The furthest vectors of the rows of `both` between each two of `bounds`; the first of a tie.
 
-    Goes on from the vectors in `result` and how far they reach, `best`.
+    Continues from the vectors in `result` and their reach in `best`.
     """
     width = result.shape[2]
     furthest = np.empty(width, np.int32)
     for i in range(len(bounds) - 1):
         row, reached = result[i], best[i]
-        furthest[:] = -1  # Choosing rows first, vectors after, is several times faster.
+        furthest[:] = -1  # Choosing rows first and vectors after is several times faster.
         for j in range(bounds[i], bounds[i + 1]):
             here, number = both[j], np.int32(j)
             for c in range(width):

@@ -1,1 +1,1 @@
-"""From the cloud a caller sends to the scene that grasps are looked for in."""
+"""From the caller's cloud to the scene in which grasps are searched."""

@@ -1,4 +1,4 @@
-"""From the array a caller sends to the small, clean cloud with normals that the network sees."""
+"""From the caller's array to the small, clean cloud with normals that the network sees."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Self, TypeVar, cast
@@ -13,16 +13,16 @@ from edgegrasp_camera.clouds import CloudInput as CloudInput
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.kernels import least_spread
 
-MAX_EXTENT = 20.0  # metres; where most of a cloud is wider, it is in millimetres
+MAX_EXTENT = 20.0  # metres; if most of a cloud is wider, it is probably in millimetres
 MAX_DISTANCE = 1000.0  # metres from the origin; beyond, float32 rounds by more than 0.03 mm
 OUTLIER_NEIGHBORS = 8
 OUTLIER_DEVIATIONS = 2.5
 NORMAL_NEIGHBORS = 20
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)  # of the canonical frame
-CUBE = 8  # voxels along the edge of a cube whose points follow one another
+CUBE = 8  # voxels along the edge of a cube; points are stored cube by cube
 WIDEST_VIEW = 1.2  # tangent of half the angle that a depth camera sees
 MAX_UPWARD = 0.5  # sine of the angle from the level at which a camera looks up
-MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset points nowhere
+MIN_HORIZONTAL = 1e-3  # metres; a shorter horizontal offset has no direction
 ENOUGH = 6000  # points that stand for a whole cloud where a fit, a mean or a view is asked for
 
 
@@ -31,7 +31,7 @@ Vectors = TypeVar("Vectors", bound=Floats)
 
 @dataclass(frozen=True)
 class CheckedCloud:
-    """The finite points of a cloud, and what comes with them."""
+    """The finite points of a cloud, and the per-point arrays sent with them."""
 
     points: Float32  # (N, 3) metres
     row: Int64  # (N,) each point's row in the cloud as sent
@@ -39,14 +39,14 @@ class CheckedCloud:
     normals: Float32 | None = None  # (N, 3)
     segment_ids: Int64 | None = None  # (N,)
     view_ids: Int64 | None = None  # (N,)
-    image_size: tuple[int, int] | None = None  # (H, W) where it is organised
+    image_size: tuple[int, int] | None = None  # (H, W) of an organised cloud
     warnings: tuple[str, ...] = ()
 
     def take(self, kept: Bools | Int64) -> "CheckedCloud":
-        """Some of the points, by truth values (N,) or places; rows are counted as before."""
+        """Some of the points, by mask (N,) or indices; `row` still refers to the cloud as sent."""
         place = np.flatnonzero(kept) if kept.dtype == np.bool_ else kept
         return CheckedCloud(
-            self.points.take(place, axis=0),  # many times faster than by brackets
+            self.points.take(place, axis=0),  # many times faster than indexing
             self.row[place],
             self.rows_sent,
             None if self.normals is None else self.normals[place],
@@ -62,17 +62,17 @@ def check_cloud(cloud: object, num_approach_points: int = 1) -> CheckedCloud:
 
     Args:
         cloud: A CloudInput, or an array of points alone.
-        num_approach_points: How many of its points the caller wants as approach points.
+        num_approach_points: How many approach points the caller wants.
 
     Raises:
-        InvalidRequest: An array is of the wrong type, dtype or shape, or holds what it must not;
+        InvalidRequest: An array is of the wrong type, dtype or shape, or has an invalid value;
             names `cloud`, `normals`, `colors`, `segment_ids` or `view_ids`.
     """
     sent = cloud if isinstance(cloud, CloudInput) else CloudInput(cloud)
     points = sent.points
     kept = size_of_image = None
     if isinstance(points, np.ndarray) and points.ndim == 3 and points.shape[2] == 3:
-        # A single row of points, such as those of several images, is no image.
+        # A single row of points, such as fused images, is not an image.
         size_of_image = None if 1 in points.shape[:2] else points.shape[:2]
         points = points.reshape(-1, 3)
         if points.dtype in (np.float32, np.float64):
@@ -118,9 +118,9 @@ def unit(vectors: Vectors) -> Vectors:
 
 
 def seen_from_origin(points: Float32, up: ArrayLike | None) -> bool:
-    """Whether points (N, 3) look like what a camera at their origin sees, along +z.
+    """Whether points (N, 3) look as if seen by a camera at the origin along +z.
 
-    Where `up` (3,) is known, such a camera does not look steeply upward.
+    If `up` (3,) is known, such a camera must not look steeply upward.
     """
     x, y, z = points.T
     if len(points) == 0 or z.min() <= 0 or np.quantile(np.hypot(x, y) / z, 0.99) > WIDEST_VIEW:
@@ -192,7 +192,7 @@ def _valid_points(
 
 
 def _near_points(points: Floats) -> Int64:
-    """Places of the points (N, 3) that are no stray readings far away.
+    """Indices of the points (N, 3) without stray readings far away.
 
     Raises:
         InvalidRequest: Most of the cloud has an extent that suggests millimetres.
@@ -209,7 +209,7 @@ def _near_points(points: Floats) -> Int64:
 
 
 def _check_place(count: int, furthest: float, num_approach_points: int) -> None:
-    """Refuse points `furthest` metres from the origin, or fewer than approach points."""
+    """Refuse points too far from the origin, or fewer points than approach points."""
     if furthest > MAX_DISTANCE:
         raise InvalidRequest(
             "cloud",
@@ -233,7 +233,7 @@ def _finite(points: Floats) -> Bools:
 
 @dataclass(frozen=True)
 class Voxels:
-    """The occupied voxels of a cloud, ordered by place: the order of the points does not matter."""
+    """The occupied voxels of a cloud, sorted by position: the order of the points has no effect."""
 
     voxel: Int64  # (N,) voxel of each point
     size: Int64  # (V,) points in each
@@ -244,11 +244,11 @@ class Voxels:
         return (np.stack(sums, axis=1) / self.size[:, None]).astype(np.float32)
 
     def share(self, holds: Bools) -> Float64:
-        """Share (V,) of each voxel's points for which something holds (N,)."""
+        """Share (V,) of each voxel's points for which a condition (N,) holds."""
         return np.bincount(self.voxel, holds, len(self.size)) / self.size
 
     def commonest(self, labels: NDArray[np.integer]) -> Int64:
-        """Commonest label (V,) in each voxel, of any labels (N,); the lowest of those as common."""
+        """Most common label (V,) in each voxel, from labels (N,); the lowest one on ties."""
         low, one = labels.min(), np.ones(len(labels), dtype=np.int64)
         tally = coo_array((one, (self.voxel, labels - low))).tocsr()  # (V, labels), few of them
         voxel = np.repeat(np.arange(len(self.size)), np.diff(tally.indptr))
@@ -258,9 +258,9 @@ class Voxels:
 
 def voxelise(points: Floats, voxel_size: float) -> Voxels:
     """Sort points (N, 3) into voxels with edges of `voxel_size` metres."""
-    # Axis by axis: three times as fast as all at once.
+    # Axis by axis is three times as fast as all at once.
     cells = [((axis - float(axis.min())) / voxel_size).astype(np.int64) for axis in points.T]
-    # Cube by cube: loops over hands then pass over many points that are far at a time.
+    # Stored cube by cube, so that loops over hands skip many distant points at a time.
     keys = np.zeros(len(points), dtype=np.int64)
     for cell in cells:
         keys = keys * (cell.max() // CUBE + 1) + cell // CUBE
@@ -271,7 +271,7 @@ def voxelise(points: Floats, voxel_size: float) -> Voxels:
 
 
 class Neighbors(NamedTuple):
-    """The points of a cloud that are nearest to each of its N points, itself the first."""
+    """The nearest points of each of N points, the point itself first."""
 
     distance: Float64  # (N, K) metres
     row: Int64  # (N, K)
@@ -285,7 +285,7 @@ class Neighbors(NamedTuple):
 
 
 def statistical_outlier_removal(near: Neighbors) -> Bools:
-    """Which points (N,) are not far from their neighbours by the measure of the whole cloud."""
+    """A mask (N,) of points whose distance to their neighbours is not unusual for the cloud."""
     if len(near.row) <= OUTLIER_NEIGHBORS:
         return np.ones(len(near.row), dtype=bool)
     mean = near.distance[:, 1 : OUTLIER_NEIGHBORS + 1].mean(axis=1)
@@ -294,37 +294,37 @@ def statistical_outlier_removal(near: Neighbors) -> Bools:
 
 
 def estimate_normals(points: Float32, near: Neighbors) -> Float32:
-    """Unit normals (N, 3) of points (N, 3), of either sign: where their neighbours spread least."""
+    """Unit normals (N, 3) of points (N, 3), of either sign: the direction of least variance."""
     return least_spread(points, near.row)
 
 
 def orient_normals(points: Float32, normals: Float32, viewpoint: Float32) -> Float32:
-    """Turn each normal to the side of its surface that the viewpoint, (3,) or (N, 3), sees."""
+    """Flip normals so that they point toward the viewpoint, (3,) or (N, 3)."""
     away = np.einsum("nd,nd->n", normals, viewpoint - points) < 0
     return np.where(away[:, None], -normals, normals).astype(np.float32)
 
 
 def assumed_viewpoint(points: Float32, up: Float32) -> Float32:
-    """A stand-in for an unknown camera: one metre above the cloud's middle."""
+    """A substitute for an unknown camera: one metre above the cloud's middle."""
     middle: Float32 = (points.min(axis=0) + points.max(axis=0)) / 2
     return middle + up / np.linalg.norm(up)
 
 
 @dataclass(frozen=True)
 class CanonicalFrame:
-    """z along up, x horizontally toward the camera, the origin at the points' mean."""
+    """z is up, x points horizontally toward the camera, the origin is the points' mean."""
 
     T_canonical_cloud: Float64  # (4, 4)
 
     @classmethod
     def of_scene(cls, points: Float32, up: ArrayLike, viewpoint: ArrayLike | None) -> Self:
-        """Fix the frame to the scene: it turns and moves with the scene.
+        """The frame of a scene; it rotates and moves with the scene.
 
         Args:
             points: (N, 3) metres.
             up: (3,) of any length but zero.
-            viewpoint: (3,) the camera. Where there is none, or it is straight above, x points to
-                the furthest point instead.
+            viewpoint: (3,) the camera. If unknown or straight above, x points to the farthest point
+                instead.
         """
         origin = points.mean(axis=0, dtype=np.float64)
         z = np.asarray(up, dtype=np.float64)
@@ -372,7 +372,7 @@ class CanonicalFrame:
 
 
 def _furthest_out(offsets: Float64, z: Float64) -> Float64 | None:
-    """Horizontal direction (3,) of the offset that is the longest seen from above, if any is."""
+    """Horizontal direction (3,) of the offset that is longest when seen from above, if any."""
     horizontal = offsets - (offsets @ z)[:, None] * z
     length = np.linalg.norm(horizontal, axis=1)
     longest = int(length.argmax())

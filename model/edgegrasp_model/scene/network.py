@@ -1,4 +1,4 @@
-"""The `scene` network: what each pixel of a range image shows, and which pixels belong together.
+"""The `scene` network: classifies pixels of a range image and says which belong together.
 
 A U-Net on depth alone, as networks that segment unseen objects from simulated depth (UOIS-Net, Xie
 et al., T-RO 2021): its input has twice the resolution of its output.
@@ -26,19 +26,19 @@ OUTPUTS = len(CLASSES) + 3 + 2 + 3
 
 
 class SceneOutput(NamedTuple):
-    """What the network says of each pixel, at half of the input's resolution."""
+    """The network's output for each pixel, at half the input's resolution."""
 
     classes: Tensor  # (B, 3, H/2, W/2) logits of CLASSES
     votes: Tensor  # (B, 3, H/2, W/2) metres from the point to the centre of its object
     links: Tensor  # (B, 2, H/2, W/2) logits: same object as the right, the lower neighbour
-    up: Tensor  # (B, 3, H/2, W/2) away from gravity, of any length
+    up: Tensor  # (B, 3, H/2, W/2) direction away from gravity, of any length
 
 
 class SceneNet(nn.Module):
-    """Classes, votes for centres, links, and which way is up, of range images."""
+    """Predicts classes, votes for object centres, links between pixels, and the up direction."""
 
     def __init__(self, widths: tuple[int, ...] = WIDTHS) -> None:
-        """With random weights; `widths` are channels at each resolution, from the output's."""
+        """Random weights; `widths` are the channels at each resolution, the output's first."""
         super().__init__()
         first = widths[0]
         self.stem = _layer(CHANNELS, first, kernel=4, stride=2)
@@ -53,7 +53,7 @@ class SceneNet(nn.Module):
         self.head = nn.Conv2d(first, OUTPUTS, 1)
 
     def forward(self, features: Tensor) -> SceneOutput:
-        """Of features (B, CHANNELS, H, W), where H and W are multiples of 16."""
+        """Maps features (B, CHANNELS, H, W); H and W are multiples of 16."""
         x = self.fine(self.stem(features))
         kept = []
         for layer in self.down:
@@ -69,7 +69,7 @@ class SceneNet(nn.Module):
         return SceneOutput(out[:, :3], VOTE_UNIT * out[:, 3:6], out[:, 6:8], out[:, 8:])
 
     def fused(self) -> "SceneNet":
-        """This network with each normalisation folded into its convolution, for inference."""
+        """This network with every normalisation folded into its convolution, for inference."""
         for module in self.modules():
             if isinstance(module, nn.Sequential) and isinstance(module[0], nn.Conv2d):
                 normalisation = module[1]
@@ -80,7 +80,7 @@ class SceneNet(nn.Module):
 
 
 class _Block(nn.Module):
-    """Two convolutions beside the identity."""
+    """Residual block of two convolutions."""
 
     def __init__(self, width: int, dilation: int = 1) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ def _layer(
 
 
 def scene_features(points: Float32, up: Float64 | None, footprint: float) -> Float32:
-    """What the network reads of a range image.
+    """The network's input for a range image.
 
     Args:
         points: (H, W, 3) camera frame, metres; NaN without a reading.
@@ -161,7 +161,7 @@ def _fill_features(points: Float32, up: Float64, known: bool, offset: float, out
             bz = points[i, j + s, 2] - points[i, j - s, 2]
             nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length > 0.0:  # false for NaN too
+            if length > 0.0:  # false for NaN as well
                 out[5, i, j], out[6, i, j], out[7, i, j] = nx / length, ny / length, nz / length
                 if known:
                     out[9, i, j] = (up[0] * nx + up[1] * ny + up[2] * nz) / length

@@ -1,4 +1,4 @@
-"""Solid boxes in any orientation: whether a moving hand meets them, and how far away they are."""
+"""Solid boxes in any orientation: whether a moving hand hits them, and their distance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _EDGES = np.argwhere(np.triu(_DIFFER == 1))  # (12, 2) corners
 
 @dataclass(frozen=True)
 class SolidBoxes:
-    """Boxes by their middles and the vectors from there to the middles of their faces."""
+    """Boxes given by their centres and the vectors from there to the centres of their faces."""
 
     center: Float64  # (M, 3) metres
     half: Float64  # (M, 3, 3) rows: half extents times axes, metres
@@ -76,15 +76,15 @@ def box_pose(box: Box | OrientedBox) -> tuple[Float64, Float64]:
 
 
 def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = None) -> Float64:
-    """Widest gap between boxes along any axis that can separate them; exact as to its sign.
+    """Widest gap between boxes along any separating axis; its sign is exact.
 
-    Negative: they overlap, and by so much they would have to move apart. Positive: a lower bound
-    of their distance, which is this or more.
+    Negative: they overlap, by the distance they would have to move apart. Positive: a lower bound
+    of their distance.
 
     Args:
         ours: M boxes.
-        theirs: M boxes, each for the one of the same row.
-        sweep: (M, 3) ours cover all they pass when moved along this; None: at rest.
+        theirs: M boxes, compared row by row.
+        sweep: (M, 3) motion over which ours are swept; None: at rest.
 
     Returns:
         (M,) metres.
@@ -109,11 +109,11 @@ def separation(ours: SolidBoxes, theirs: SolidBoxes, sweep: Float64 | None = Non
 
 
 def signed_distance(ours: SolidBoxes, theirs: SolidBoxes) -> Float64:
-    """Distance between boxes; where they overlap, minus the way they would have to move apart.
+    """Distance between boxes; if they overlap, minus the distance they would have to move apart.
 
     Args:
         ours: M boxes.
-        theirs: M boxes, each for the one of the same row.
+        theirs: M boxes, compared row by row.
 
     Returns:
         (M,) metres.
@@ -148,7 +148,7 @@ def _corner_distance(corners: Float64, boxes: SolidBoxes) -> Float64:
 
 
 def _segment_distance(p0: Float64, p1: Float64, q0: Float64, q1: Float64) -> Float64:
-    """Distance of segments p0 p1 and q0 q1, (..., 3) each, none of length zero."""
+    """Distance between segments p0 p1 and q0 q1, (..., 3) each, of nonzero length."""
     p, q, r = p1 - p0, q1 - q0, p0 - q0
     pp, qq, pq = (p * p).sum(-1), (q * q).sum(-1), (p * q).sum(-1)
     pr, qr = (p * r).sum(-1), (q * r).sum(-1)

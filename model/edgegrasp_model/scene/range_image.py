@@ -1,4 +1,4 @@
-"""What a viewpoint sees of points, as the range image that the `scene` network reads."""
+"""Renders points from a viewpoint as the range image that the `scene` network reads."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from edgegrasp_model.scene.network import HEIGHT, MULTIPLE, WIDTH
 
 NEAREST = 0.05  # metres from the viewpoint
 COVERED = 0.5  # percent of the points that may lie beyond each side of the image
-COARSE = 40  # cells across the view, which tell how densely points lie
+COARSE = 40  # cells across the view in which the density of points is measured
 SPACING = 1.25  # pixels between neighbouring points, so that few pixels stay empty
-DENSE = 3  # points for each pixel, of which more show nothing new
-SURFACE = 0.02  # metres by which a nearer point of the same pixel hides another
+DENSE = 3  # points per pixel; more add nothing
+SURFACE = 0.02  # metres; a point nearer by this much hides another of the same pixel
 
 
 class RangeImage(NamedTuple):
-    """Points in the frame of a camera (x right, y down, z forward) at a viewpoint."""
+    """An image of points in the frame of a camera (x right, y down, z forward) at a viewpoint."""
 
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
     footprint: float  # metres, width of a pixel at a depth of one metre
@@ -34,13 +34,14 @@ def range_image(
     Args:
         points: (N, 3) cloud frame, metres; at least one.
         viewpoint: (3,) of the camera.
-        up: (3,) away from gravity, which becomes upward in the image; None: unknown.
-        down: (3,) downward in the image where `up` does not say; None: as cloud frames usually are.
+        up: (3,) away from gravity, which is drawn upward in the image; None: unknown.
+        down: (3,) downward in the image if `up` is unknown or along the sight; None: by the usual
+            frames.
     """
     downward = [way for way in (None if up is None else -up, down) if way is not None]
     apart = points[thinned(len(points))].astype(np.float64) - viewpoint
     sight = unit(apart)
-    # Rounded, so that the image does not depend on the order of the points.
+    # Rounded, so that the image is independent of the order of the points.
     turn = _camera_axes(sight.mean(axis=0).round(9), downward)
     for _ in range(2):
         low, high = _view(apart @ turn.T)
@@ -63,11 +64,11 @@ def range_image(
 def _camera_axes(sight: Float64, downward: list[Float64]) -> Float64:
     """Axes (3, 3), rows x right, y down, z forward along `sight`; cloud frame.
 
-    The first of `downward` that is not along the sight decides.
+    Uses the first of `downward` that is not along the line of sight.
     """
     length = float(np.linalg.norm(sight))
     z = sight / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
-    # Clouds come in a camera's frame (y down) or in one whose z points up.
+    # Clouds are usually in a camera's frame (y down) or in a frame whose z points up.
     usual = np.array([0.0, 1.0, 0.0]) if abs(z[2]) > 0.7 else np.array([0.0, 0.0, -1.0])
     choices = [*downward, usual, np.array([1.0, 0.0, 0.0])]
     x = next(x for x in (np.cross(way, z) for way in choices) if np.linalg.norm(x) > 0.1)
@@ -88,7 +89,7 @@ def _view(points: Float64) -> tuple[Float64, Float64]:
 
 
 def _pixel_size(points: Float64, low: Float64, high: Float64, count: int) -> float:
-    """Side of a pixel at z = 1: as fine as the points allow, as coarse as the network asks for."""
+    """Side of a pixel at z = 1: as fine as the points allow and the network needs."""
     side = high - low
     finest = float(np.sqrt(side.prod() / (WIDTH * HEIGHT)))
     ahead = points[points[:, 2] > NEAREST]
@@ -107,7 +108,7 @@ def _render(
     pixel_size: float,
     image: Float32,
 ) -> None:
-    """Put into each pixel the point nearest to its middle, of the nearest surface."""
+    """For each pixel, take the nearest surface's point that is closest to the pixel's centre."""
     height, width, _ = image.shape
     nearest = np.full((height, width), np.inf, dtype=np.float32)
     best = np.full((height, width), np.inf, dtype=np.float32)
@@ -137,7 +138,7 @@ def _render(
 
 @compiled("contract")
 def _fill_holes(image: Float32, out: Float32) -> None:
-    """Give an empty pixel the mean of its neighbours where most of them are there and agree."""
+    """Fill an empty pixel with the mean of its neighbours if most of them exist and agree."""
     height, width, _ = image.shape
     for i in range(1, height - 1):
         for j in range(1, width - 1):

@@ -1,4 +1,4 @@
-"""Which points of a cloud lie in the regions of a request, or on the objects it asks for."""
+"""Which points of a cloud lie in a request's regions, or on the objects it names."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,13 +23,13 @@ from edgegrasp_model.options import (
 from edgegrasp_model.scene.cloud import CheckedCloud, Voxels
 from edgegrasp_model.scene.segment import FIXED
 
-HELD_SHARE = 0.5  # of a voxel's points, from which rows hold the voxel
-NEAR_POINT = 0.1  # metres from a position to the object that it asks for, at most
-NEAR_PIXEL = 0.02  # of the image's width, as far from a pixel
+HELD_SHARE = 0.5  # share of a voxel's points that must be listed for rows to hold the voxel
+NEAR_POINT = 0.1  # most metres from a position to the object it names
+NEAR_PIXEL = 0.02  # the same from a pixel, as a share of the image's width
 
 
 def check_regions(cloud: CheckedCloud, options: DetectOptions) -> None:
-    """Raise InvalidRequest where `at` or a region speaks of what the cloud does not have."""
+    """Raise InvalidRequest if `at` or a region refers to something that the cloud does not have."""
     check_pixel(cloud, options)
     for name in ("approach_region", "contact_region"):
         if (region := getattr(options, name)) is not None:
@@ -40,7 +40,7 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
     """Check that the rows a region speaks of exist.
 
     Args:
-        region: Its shapes, some of which may name rows.
+        region: A region, whose shapes may name rows.
         cloud: The cloud as sent.
         field: Name of the region in the request, for the error.
 
@@ -62,7 +62,7 @@ def check_region(region: Region, cloud: CheckedCloud, field: str) -> None:
 
 
 def check_pixel(cloud: CheckedCloud, options: DetectOptions) -> None:
-    """Raise InvalidRequest where `at` is no pixel of the cloud."""
+    """Raise InvalidRequest unless `at` is a pixel of the cloud."""
     if options.at is None:
         return
     if cloud.image_size is None:
@@ -77,13 +77,13 @@ def check_pixel(cloud: CheckedCloud, options: DetectOptions) -> None:
 def chosen_objects(
     number: Int64, cloud: CheckedCloud, options: DetectOptions, warnings: list[str]
 ) -> Int64:
-    """The object (N,) of each point of a cloud, where it is asked for; FIXED: it is not.
+    """The object (N,) of each point if the request names that object; FIXED otherwise.
 
     Args:
-        number: (N,) the object of each point; negative: of none.
+        number: (N,) the object of each point; negative: none.
         cloud: N points.
         options: objects, at and near.
-        warnings: Gets what is asked for and not there.
+        warnings: Gets objects that are named but not there.
     """
     found = np.flatnonzero(np.bincount(number[number >= 0]))
     wanted, choice = found, options.objects
@@ -145,7 +145,7 @@ def inside_region(region: Region, points: Float32, voxels: Voxels, cloud: Checke
 
 
 def inside_workspace(points: Float32, box: Workspace | None, around: Floats | float = 0.0) -> Bools:
-    """Which points (N, 3) lie in a box grown by `around` metres; all where there is none."""
+    """Which points (N, 3) lie in a box grown by `around` metres; all if there is no box."""
     if box is None:
         return np.ones(len(points), dtype=bool)
     low, high = np.asarray(box.min) - around, np.asarray(box.max) + around
@@ -154,7 +154,7 @@ def inside_workspace(points: Float32, box: Workspace | None, around: Floats | fl
 
 
 def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32) -> Bools:
-    """Which points (V, 3), in the frame of the shape's own numbers, lie in it.  # (V,)."""
+    """Which points (V, 3), in the shape's frame, lie in it.  # (V,)."""
     match shape:
         case Box():
             inside = (points >= np.asarray(shape.min)) & (points <= np.asarray(shape.max))
@@ -171,7 +171,7 @@ def inside_shape(shape: Box | OrientedBox | Sphere | HalfSpace, points: Float32)
 
 
 def _in_rows(shape: Rows, cloud: CheckedCloud) -> Bools:
-    """Which points of the cloud a list of rows, a mask or segments hold.  # (N,)."""
+    """Which points of the cloud are listed by rows, a mask or segments.  # (N,)."""
     match shape:
         case Indices():
             return np.isin(cloud.row, np.asarray(shape.indices, dtype=np.int64))

@@ -1,4 +1,4 @@
-"""A request's scene: the small clean cloud in the canonical frame, and what else is there."""
+"""A request's scene: the small, clean cloud in the canonical frame, its support and obstacles."""
 
 import math
 from dataclasses import dataclass, field
@@ -56,42 +56,42 @@ from edgegrasp_model.scene.support import (
     correct_depth_scale,
 )
 
-MIN_POINTS = 4  # fewer make no surface
+MIN_POINTS = 4  # fewer are too few for a surface
 MIN_NORMAL = 1e-3  # a voxel's mean normal shorter than this has no direction
-SIDE_DEPTH = 0.006  # metres inside a side of the workspace where an object may be cut off
+SIDE_DEPTH = 0.006  # metres from a side of the workspace within which an object may be cut off
 MAX_VOXELS = 200_000  # some seconds of work; a tabletop has 3,000 to 30,000
-REACH = 0.25  # metres around an object in which a hand at it may meet something
-FOLLOWED_REACH = 0.16  # the same where only grasps that are known are looked at
+REACH = 0.25  # metres around an object in which a hand at it may collide
+FOLLOWED_REACH = 0.16  # the same if only known grasps are checked
 PLAN_CELL = 0.05  # metres
-CLOSE = 0.06  # metres within which no camera measures
-UNRECOGNISED = 0.7  # probability of an object that the network did not see
-LIKELY = 0.5  # probability of object or support from which what rises may be an object
+CLOSE = 0.06  # metres; no camera measures closer
+UNRECOGNISED = 0.7  # confidence of an object that the network did not see
+LIKELY = 0.5  # probability of object or support above which a risen point may be an object
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What grasps are looked for in; canonical frame. V points are left of the cloud."""
+    """The scene in which grasps are searched; canonical frame. V voxels are left of the cloud."""
 
     frame: CanonicalFrame
     cloud: Cloud  # V points
     points_in_cloud: Float32  # (V, 3) the same in the cloud's frame
-    point_of_row: Int64  # (R,) point that each row of the cloud as sent went into; -1: none
+    point_of_row: Int64  # (R,) voxel of each row of the cloud as sent; -1: none
     approach_allowed: Bools  # (V,) in the approach region
     contact_allowed: Bools  # (V,) in the contact region
-    object_of_point: Int64  # (V,) number of the object that each point is of; FIXED; UNKNOWN
+    object_of_point: Int64  # (V,) number of each point's object; FIXED; UNKNOWN
     support: SupportPlane | None
     obstacles: SolidBoxes | None  # beside the cloud; None: there are none
-    viewpoints: Float32 | None = None  # (W, 3) the cameras, where they are known
+    viewpoints: Float32 | None = None  # (W, 3) the cameras, if known
     confidence: dict[int, float] = field(default_factory=dict)  # probability of each, if found
     at_side: Bools | None = None  # (V,) where a side of the workspace cuts the cloud off
 
 
 @dataclass(frozen=True)
 class SelectedPoints:
-    """What is left of a cloud: M points of objects and of what is around them."""
+    """The selected points of a cloud: M points of objects and their surroundings."""
 
     sent: CheckedCloud  # M points
-    number: Int64  # (M,) the object that each is of; FIXED: of background; UNKNOWN: of neither
+    number: Int64  # (M,) each one's object; FIXED: background; UNKNOWN: undecided
     support: Support | None
     up: Float64  # (3,) unit, away from gravity, cloud frame
     viewpoints: Float64 | None  # (W, 3) the cameras
@@ -105,11 +105,11 @@ def select_points(
     counts: dict[str, int],
     warnings: list[str],
 ) -> SelectedPoints:
-    """Correct depths, segment, remove the support, drop what no hand at an object can meet.
+    """Correct depths, segment, remove the support, and drop what no hand at an object can reach.
 
     Raises:
-        InvalidRequest: A region speaks of rows or segments that the cloud does not have, or the
-            views do not suit the viewpoints, or there are none to correct depths from.
+        InvalidRequest: A region names rows or segments that the cloud does not have, the view ids
+            do not match the viewpoints, or the viewpoint needed to correct depths is missing.
     """
     viewpoints = camera_positions(sent, options)
     check_regions(sent, options)
@@ -139,7 +139,8 @@ def select_points(
         if shown is not None:
             number, confidence = _recognised(shown, support, above, plan, height, margin)
         if support is None and (viewpoints is None or not (number >= 0).any()):
-            # One object, without what it stands on; but no camera sees what touches it.
+            # A single object without its support, although no camera separates an object from what
+            # touches it.
             close = viewpoints is not None and seen.distance().max(initial=0.0) < CLOSE
             number, confidence = np.full_like(number, FIXED if close else 0), {}
         number = without_long(number, sent.points, options.max_object_size)
@@ -157,7 +158,7 @@ def select_points(
 
 
 def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
-    """Whether the caller says what the objects are: by segments, by rows, or all is one."""
+    """Whether the caller defines the objects: by segments, by rows, or as one object."""
     by_rows = has_rows(options.approach_region) or has_rows(options.contact_region)
     return sent.segment_ids is not None or by_rows or options.objects == "off"
 
@@ -165,7 +166,7 @@ def _objects_given(sent: CheckedCloud, options: DetectOptions) -> bool:
 def _segmentation(
     sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
 ) -> Segmentation | None:
-    """What the network says of the points; None where nothing of it is needed."""
+    """The network's segmentation of the points; None if it is not needed."""
     needed = isinstance(options.support, AutoPlane) or not _objects_given(sent, options)
     if len(sent.points) == 0 or options.support is None or not needed:
         return None
@@ -174,7 +175,7 @@ def _segmentation(
 
 
 def _heights(seen: Seen, support: Support | None) -> tuple[Float32, Float32]:
-    """As `Support.heights`; without a support everything is above it."""
+    """As `Support.heights`; without a support, everything counts as above it."""
     if support is not None:
         return support.heights(seen)
     everywhere = np.ones(len(seen.points), dtype=np.float32)
@@ -189,10 +190,10 @@ def _recognised(
     height: Float32,
     margin: Float32,
 ) -> tuple[Int64, dict[int, float]]:
-    """The object (M,) of each point above the support, and the probability of each to be one.
+    """The object (M,) of each point above the support, and the confidence of each object.
 
     Args:
-        shown: What N points show.
+        shown: The segmentation of N points.
         support: The plane.
         above: (M,) which of them rise above it.
         plan: (M, 2) places along it, metres.
@@ -212,7 +213,7 @@ def _recognised(
 def _views(
     sent: CheckedCloud, viewpoints: Float64 | None, options: DetectOptions
 ) -> list[tuple[Float64, Int64 | None]]:
-    """The position of each camera and the rows that it saw; without any, one above the points."""
+    """The position of each camera and the rows that it saw; if unknown, one above the points."""
     if viewpoints is None:
         up = options.known_up
         up = np.array([0.0, 0.0, 1.0]) if up is None else up
@@ -228,7 +229,7 @@ def _views(
 def _down_in_image(sent: CheckedCloud, viewpoints: Float64 | None) -> Float64 | None:
     """(3,) unit, cloud frame, downward in the image; None: unknown.
 
-    Without a camera, one that turns with the cloud.
+    Without a camera, a direction that rotates with the cloud.
     """
     if viewpoints is None:
         apart = sent.points - sent.points.mean(axis=0)
@@ -249,17 +250,17 @@ def build_scene(
     counts: dict[str, int],
     max_voxels: int = MAX_VOXELS,
 ) -> Scene | None:
-    """Voxelise what is left of a cloud, clean it, estimate its normals, find the regions.
+    """Voxelise the selected points, remove outliers, estimate normals, and find the regions.
 
     Args:
         selected: M points.
         options: workspace, regions and obstacles.
         voxel_size: Metres.
         counts: Gets the number of points left after each step.
-        max_voxels: Most voxels that the cloud may have where grasps are looked for.
+        max_voxels: Most voxels that the cloud may have where grasps are searched.
 
     Returns:
-        The scene, or None where too few points are left to make a surface.
+        The scene, or None if too few points are left to make a surface.
 
     Raises:
         InvalidRequest: The cloud has too many voxels.
@@ -305,7 +306,7 @@ def build_scene(
 
 
 def _point_of_row(sent: CheckedCloud, voxels: Voxels, kept: Bools) -> Int64:
-    """The kept voxel (R,) that each row of the cloud as sent went into; -1: none."""
+    """The kept voxel (R,) of each row of the cloud as sent; -1: none."""
     place = np.where(kept, np.cumsum(kept) - 1, -1)
     point = np.full(sent.rows_sent, -1, dtype=np.int64)
     point[sent.row] = place[voxels.voxel]
@@ -319,7 +320,7 @@ def _clean_cloud(
     frame: CanonicalFrame,
     viewpoints: Float64 | None,
 ) -> tuple[Cloud | None, Bools]:
-    """The voxels without outliers, and which (V,) these are; no cloud where too few are left.
+    """The voxels without outliers, and a mask (V,) of them; no cloud if too few are left.
 
     Args:
         sent: M points.
@@ -353,9 +354,9 @@ def _check_voxels(
 
 
 def _up(options: DetectOptions, support: Support | None, shown: Segmentation | None) -> Float64:
-    """Unit vector (3,) away from gravity: as sent, else the support's normal, else the network's.
+    """Unit vector (3,) away from gravity: as sent, else the support's normal, else estimated.
 
-    +z where there is none of them, or no camera.
+    +z if none of these is known, or there is no camera.
     """
     if options.up is not None:
         return unit(np.asarray(options.up, dtype=np.float64))
@@ -365,14 +366,14 @@ def _up(options: DetectOptions, support: Support | None, shown: Segmentation | N
 
 
 def _given_numbers(sent: CheckedCloud) -> Int64:
-    """The segments (N,) that a caller sent, 0 and less none; else all points are one object."""
+    """The caller's segments (N,), 0 and below meaning none; else all points are one object."""
     if sent.segment_ids is None:
         return np.zeros(len(sent.points), dtype=np.int64)
     return np.where(sent.segment_ids > 0, sent.segment_ids, UNKNOWN)
 
 
 def object_probability(scene: Scene, points: Int64) -> Float64:
-    """How probable it is that points (E,), rows of the cloud, are of an object; 1 where given."""
+    """Confidence of the objects of points (E,), rows of the cloud; 1 if given by the caller."""
     number = scene.object_of_point[points]
     probability = np.ones(len(points))
     for which, confidence in scene.confidence.items():
@@ -381,7 +382,7 @@ def object_probability(scene: Scene, points: Int64) -> Float64:
 
 
 def near_objects_along(plan: Float64, number: Int64) -> Bools:
-    """Which points (M,), with places (M, 2) along the support, a hand at any object could meet."""
+    """Which points (M,), at (M, 2) along the support, a hand at any object could reach."""
     if not (number >= 0).any():
         return np.zeros(len(plan), dtype=bool)
     x, y = (((axis - axis.min()) / PLAN_CELL).astype(np.int64) for axis in plan.T)
@@ -397,7 +398,7 @@ def near_workspace_side(
 ) -> Bools:
     """Which points (V, 3) lie at a side of the workspace beyond which nothing was seen.
 
-    An object there may be cut off, and wider than it seems. Floor and ceiling do not count.
+    An object there may be cut off and wider than it looks. Floor and ceiling do not count.
 
     Args:
         points: Cloud frame, metres.
@@ -417,7 +418,7 @@ def near_workspace_side(
 
 
 def camera_positions(sent: CheckedCloud, options: DetectOptions) -> Float64 | None:
-    """The camera positions (W, 3) that the request gives, if any."""
+    """The camera positions (W, 3) of the request, if any."""
     if options.viewpoint is None:
         return None
     viewpoints = np.asarray(options.viewpoint, dtype=np.float64).reshape(-1, 3)
@@ -442,7 +443,7 @@ def _turned_normals(
     frame: CanonicalFrame,
     viewpoints: Float64 | None,
 ) -> Float32:
-    """Unit normals of the kept voxels: those given, else the estimated, turned to the camera."""
+    """Unit normals of the kept voxels: as given, else estimated and oriented to the camera."""
     seen_from = assumed_viewpoint(points, UP)
     if viewpoints is not None:
         seen_from = frame.points(viewpoints).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What each point shows, by the `scene` network: an object and which one, the support, or else."""
+"""Classifies each point with the `scene` network: which object, the support, or background."""
 
 import json
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from edgegrasp_model.scene.range_image import NEAREST, range_image
 WEIGHTS = Path(__file__).with_name("network.safetensors")
 
 
-# In place of an object's number: background; what may belong to an object.
+# In place of an object's number: background, or possibly part of an object.
 FIXED, UNKNOWN = -1, -2
 
 # When pixels show the same object.
@@ -37,25 +37,25 @@ SMOOTH = 0.97  # cosine between normals of neighbours on one smooth surface
 STEP = 3.0  # pixels between neighbours on one smooth surface
 VIEW_CELL = 0.01  # metres, in which the views of one object lie in the same place
 VIEW_SHARE = 0.25  # of the smaller one's cells that two views of one object share
-BESIDE = 0.012  # metres from an object to points that the network missed and that belong to it
-STANDS_OUT = 0.004  # metres that these rise at least over what belongs to the support
-FEWEST_CELLS, FEWEST_EACH = 5, 4  # of a cluster of such points, as wide as BESIDE; points in each
-MOST_CELLS = 2000  # along a side of the ground that is looked at
+BESIDE = 0.012  # metres from an object within which missed points may belong to it
+STANDS_OUT = 0.004  # least metres that such points rise above the support's margin
+FEWEST_CELLS, FEWEST_EACH = 5, 4  # cells of a cluster, each BESIDE wide; points per cell
+MOST_CELLS = 2000  # along a side of the ground plan
 REACH, REACH_GROWTH = 0.012, 0.012  # metres, and share of the depth, from a point to its pixel
 
 
 class Segmentation(NamedTuple):
-    """What N points show."""
+    """The segmentation of N points."""
 
-    number: Int64  # (N,) the object, from 0; FIXED; UNKNOWN
+    number: Int64  # (N,) each point's object, from 0; FIXED; UNKNOWN
     object: Float32  # (N,) probability of an object
     support: Float32  # (N,) probability of a support
-    confidence: Float64  # (O,) probability of each number to be an object
-    up: Float64  # (3,) unit, away from gravity, as the network sees it; cloud frame
+    confidence: Float64  # (O,) confidence of each object
+    up: Float64  # (3,) unit, away from gravity, estimated by the network; cloud frame
 
 
 class Pixels(NamedTuple):
-    """What the network says of the pixels of its output, and what they show; camera frame."""
+    """The network's output for each pixel, and the point seen there; camera frame."""
 
     points: Float32  # (H, W, 3) metres; NaN where nothing was seen
     normals: Float32  # (H, W, 3) unit; 0 where unknown
@@ -74,7 +74,7 @@ class Recogniser(NamedTuple):
     @classmethod
     @cache
     def shipped(cls) -> "Recogniser":
-        """With the weights that ship; loaded once a process."""
+        """With the shipped weights; loaded once per process."""
         network = SceneNet()
         network.load_state_dict(load_file(WEIGHTS))
         network.eval().fused().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -89,14 +89,13 @@ def segment(
     up: Float64 | None,
     down: Float64 | None = None,
 ) -> Segmentation:
-    """Segment points, view by view; an object that several views show has one number.
+    """Segment points view by view; an object seen in several views gets one number.
 
     Args:
         points: (N, 3) cloud frame, metres.
-        views: The position (3,) of each camera, and the rows (M,) of the points that it saw;
-            None: all.
+        views: For each camera its position (3,) and the rows (M,) of the points it saw; None: all.
         up: (3,) unit, away from gravity; None: unknown.
-        down: (3,) unit, downward in the image, of use where `up` is unknown; None: unknown.
+        down: (3,) unit, downward in the image, used if `up` is unknown; None: unknown.
     """
     number, seen_up = np.full(len(points), UNKNOWN), np.zeros(3)
     objects, support = np.zeros((2, len(points)), dtype=np.float32)
@@ -121,7 +120,7 @@ def segment(
 def _segment_view(
     points: Float32, viewpoint: Float64, up: Float64 | None, down: Float64 | None
 ) -> Segmentation:
-    """What M points show that one camera saw."""
+    """The segmentation of M points seen by one camera."""
     image = range_image(points, viewpoint, up, down)
     turn, shipped = image.T_cloud_camera[:3, :3], Recogniser.shipped()
     up_in_view = None if up is None else up @ turn
@@ -139,7 +138,7 @@ def _segment_view(
 def look(
     network: SceneNet, points: Float32, up: Float64 | None, footprint: float
 ) -> tuple[Pixels, Float64]:
-    """What a network says of a range image, and which way (3,) it takes for up; camera frame.
+    """A network's output for a range image, and its estimate of up (3,); camera frame.
 
     Args:
         network: In evaluation mode.
@@ -158,14 +157,14 @@ def look(
     seen = np.ascontiguousarray(points[::2, ::2])
     normals = features[5:8, ::2, ::2].transpose(1, 2, 0)
     seen_up = ways[:, ~np.isnan(seen[..., 2])].sum(axis=1).astype(np.float64)
-    if not seen_up.any():  # nothing was seen: toward the camera
+    if not seen_up.any():  # nothing was seen: assume toward the camera
         seen_up = np.array([0.0, 0.0, -1.0])
     return Pixels(seen, normals, classes, votes, links, 2 * footprint), unit(seen_up)
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """What the network says must not depend on how many threads a process has."""
+    """The network's output must not depend on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -175,7 +174,7 @@ def _one_thread() -> Iterator[None]:
 
 
 def group(pixels: Pixels) -> Int64:
-    """The object (H, W) of each pixel, from 0; FIXED where it shows none, UNKNOWN in doubt."""
+    """The object (H, W) of each pixel, from 0; FIXED: background; UNKNOWN: undecided."""
     points, _, classes, votes, links, footprint = pixels
     seen = ~np.isnan(points[..., 2])
     held = seen & (classes.argmax(axis=0) == 2)
@@ -202,7 +201,7 @@ def group(pixels: Pixels) -> Int64:
     large = np.flatnonzero((count >= SMALLEST) & (area >= SMALLEST_AREA))
     if len(large) == 0:
         return number
-    # Parts that something in front separates vote for one centre.
+    # Parts of an object that are separated by something in front vote for the same centre.
     apart = np.linalg.norm(mean[large, None] - mean[large], axis=-1)
     _, merged = connected_components(apart < APART, directed=False)
     of_part = np.full(len(count), UNKNOWN)
@@ -215,12 +214,12 @@ def group(pixels: Pixels) -> Int64:
 def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: float) -> None:
     """Join pairs (P, 2) of pixels in order, but not two large parts with different centres.
 
-    One weak link then does not join two objects (Kruskal's algorithm, with that exception).
+    So one weak link cannot join two objects (Kruskal's algorithm with that exception).
 
     Args:
-        pairs: Those that most probably show one object first.
-        component: (N,) each pixel; becomes the part that it belongs to.
-        centre: (N, 3) metres, what each pixel votes for; overwritten by sums.
+        pairs: Sorted, the most probable pairs first.
+        component: (N,) overwritten with the part of each pixel.
+        centre: (N, 3) metres, the vote of each pixel; overwritten by sums.
         large: Pixels of a large part.
         apart: Metres between centres.
     """
@@ -255,15 +254,15 @@ def _join(pairs: Int64, component: Int64, centre: Float64, large: int, apart: fl
 
 
 def instance_traits(number: Int64, pixels: Pixels) -> Float64:
-    """What tells objects from patches of background that the network calls one.
+    """Features that tell objects from background that the network classified as object.
 
     Args:
         number: (H, W) as from `group`, of O objects.
         pixels: The same.
 
     Returns:
-        (O, 3) 1, the mean probability of an object, and the share of the border on which the
-        surface runs on smoothly into what is no object.
+        (O, 3) 1, the mean probability of an object, and the share of the border across which the
+        surface continues smoothly into background.
     """
     points, normals, classes, _, _, footprint = pixels
     count = int(number.max(initial=-1)) + 1
@@ -286,7 +285,7 @@ def instance_traits(number: Int64, pixels: Pixels) -> Float64:
 
 
 def joined(points: Float32, number: Int64, count: int) -> Int64:
-    """The new number (O,) of each of the numbers (N,): objects in the same place become one."""
+    """The new number (O,) of each object: those in the same place are joined."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return np.arange(count)
@@ -308,9 +307,9 @@ def joined(points: Float32, number: Int64, count: int) -> Int64:
 def with_risen(
     number: Int64, plan: Float64, height: Float32, margin: Float32, likely: Bools
 ) -> Int64:
-    """The numbers (N,), where points that rise above the support belong to the object beside them.
+    """The numbers (N,), with points that rise above the support added to the object beside them.
 
-    The network misses what is thin: handles, edges.
+    The network misses thin parts such as handles and edges.
 
     Args:
         number: (N,) as from `segment`.
@@ -332,10 +331,10 @@ def with_risen(
 
 
 def with_clusters(number: Int64, plan: Float64) -> Int64:
-    """The numbers (N,), where points in no recognised object that lie close together are one.
+    """The numbers (N,), with clusters of points outside of recognised objects as further objects.
 
-    Of a cloud whose support was cut off little but objects is left, and the network sees them
-    without what they stand on.
+    For clouds whose support was cut off, in which the network sees objects without what they stand
+    on.
 
     Args:
         number: (N,) as from `segment`.
@@ -360,7 +359,7 @@ def with_clusters(number: Int64, plan: Float64) -> Int64:
 
 
 def without_long(number: Int64, points: Float32, max_size: float) -> Int64:
-    """The numbers (N,) but for objects longer than `max_size` metres, which are background."""
+    """The numbers (N,), with objects longer than `max_size` metres turned into background."""
     held = np.flatnonzero(number >= 0)
     if len(held) == 0:
         return number
@@ -390,7 +389,7 @@ def _look_up(
     objects: Float32,
     support: Float32,
 ) -> None:
-    """Give each point what the nearest output pixel around it shows, if one is near enough."""
+    """Give each point the label of the nearest output pixel around it, if one is near enough."""
     rows, columns, _ = seen.shape
     T, per_pixel = T_camera_cloud.astype(np.float32), np.float32(1.0 / pixel_size)
     left, top = np.float32(corner[0]) * per_pixel, np.float32(corner[1]) * per_pixel

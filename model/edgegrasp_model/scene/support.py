@@ -15,20 +15,20 @@ from edgegrasp_model.scene.cloud import MAX_DISTANCE, CanonicalFrame, CheckedClo
 from edgegrasp_model.scene.regions import inside_workspace
 from edgegrasp_model.scene.segment import Segmentation
 
-THICK, GROWTH = 0.004, 0.006  # metres from a plane, and per squared metre of distance
+THICK, GROWTH = 0.004, 0.006  # metres from a plane, plus this per squared metre of distance
 MOST_MARGIN = 0.02  # metres over it that belong to it at most; THICK do at least
 GIVEN_MARGIN = 0.005  # metres over a plane that is given
 DEVIATIONS = 4.0  # of its own points that still belong to it
-BOW = 0.025  # metres by which a support may rise over its plane
+BOW = 0.025  # metres by which a bowed support may rise over its plane
 TILT = math.radians(30)  # between the plane and a given `up`
 NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
-TRIES, SAMPLE = 150, 1200  # planes that are tried, points that judge them
+TRIES, SAMPLE = 150, 1200  # planes tried, and points that judge them
 REFINEMENTS = 4  # least squares over the plane's points
-STIFF = 1e-6 * np.eye(6)  # keeps a support flat where too little of it is seen
+STIFF = 1e-6 * np.eye(6)  # keeps a support flat if little of it is seen
 SUPPORT_STREAM = 2  # random stream of one request
 # Of depths that a known plane corrects:
 NEAR = 0.01  # metres from the plane within which points belong to it
@@ -38,11 +38,11 @@ MIN_SHARE = 0.1  # of the points that the plane must hold
 
 @dataclass(frozen=True)
 class Support:
-    """A support plane, and how well what is seen agrees with it; the cloud's frame."""
+    """A support plane and how well the points agree with it; cloud frame."""
 
     plane: SupportPlane
     frame: CanonicalFrame  # its z is the height over the plane
-    least: float  # metres over it that belong to it anyway
+    least: float  # metres above it that always belong to it
     residual: float = math.nan  # metres, median distance of its points; NaN where it is not seen
     share: float = 0.0  # of the points that lie in it
     growth: float = math.nan  # noise of its points, metres per squared metre of distance
@@ -55,7 +55,7 @@ class Support:
         return np.asarray(self.frame.T_canonical_cloud[2, :3])
 
     def heights(self, seen: "Seen") -> tuple[Float32, Float32]:
-        """How high points stand over the support, which may be bowed, and what belongs to it.
+        """Heights of points over the support, which may be bowed, and its margin.
 
         The noise of depth cameras grows with the square of the distance.
 
@@ -77,10 +77,10 @@ class Support:
 
 
 class Seen(NamedTuple):
-    """N points and from where they were seen."""
+    """N points and their viewpoint."""
 
     points: Float32  # (N, 3) metres
-    viewpoint: Float64 | None  # (3,) the camera, the mean of several; None: unknown
+    viewpoint: Float64 | None  # (3,) the camera, or the mean of several; None: unknown
 
     def distance(self) -> Float64:
         """Metres (N,) from the camera."""
@@ -148,21 +148,21 @@ def choose_support(
 def _fitted(
     seen: Seen, shown: Segmentation, objects: Bools, up: Float64 | None, rng: np.random.Generator
 ) -> Support | None:
-    """The plane of the points that the network calls a support, those near objects above all."""
+    """The plane of the points classified as support, weighted toward those near objects."""
     on, held = np.flatnonzero(shown.support > 0.5), np.flatnonzero(objects)
     part = Seen(seen.points[on[thinned(len(on))]], seen.viewpoint)
     around = seen.points[held[thinned(len(held), 500)]]
     weight, up = near_objects(part.points, around), shown.up if up is None else up
     plane = fit_plane(part, weight, rng, up)
     if plane is not None and len(held) and np.median(plane.heights(around)) < -MOST_MARGIN:
-        # The top of something larger: they stand on what lies below it.
+        # This plane is the top of something larger, and the objects stand below it.
         weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
         plane = fit_plane(part, weight, rng, up)
     return None if plane is None else measured(part, plane, THICK)
 
 
 def near_objects(points: Float32, objects: Float32) -> Float64:
-    """What each point (N, 3) of a support counts: in full near an object (M, 3), else a little."""
+    """Weight of each point (N, 3) of a support: full near an object (M, 3), small elsewhere."""
     if len(objects) == 0:
         return np.ones(len(points))
     apart, _ = cKDTree(objects).query(points, distance_upper_bound=NEAR_OBJECTS)
@@ -170,7 +170,7 @@ def near_objects(points: Float32, objects: Float32) -> Float64:
 
 
 def by_surface(points: Float32) -> Float64:
-    """What each point (N, 3) counts so that equal areas count alike."""
+    """Weight of each point (N, 3), so that equal areas count alike."""
     cell = np.floor(points / CELL).astype(np.int64)
     _, which, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     return np.asarray(1.0 / count[which.reshape(-1)])
@@ -234,14 +234,14 @@ def fit_plane(
 
 
 def _toward(seen: Seen, origin: Float64, up: Float64 | None) -> Float64:
-    """Directions (T, 3) to which normals point: the camera, else up, else +z."""
+    """Directions (T, 3) that normals should point toward: the camera, else up, else +z."""
     if seen.viewpoint is not None:
         return np.asarray(seen.viewpoint - origin)
     return np.broadcast_to(np.array([0.0, 0.0, 1.0]) if up is None else up, origin.shape)
 
 
 def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
-    """A plane, and how well the points agree with it where it is seen.
+    """The support of a plane, and how well the points agree with it where it is seen.
 
     Args:
         seen: N points.
@@ -254,7 +254,7 @@ def measured(seen: Seen, plane: SupportPlane, least: float) -> Support:
     x, y, height = frame.points(sample.points).T
     thick, distance = sample.thickness(), sample.distance()
     near = np.abs(height) < thick
-    # Where the cloud was cut off above the plane, only what stands on it is near.
+    # If the cloud was cut off above the plane, only objects on it are near.
     if near.sum() < FEWEST or (height[near] < 1e-4).mean() < 0.2:
         return Support(plane, frame, least)
     terms, bow = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y]), np.zeros(6)
@@ -291,13 +291,13 @@ def _heights(
 def correct_depth_scale(
     sent: CheckedCloud, plane: SupportPlane, viewpoints: Float64 | None, warnings: list[str]
 ) -> CheckedCloud:
-    """Scale every view about its camera so that the support plane it sees lies where it should.
+    """Scale every view about its camera so that its support lies in the given plane.
 
     Args:
         sent: N points, in which the plane is seen.
-        plane: Where the support is, and how wrong depths may be (max_depth_error).
+        plane: The support plane, and the greatest depth error (max_depth_error).
         viewpoints: (W, 3) the cameras, metres; the cloud's `view_ids` are their rows.
-        warnings: Gets what was done, or why nothing was.
+        warnings: Gets the correction made, or why none was.
 
     Raises:
         InvalidRequest: There is no viewpoint to scale about.
@@ -323,30 +323,30 @@ def correct_depth_scale(
 
 
 def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> float | None:
-    """The factor on all depths of a view that brings its points of the plane into the plane.
+    """The factor on a view's depths that moves its points of the support into the plane.
 
-    Where several factors fit (the table, or the flat top of an object), the smallest counts:
+    If several factors fit (the table, or the flat top of an object), the smallest one is taken, as
     nothing is seen below the table.
 
     Args:
         points: (N, 3) metres.
         viewpoint: (3,) metres.
-        plane: With the greatest depth error that is looked for.
+        plane: The plane and the greatest depth error.
 
     Returns:
-        The factor; None where the camera is not above the plane, or too high, or sees too little.
+        The factor; None if the camera is not above the plane, is too high, or sees too little.
     """
     height = float(plane.heights(viewpoint))
     falls = height - plane.heights(points.astype(np.float64))
     if not NEAR < height < MAX_DISTANCE:
         return None
-    # A point lies in the plane once it is as far below the camera as the plane is.
+    # A scaled point lies in the plane if it is as far below the camera as the plane.
     factors = np.sort(height / falls[falls > 0.5 * height])
     reach = NEAR / height
     tried = np.arange(1.0 - plane.max_depth_error, 1.0 + plane.max_depth_error, reach / 10)
     held = np.searchsorted(factors, tried + reach) - np.searchsorted(factors, tried - reach)
     enough = max(MIN_SHARE * len(points), FEWEST)
-    start, width = 0, 21  # tries from a plane's rise to past its peak
+    start, width = 0, 21  # number of factors from the rise of a peak to past it
     while start < len(tried):
         window = held[start : start + width]
         if window.max() >= enough:
@@ -359,7 +359,7 @@ def depth_scale(points: Floats, viewpoint: Float64, plane: SupportPlane) -> floa
 
 
 def _middle(factors: Float64, scale: float, reach: float) -> float | None:
-    """The median of the factors around one; None where they are too spread for a plane."""
+    """The median of the factors around one; None if they spread too much for a plane."""
     for _ in range(20):
         within = factors[np.abs(factors - scale) <= reach]
         scale = float(np.median(within))

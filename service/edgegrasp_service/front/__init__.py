@@ -1,1 +1,1 @@
-"""What accepts requests, over HTTP and gRPC, and hands them to the workers unread."""
+"""The front: accepts requests over HTTP and gRPC and passes them to the workers undecoded."""

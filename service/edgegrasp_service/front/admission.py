@@ -9,34 +9,34 @@ from contextlib import asynccontextmanager
 
 from edgegrasp_service.errors import DeadlineExceeded, Overloaded, ServiceError
 
-LATEST = 15  # service times whose median is the pace: one slow request does not change it
-MARGIN = 1.5  # the wait is estimated from a median; half of the requests take longer
+LATEST = 15  # latest service times, whose median is the pace; one slow request does not change it
+MARGIN = 1.5  # the wait is estimated from a median, and half of the requests take longer
 
 
 class Ticket:
-    """The place of one request in the server."""
+    """The slot of one request in the server."""
 
     def __init__(self, client: str) -> None:
         self.client = client
         self.whole = False  # whether its body has arrived
-        self.at_work = False  # whether a worker has begun it
+        self.at_work = False  # whether a worker has started it
         self.bytes = 0
         self.left = False
         self._reason: ServiceError | None = None
         self._timeout: asyncio.Timeout | None = None
 
     def refuse(self, reason: ServiceError) -> None:
-        """End the request with an error, at whatever stage it is."""
+        """End the request with an error, at any stage."""
         self._reason = reason
         if self._timeout is not None and not self._timeout.expired():
             self._timeout.reschedule(asyncio.get_running_loop().time())
 
 
 class Admission:
-    """Bounds the requests and the bytes in the server; used in the event loop only.
+    """Limits the requests and bytes in the server; used in the event loop only.
 
-    A single client may use all places and half of the bytes. When there is no room left, the
-    client that holds most loses a request to a client that would still hold less.
+    A single client may use all slots and half of the bytes. When the server is full, the client
+    that holds the most loses a request to a client that would still hold fewer.
 
     Args:
         workers: Requests worked on at a time.
@@ -91,7 +91,7 @@ class Admission:
             self._leave(ticket)
 
     def _make_room(self, client: str) -> None:
-        """Raise Overloaded unless there is a free place, or another client loses one."""
+        """Free a slot, if need be by refusing another client's request; raises Overloaded."""
         if len(self._tickets) < self._max_tickets:
             return
         counts = Counter(ticket.client for ticket in self._tickets)
@@ -100,7 +100,7 @@ class Admission:
             raise self._full(f"it holds {len(self._tickets)} requests")
 
     def _give_up(self, holder: str) -> bool:
-        """Refuse the client's latest request that no worker has; returns whether it has one."""
+        """Refuse the client's latest request that no worker has started; false: there is none."""
         for ticket in reversed(self._tickets):
             if ticket.client == holder and not ticket.at_work:
                 held = sum(one.client == holder for one in self._tickets)
@@ -111,7 +111,7 @@ class Admission:
         return False
 
     def resize(self, ticket: Ticket, size: int) -> None:
-        """Set how many bytes a request holds now."""
+        """Set the number of bytes that a request holds."""
         if not ticket.left:
             self.held_bytes += size - ticket.bytes
             self._client_bytes[ticket.client] += size - ticket.bytes
@@ -138,7 +138,7 @@ class Admission:
         self._took.append(seconds)
 
     def refuse_all(self, reason: ServiceError) -> None:
-        """End every request in the server with an error."""
+        """End every request with an error."""
         for ticket in self._tickets:
             ticket.refuse(reason)
 
@@ -150,7 +150,7 @@ class Admission:
     def _wait(self) -> float:
         """Estimated seconds until a worker begins a new request."""
         pace = statistics.median(self._took) if self._took else 0.0
-        ahead = sum(ticket.whole for ticket in self._tickets)  # bodies of others may arrive late
+        ahead = sum(ticket.whole for ticket in self._tickets)  # others' bodies may be late
         return max(0, ahead + 1 - self._workers) * pace / self._workers
 
     def _check_pace(self, deadline: float) -> None:
@@ -171,7 +171,7 @@ class Admission:
         return Overloaded(f"The server is busy: {why}. Try again in {seconds} s.", seconds)
 
     async def _reserve(self, ticket: Ticket, size: int) -> None:
-        """Wait until the bytes of all requests, and of this client, leave room for so many."""
+        """Wait until the limits of all clients and of this client leave room for so many bytes."""
         while (self.held_bytes and self.held_bytes + size > self._max_bytes) or (
             self._client_bytes[ticket.client]
             and self._client_bytes[ticket.client] + size > self._max_bytes // 2

@@ -1,4 +1,4 @@
-"""What both transports do with a request: check, admit, run, record and report it."""
+"""The core of both transports: check, admit, run, record and report a request."""
 
 import asyncio
 import contextlib
@@ -33,8 +33,8 @@ from edgegrasp_service.worker.pool import CRASH_FIX, CRASHED, WORKER_LOST, Worke
 logger = logging.getLogger(__name__)
 
 MAX_HEADERS = 64
-MOST_DEATHS = 3  # of workers after which a request is refused; a crash counts as 3
-HARMFUL_SECONDS = 600.0  # how long it is refused
+MOST_DEATHS = 3  # dead workers after which a request is refused; a crash counts as 3
+HARMFUL_SECONDS = 600.0  # seconds for which it is refused
 MOST_HARMFUL = 1000  # requests remembered
 
 Observer = Callable[[Call], None]
@@ -42,12 +42,12 @@ Recorder = Callable[[Job, Answer], None]
 
 
 class GraspService:
-    """The front process, apart from its transports.
+    """The front process without its transports.
 
     Attributes:
         tokens: Replaced on reload.
         stopping: When set, new requests are refused.
-        in_flight: Number of calls that have not ended.
+        in_flight: Number of calls in progress.
         record: Called with each job and its answer.
     """
 
@@ -70,7 +70,7 @@ class GraspService:
 
     @property
     def ready(self) -> bool:
-        """Whether requests are answered."""
+        """Whether requests can be answered."""
         return bool(self.pool.models) and self.pool.alive and not self.stopping.is_set()
 
     def loaded(self) -> WorkerPool:
@@ -97,7 +97,7 @@ class GraspService:
             call.end()
             loop = asyncio.get_running_loop()
             for observer in self._observers:
-                loop.call_soon(observer, call)  # once the answer is on its way
+                loop.call_soon(observer, call)  # once the answer is being sent
 
     def authorize(self, call: Call, authorization: str | None) -> None:
         """Check the token of a call; raises Unauthenticated or PermissionDenied."""
@@ -107,7 +107,7 @@ class GraspService:
 
     @asynccontextmanager
     async def admit(self, call: Call, size: int) -> AsyncIterator[Ticket]:
-        """Hold a place for a request until its answer is sent, at most until its deadline.
+        """Hold a slot for a request until its answer is sent or its deadline passes.
 
         Args:
             call: The request.
@@ -115,7 +115,7 @@ class GraspService:
 
         Raises:
             NotReady: Weights are not loaded yet, or the server is stopping.
-            Overloaded: There is no place, or its turn would come too late.
+            Overloaded: The server is full, or its turn would come too late.
             PayloadTooLarge: The body is over the limit.
             DeadlineExceeded: The deadline passed.
         """
@@ -128,12 +128,12 @@ class GraspService:
             call.end_stage("write")
 
     async def answer(self, call: Call, ticket: Ticket, job: Job) -> Answer:
-        """Have a worker answer an admitted request whose body has arrived.
+        """Let a worker answer an admitted request whose body has arrived.
 
         Raises:
             PayloadTooLarge: The body is over the limit.
-            HarmfulRequest: Workers died of this request.
-            WorkerLost: The worker died of something else.
+            HarmfulRequest: This request killed workers.
+            WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
         call.bytes_in = len(job.body)
@@ -176,7 +176,7 @@ class GraspService:
             gone = "The server stopped before there was an answer. Try another one."
             self.admission.refuse_all(NotReady(gone))
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(1.0):  # for the errors to be sent
+                async with asyncio.timeout(1.0):  # time for the errors to be sent
                     await self.admission.empty()
 
     def check_size(self, size: int) -> None:
@@ -188,7 +188,7 @@ class GraspService:
 
 
 class HarmfulRequests:
-    """Requests that ended workers: by digest, until when they count and how many workers died."""
+    """Requests that killed workers, by digest: their expiry and the number of dead workers."""
 
     def __init__(self) -> None:
         self._deaths: dict[bytes, tuple[float, int]] = {}
@@ -201,7 +201,7 @@ class HarmfulRequests:
                 raise HarmfulRequest("request", CRASHED, CRASH_FIX)
 
     async def note(self, job: Job, deaths: int) -> None:
-        """Count workers that died of a request; a crash counts more than a kill."""
+        """Count workers killed by a request; a crash counts more than a kill."""
         digest, now = await asyncio.to_thread(_digest, job), time.monotonic()
         until, before = self._deaths.pop(digest, (0.0, 0))
         self._deaths[digest] = now + HARMFUL_SECONDS, deaths + (before if now < until else 0)
@@ -209,13 +209,13 @@ class HarmfulRequests:
             del self._deaths[next(iter(self._deaths))]
 
     async def forget(self, job: Job) -> None:
-        """Clear a request that was answered: its worker had died of something else."""
+        """Clear a request that was answered, so its worker had died for another reason."""
         if self._deaths:
             self._deaths.pop(await asyncio.to_thread(_digest, job), None)
 
 
 def _digest(job: Job) -> bytes:
-    """Digest of what a worker sees of a request; run it in a thread, bodies may be large."""
+    """Digest of a request as a worker sees it; run it in a thread, as bodies may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
     digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
     digest.update(job.body)
@@ -223,7 +223,7 @@ def _digest(job: Job) -> bytes:
 
 
 class Reloader:
-    """Reloads weights, tokens and certificates; the old ones serve meanwhile."""
+    """Reloads weights, tokens and certificates; the old ones stay in use meanwhile."""
 
     def __init__(
         self, service: GraspService, tls: ServerTls | None, reloaded: Callable[[bool], None]
@@ -246,16 +246,17 @@ class Reloader:
             logger.warning("SIGHUP: %s", error)
 
     async def reload(self, call: Call | None = None) -> list[dict[str, Any]]:
-        """Load anew.
+        """Reload everything.
 
         Returns what is loaded now.
 
         Raises:
             PermissionDenied: The caller has no admin token.
             NotReady: The first weights are still loading, or the server is stopping.
-            ReloadFailed: Something cannot be used, and all is as before; or a reload is under way.
+            ReloadFailed: Something cannot be used, and nothing was changed; or a reload is under
+                way.
         """
-        if call is not None and not call.is_admin:  # however its path was spelled
+        if call is not None and not call.is_admin:  # however its path is spelled
             raise PermissionDenied(HEADER, "a call for administrators", ADMIN_FIX)
         service = self._service
         service.loaded()

@@ -1,1 +1,1 @@
-"""What runs in the worker processes: decode a request, detect, encode the answer."""
+"""The worker processes: decode a request, detect, encode the answer."""

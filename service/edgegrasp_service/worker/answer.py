@@ -1,7 +1,7 @@
-"""Answer requests: decode, detect, encode; one at a time, in a worker process.
+"""Answer requests in a worker process, one at a time: decode, detect, encode.
 
-Whatever is wrong with a request comes back as a Problem. Nothing here knows of event loops,
-connections or the servers of either transport.
+Every fault of a request is returned as a Problem. This module knows no event loops, connections or
+transports.
 """
 
 import time
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from edgegrasp_model.detector import ModelCatalogue
     from edgegrasp_robot import Robot
 
-# Memory to read a request in: numbers take some 12 times as much in Python as in JSON.
+# Memory for reading a request: numbers take about 12 times as much in Python as in JSON.
 DECODE_BYTES, DECODE_FACTOR = 512 * 2**20, 24
-TO_ENCODE = 0.1  # of the time that a request has, kept for its answer
+TO_ENCODE = 0.1  # share of a request's time that is kept for writing its answer
 
 
 def load_catalogue(settings: Settings) -> "ModelCatalogue":
@@ -45,7 +45,7 @@ def load_catalogue(settings: Settings) -> "ModelCatalogue":
     Raises:
         EdgeGraspError: Weights cannot be used, or the device is not there.
     """
-    # Torch takes seconds to import, and tests do without.
+    # Torch takes seconds to import, and some tests do without it.
     from edgegrasp_model.detector import ModelCatalogue, choose_device
 
     device = choose_device(settings.device)
@@ -61,22 +61,22 @@ def load_robots(settings: Settings) -> "Mapping[str, Robot]":
     """The robots that the settings name; loaded once, before the workers fork."""
     if not settings.robots:
         return {}
-    import edgegrasp_robot  # half a gigabyte, which few servers need
+    import edgegrasp_robot  # imports half a gigabyte, which few servers need
 
     return edgegrasp_robot.load_robots(settings.robots)
 
 
 def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
-    """Decode a job, detect, and encode the answer; nothing of it is kept for the next.
+    """Decode a job, detect, and encode the answer; nothing is kept for the next job.
 
-    A cloud that takes longer than its deadline allows, at the pace that the catalogue measured
-    when it was loaded, is refused before the work.
+    A cloud that would exceed its deadline, at the pace measured when the catalogue was loaded, is
+    refused before any work.
 
     Returns:
-        The answer; or, for a request that cannot be answered, an empty one with its Problem.
+        The answer, or an empty one with its Problem if the request cannot be answered.
 
     Raises:
-        MemoryError: There is not enough; the process is better replaced.
+        MemoryError: Out of memory; the process should be replaced.
     """
     work = _Work(job, catalogue, settings)
     try:
@@ -94,7 +94,7 @@ def answer(job: Job, catalogue: "ModelCatalogue", settings: Settings) -> Answer:
 
 
 class _Work:
-    """One job on its way to an answer."""
+    """One job while it is being answered."""
 
     def __init__(self, job: Job, catalogue: "ModelCatalogue", settings: Settings) -> None:
         self.facts = Facts()
@@ -106,7 +106,7 @@ class _Work:
         self._deadline = time.monotonic() + job.remaining
 
     def answer(self) -> bytes:
-        """The body of the answer; raises any error that there may be."""
+        """The body of the answer; may raise any error."""
         if self._job.method == "Beat":
             return b"{}"
         if self._job.method == "RecordOutcome":
@@ -121,7 +121,7 @@ class _Work:
 
     def _record_outcome(self) -> None:
         kind, path = self._job.content_type, self._settings.outcomes_file
-        if not kind.lower().startswith(http_bodies.JSON):  # which no foreign web page can send
+        if not kind.lower().startswith(http_bodies.JSON):  # foreign web pages cannot send it
             fix = f"Send {http_bodies.JSON}."
             raise UnsupportedMediaType("Content-Type", repr(kind[:40]), fix)
         assert path is not None
@@ -141,7 +141,7 @@ class _Work:
     def _grasps(
         self, detector: Any, cloud: CloudInput, options: DetectOptions
     ) -> tuple[Detection, Any]:
-        """The detection, and what it was prepared from."""
+        """The detection and its prepared request."""
         with self._stage("prepare"):
             most = self._within_deadline(self._settings.max_voxels, self._catalogue.pace.voxel)
             prepared = detector.prepare(cloud, options, most)
@@ -154,7 +154,7 @@ class _Work:
     def _picks(
         self, detector: Any, cloud: CloudInput, options: DetectOptions, name: str
     ) -> Detection:
-        """The detection, with how a robot's arm gets to the grasps."""
+        """The detection with the arm's plans for its grasps."""
         robots = load_robots(self._settings)
         if name not in robots:
             fix = f"Use one of: {', '.join(robots)}." if robots else "Set the setting `robots`."
@@ -176,7 +176,7 @@ class _Work:
         return scoring
 
     def _decode(self) -> tuple[Any, CloudInput, DetectOptions, dict[str, Array]]:
-        """What a request is about, within the limits: detector, cloud, options, given grasps."""
+        """Decode a request within the limits: detector, cloud, options, given grasps."""
         size, most = len(self._job.body), self._settings.max_points
         in_time = most
         try:
@@ -200,13 +200,13 @@ class _Work:
         return detector, cloud, options, given
 
     def _within_deadline(self, most: int, seconds: float) -> int:
-        """Of `most` points or voxels that take so long each, those that can be done in time."""
+        """The number of points or voxels, at most `most`, that can be processed in time."""
         remaining = max(self._deadline - time.monotonic(), 0.0)
         return int(min(most, remaining / seconds)) if seconds else most
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
-        """Time a stage; raises DeadlineExceeded instead of beginning it too late."""
+        """Time a stage; raises DeadlineExceeded instead of starting it too late."""
         start = time.monotonic()
         if start > self._deadline:
             raise DeadlineExceeded()
@@ -232,7 +232,7 @@ def _given(fields: Mapping[str, Any], max_points: int) -> dict[str, Array]:
 
 
 def _out_of_memory(error: Exception) -> bool:
-    """Whether an error says so; PyTorch has a RuntimeError of its own for each device."""
+    """Whether an error means out of memory; PyTorch raises its own RuntimeError for each device."""
     return (
         isinstance(error, MemoryError)
         or type(error).__name__ == "OutOfMemoryError"

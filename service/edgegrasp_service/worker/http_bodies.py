@@ -1,4 +1,4 @@
-"""HTTP bodies: take those of requests apart, and write those of answers.
+"""HTTP bodies: parse requests and write answers.
 
 A request is JSON, a point cloud file, or a form with parts; an answer is JSON.
 """
@@ -30,7 +30,7 @@ JSON, FORM = "application/json", "multipart/form-data"
 FILE_TYPES = {f"application/x-{name}": name for name in FILE_FORMATS}
 FIELDS = ("point_cloud2", "depth_images", *PER_POINT, "options")
 MAX_QUERY_FIELDS = 64
-MAX_CAMERA_TEXT = 1000  # bytes of a part like 615,615,320,240; a longer one is JSON
+MAX_CAMERA_TEXT = 1000  # most bytes of a part like 615,615,320,240; a longer one must be JSON
 MAX_SHORT_LISTS = 20_000  # in JSON; edges take 6 bytes each
 
 
@@ -38,11 +38,11 @@ def read_request(job: Job) -> dict[str, Any]:
     """The fields of a request.
 
     Returns:
-        Those that were sent, JSON or File, or `cloud`, a File; and `options`.
+        The fields that were sent, as JSON or File; `cloud` is a File; and `options`.
 
     Raises:
-        InvalidRequest: The body is not what its content type says, has unknown fields or parts, or
-            there are query parameters beside one that has its own options.
+        InvalidRequest: The body does not match its content type, has unknown fields or parts, or
+            comes with query parameters although it has options.
         UnsupportedMediaType: There is no reader for the content type.
     """
     media_type, named = parse_options_header(job.content_type)
@@ -78,12 +78,12 @@ def read_request(job: Job) -> dict[str, Any]:
 
 
 def write(result: Detection | Scoring) -> bytes:
-    """A result as DetectionBody or ScoringBody; its floats are float32 written out exactly."""
+    """A result as DetectionBody or ScoringBody; its floats are exact float32 values."""
     return orjson.dumps(result, default=_plain, option=orjson.OPT_PASSTHROUGH_DATACLASS)
 
 
 def _plain(value: Any) -> Any:
-    """What JSON has instead of it; orjson writes NaN as null."""
+    """The JSON form of a value that orjson does not know; orjson writes NaN as null."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     fields = vars(value)
@@ -103,14 +103,14 @@ def _refuse_unknown(fields: Iterable[str], known: tuple[str, ...], kind: str) ->
 
 
 def read_json(field: str, text: bytes) -> Any:
-    """What a text says, within the memory that a request of its size is worth.
+    """Parse JSON within the memory allowed for a request of its size.
 
     Raises:
-        InvalidRequest: It is no JSON, has a key twice, or would take far more memory than points
-            of its size do.
+        InvalidRequest: It is not JSON, has a key twice, or would take far more memory than points
+            of its size.
     """
     lists = text.count(b"[") + text.count(b"{")
-    # Most lists are points, of 8 bytes or more. An empty one takes 3 bytes, and 64 in memory.
+    # Most lists are points of 8 bytes or more; an empty list takes 3 bytes, but 64 in memory.
     if lists > len(text) // 7 + MAX_SHORT_LISTS:
         value = f"{lists} lists and objects in {len(text)} bytes"
         raise InvalidRequest(field, value, "Send lists that hold numbers.")
@@ -132,14 +132,14 @@ def _object(field: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
-    """Decode query parameters, or what the command line takes; one an option.
+    """Decode query parameters or command line values, one per option.
 
     A value is JSON (`seed=3`, `suppression=null`, `workspace={"min":[0,0,0],"max":[1,1,1]}`),
     numbers between commas (`viewpoint=0.1,0.2,0.3`), or else the text itself
     (`sampling=uniform`).
 
     Raises:
-        InvalidRequest: A parameter stands there twice.
+        InvalidRequest: A parameter occurs twice.
     """
     options: dict[str, Any] = {}
     for name, text in items:
@@ -150,10 +150,10 @@ def options_from_query(items: Iterable[tuple[str, str]]) -> dict[str, Any]:
 
 
 def value_of_text(name: str, text: str) -> object:
-    """One value as `options_from_query` reads it; of an option, or of a part of a form."""
+    """One value of an option or form part, as `options_from_query` reads it."""
     field = DetectOptions.model_fields.get(name)
     if field is not None and field.annotation is str:
-        return text  # weights may be named 7 or null
+        return text  # a model may be named 7 or null
     if name == "gripper" and not text.startswith(("{", "[")) and text != "null":
         return text  # as may grippers
     try:
@@ -172,7 +172,7 @@ def value_of_text(name: str, text: str) -> object:
 
 
 def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """Files as File, other parts as the JSON that they hold; one camera's as `depth_images`."""
+    """Files as File, other parts as their JSON; the parts of one camera as `depth_images`."""
     fields: dict[str, Any] = {}
     for name, file_format, data in _parts(body, boundary, len(known) + 1):
         _refuse_unknown([name], known, "part")
@@ -180,7 +180,7 @@ def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[
             raise InvalidRequest(name, "two parts", "Send one.")
         if name == "cloud" and file_format is None:
             raise InvalidRequest("cloud", "no file", "Send the cloud as a file part.")
-        # curl sends `-F options=@file;type=application/json` as a file too.
+        # curl sends `-F options=@file;type=application/json` as a file as well.
         if name == "cloud" or (file_format in ("npy", "png") and name != "options"):
             fields[name] = File(file_format or "", data)
         elif name in CAMERA and len(data) < MAX_CAMERA_TEXT:
@@ -194,9 +194,9 @@ def _fields_of_form(body: bytes, boundary: str, known: tuple[str, ...]) -> dict[
 
 
 def _parts(body: bytes, boundary: str, most: int) -> Iterator[tuple[str, str | None, bytes]]:
-    """Name, file format (None: no file) and data of the parts of a multipart body.
+    """Name, file format (None: not a file) and data of each part of a multipart body.
 
-    The format is what a part's content type names, or else its file name's ending.
+    The format comes from a part's content type, else from its file name.
     """
     parser = MultiPartParser(
         lambda **named: io.BytesIO(),  # type: ignore[arg-type]  # it is called so

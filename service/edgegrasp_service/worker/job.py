@@ -1,4 +1,4 @@
-"""What crosses between the front and its workers: plain values as JSON, and bodies as bytes."""
+"""Messages between the front and its workers: plain values as JSON, and bodies as bytes."""
 
 import json
 import struct
@@ -15,7 +15,7 @@ Transport = Literal["http", "grpc"]
 
 @dataclass(frozen=True)
 class Job:
-    """One request as it arrived; the front hands it on without looking into it."""
+    """One request as it arrived; the front passes it on undecoded."""
 
     method: Method
     transport: Transport
@@ -28,20 +28,20 @@ class Job:
 
 @dataclass
 class Facts:
-    """What logs and metrics tell of a request, as far as it came."""
+    """Facts about a request for logs and metrics, as far as it got."""
 
     model: str = ""  # name of the weights
     points: int = 0  # in the cloud as sent, holes included
-    grasps: int = 0  # returned, or evaluated where the caller gave them
+    grasps: int = 0  # returned, or evaluated if given by the caller
     seconds: dict[str, float] = field(default_factory=dict)  # of each stage, in order
     counts: dict[str, int] = field(default_factory=dict)  # what passed each stage
-    options: str = ""  # those that are not the defaults, as JSON, cut short
-    traceback: str = ""  # of a fault of the server's own
+    options: str = ""  # options that differ from the defaults, as shortened JSON
+    traceback: str = ""  # of an internal error
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What becomes of a job."""
+    """The result of a job."""
 
     body: bytes  # JSON, or the serialized response message; empty for an error
     facts: Facts
@@ -50,26 +50,26 @@ class Answer:
 
 @dataclass(frozen=True)
 class Ready:
-    """What the nursery and its workers say first."""
+    """The first message of the nursery and of each worker."""
 
     pid: int
-    models: list[dict[str, Any]]  # what a catalogue tells of its weights; of workers
-    failure: str = ""  # why there is none after all
-    robots: list[dict[str, Any]] = field(default_factory=list)  # what a robot tells of itself
+    models: list[dict[str, Any]]  # the catalogue's description of its weights; from workers
+    failure: str = ""  # why loading failed
+    robots: list[dict[str, Any]] = field(default_factory=list)  # the description of each robot
 
 
 MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}
 
 
 def pack(message: object) -> tuple[bytes, bytes]:
-    """One of MESSAGES as bytes: the lengths and its plain fields, and its body, not copied."""
+    """Serialize one of MESSAGES: lengths, plain fields as JSON, and the body without a copy."""
     text = json.dumps([type(message).__name__, message], default=_plain).encode()
     body: bytes = getattr(message, "body", b"")
     return HEADER.pack(len(text), len(body)) + text, body
 
 
 def unpack(text: bytes, body: bytes) -> Any:
-    """The message of its plain fields, as JSON, and its body."""
+    """Deserialize a message from its plain fields, as JSON, and its body."""
     name, fields = json.loads(text)
     if "body" in fields:
         fields["body"] = body

@@ -1,7 +1,7 @@
-"""Messages of gRPC: take requests apart, and write answers.
+"""gRPC messages: parse requests and write answers.
 
-What a request message holds becomes the fields in which the same request is written in JSON, so
-that one schema checks both.
+A request message is converted to the fields of the same request in JSON, so that one schema checks
+both.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from edgegrasp_model.request_cloud import PER_POINT, File
 from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_service.worker.job import Job
 
-MAX_PARTS = 64  # messages in a repeated field; no option takes more
+MAX_PARTS = 64  # most messages in a repeated field; no option takes more
 MAX_GIVEN = {"edges": MAX_CANDIDATES, "hand_poses": MAX_CANDIDATES}
 
 
@@ -31,8 +31,8 @@ def read_request(job: Job) -> dict[str, Any]:
         as arrays.
 
     Raises:
-        InvalidRequest: It is no such message, has a pose that is none, more parts than any request
-            needs, or a field that this server does not know.
+        InvalidRequest: It is not such a message, has an invalid pose, more parts than any request
+            needs, or an unknown field.
     """
     scores = job.method == "ScoreGrasps"
     kind = grasp_pb2.ScoreGraspsRequest if scores else grasp_pb2.DetectGraspsRequest
@@ -80,7 +80,7 @@ def write(result: Detection | Scoring) -> bytes:
 
 
 def _flat(value: Any) -> Any:
-    """Fields as messages have them: arrays flat, in row-major order."""
+    """Fields in the form of messages: arrays flat, in row-major order."""
     if isinstance(value, np.ndarray):
         return value.ravel().tolist()
     if isinstance(value, list):
@@ -94,7 +94,7 @@ def _flat(value: Any) -> Any:
 
 
 def _check(message: Message, name: str) -> None:
-    """Refuse fields of no schema, and lists that would take minutes and gigabytes as Python."""
+    """Refuse unknown fields, and lists that would take minutes and gigabytes in Python."""
     if len(unknown := UnknownFieldSet(message)):
         numbers = sorted({unknown[row].field_number for row in range(len(unknown))})[:5]
         fix = "Send the fields of edgegrasp.v1 only; is the server older than its client?"
@@ -142,7 +142,7 @@ def _matrix(numbers: Any, field: str) -> list[list[float]]:
 
 
 def _plain_fields(message: Message) -> dict[str, Any]:
-    """The fields of a message: those set, and lists even where they are empty."""
+    """The fields of a message that are set, and all lists, even empty ones."""
     return {
         field.name: _field(message, field)
         for field in message.DESCRIPTOR.fields
@@ -157,7 +157,7 @@ def _set_fields(message: Message) -> dict[str, Any]:
 def _field(message: Message, field: Any) -> Any:
     value = getattr(message, field.name)
     if field.type == field.TYPE_BOOL and field.is_repeated:
-        return np.array(value, dtype=bool)  # a mask: millions, packed
+        return np.array(value, dtype=bool)  # a mask: millions of values, packed
     if field.is_repeated:
         return list(value) if field.message_type is None else [_plain(part) for part in value]
     return _plain(value)
@@ -204,7 +204,7 @@ def _suppression(message: grasp_pb2.Suppression) -> dict[str, Any] | None:
     return None if fields.pop("disabled") else fields
 
 
-# What JSON writes in another way than field by field.
+# Messages that JSON does not write field by field.
 _FORMS: dict[type[Message], Callable[[Any], Any]] = {
     grasp_pb2.Place: _set_fields,
     grasp_pb2.Pixel: _coordinates,

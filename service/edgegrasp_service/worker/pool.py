@@ -1,4 +1,4 @@
-"""The worker processes as the front sees them: run jobs, replace dead processes, reload."""
+"""The pool of worker processes, as used by the front: run jobs, replace dead processes, reload."""
 
 import asyncio
 import contextlib
@@ -28,13 +28,13 @@ WORKER_LOST = kind_of(WorkerLost)
 CRASHES = {signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL}
 CRASHED = "one that ended the process that worked on it"
 CRASH_FIX = "Send another cloud or other options; this request is refused for 10 minutes."
-STATUS_SECONDS = 1.0  # to hear how a worker ended
-START_SECONDS = 20.0  # for a worker to fork, where it need not load
-BEAT_SECONDS = 3.0  # between two questions whether a worker is alive
-PULSE_SECONDS = 10.0  # for it to answer
-ALIVE_SECONDS = 15.0  # since the latest answer of any worker
-KILL_SECONDS = 0.5  # a worker whose answer nobody waits for may finish for so long
-RETRY_SECONDS = 1.0  # after a worker, or the nursery, failed to start
+STATUS_SECONDS = 1.0  # seconds to learn how a worker ended
+START_SECONDS = 20.0  # seconds for a worker to fork, if it need not load
+BEAT_SECONDS = 3.0  # seconds between two checks that a worker is alive
+PULSE_SECONDS = 10.0  # seconds for it to answer
+ALIVE_SECONDS = 15.0  # seconds since the latest answer of any worker
+KILL_SECONDS = 0.5  # seconds that a worker may use to finish an abandoned job
+RETRY_SECONDS = 1.0  # seconds after a worker or the nursery failed to start
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class WorkerPool:
 
     @property
     def alive(self) -> bool:
-        """Whether a worker has answered recently, or is busy, which its deadline ends."""
+        """Whether a worker answered recently, or is busy, which a deadline limits."""
         recent = time.monotonic() - self._answered < ALIVE_SECONDS
         return bool(self._workers) and (self.busy > 0 or recent)
 
@@ -82,7 +82,7 @@ class WorkerPool:
         return sum(worker.at_work for worker in self._workers)
 
     async def start(self) -> None:
-        """Load weights and start workers; workers of an earlier start end after their request.
+        """Load weights and start workers; workers of an earlier start finish their request and end.
 
         Raises:
             EdgeGraspError: Weights cannot be used.
@@ -110,11 +110,11 @@ class WorkerPool:
         else:
             old_nursery.close()
         for worker in old_workers:
-            if worker.answer is None:  # the others finish what they have begun
+            if worker.answer is None:  # the others finish their current job
                 worker.close()
 
     async def take(self) -> "_Worker":
-        """The next idle worker, to `run` a job; first come, first served."""
+        """The next idle worker for a job; first come, first served."""
         while True:
             worker = await self._idle.get()
             if worker in self._workers:  # and not dead
@@ -173,7 +173,7 @@ class WorkerPool:
         try:
             async with asyncio.timeout(START_SECONDS if self._settings.device == "cpu" else None):
                 await worker.start()
-        except TimeoutError:  # it is stopped, or hangs: its death is noted as any other
+        except TimeoutError:  # it is stopped or hangs; its death is handled like any other
             worker.close()
             nursery.kill()
             raise InvalidSettings("the process that workers fork from does not answer") from None
@@ -194,7 +194,7 @@ class WorkerPool:
                 await asyncio.sleep(RETRY_SECONDS)
 
     def _nursery_lost(self, nursery: "_Nursery") -> None:
-        """Load again; the workers go on meanwhile."""
+        """Load again; the workers continue meanwhile."""
         logger.error("the process that workers fork from died; weights are loaded again")
         self._spawn(self._until_done(nursery, self.start))
 
@@ -211,7 +211,7 @@ class _Nursery:
         self._process = process
         self.pid = process.pid
         self._control = control
-        # Of workers that have ended, by process: whether they did so by themselves.
+        # Whether each ended worker, by process id, ended by itself.
         self._crashed: defaultdict[int, asyncio.Future[bool]]
         self._crashed = defaultdict(asyncio.get_running_loop().create_future)
 
@@ -274,12 +274,12 @@ class _Nursery:
         return ours
 
     def kill(self) -> None:
-        """Kill it, even if it is stopped; `watch` notices."""
+        """Kill it, even if it is stopped; `watch` will notice."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Kill it; the workers that it forked go on."""
+        """Kill it; the workers that it forked continue."""
         with contextlib.suppress(RuntimeError, ValueError):
             asyncio.get_running_loop().remove_reader(self._control)
         self._process.kill()
@@ -326,8 +326,8 @@ class _Worker:
             deadline: On the event loop's clock; the process stops working after it.
 
         Raises:
-            HarmfulRequest: The process died of the job.
-            WorkerLost: It died of something else.
+            HarmfulRequest: The job killed the process.
+            WorkerLost: It died for another reason.
         """
         loop = asyncio.get_running_loop()
         answer = self.answer = loop.create_future()
@@ -340,12 +340,12 @@ class _Worker:
         try:
             return await asyncio.shield(answer)
         except asyncio.CancelledError:
-            if self.answer is answer:  # otherwise it is done, and may be on another job
+            if self.answer is answer:  # otherwise it has finished and may have another job
                 self._killing = loop.call_later(KILL_SECONDS, self.kill)
             raise
 
     def finish(self, answer: Answer | EdgeGraspError) -> None:
-        """Set the answer of its job, or the error instead, if it has a job."""
+        """Complete its job, if any, with the answer or an error."""
         self.at_work = False
         if self._killing is not None:
             self._killing.cancel()

@@ -1,11 +1,11 @@
-"""The processes that work: one that loads everything once, and those that fork from it.
+"""The nursery, which loads everything once, and the workers that fork from it.
 
 usage: python -m edgegrasp_service.worker.process SETTINGS    as JSON; standard input: the pool's
 socket
 
-`main` is the nursery's. It imports and loads what a worker needs, and then forks a worker whenever
-the pool asks for one: there in milliseconds, its memory shared with all others until it is written
-to. The nursery never has a second thread.
+`main` runs the nursery. It imports and loads what a worker needs, then forks a worker whenever the
+pool asks for one; that takes milliseconds, and memory is shared until written to. The nursery never
+has a second thread.
 """
 
 import contextlib
@@ -28,19 +28,19 @@ from edgegrasp_service.errors import WorkerLost, report
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.job import Answer, Facts, Ready, pack, receive
 
-ORPHAN_SECONDS = 10.0  # after its deadline a worker ends itself, should nobody be left to kill it
-ENDED = struct.Struct("=ii")  # what the nursery tells of a worker: its process and wait status
+ORPHAN_SECONDS = 10.0  # seconds after its deadline at which a worker ends itself if nobody kills it
+ENDED = struct.Struct("=ii")  # the nursery's message about a worker: process id and wait status
 LOST = "The worker of this request died or ran out of memory. Try again, or send fewer points."
 
 
 def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> None:
-    """Load, then fork a worker for each socket that comes on standard input, until its end.
+    """Load, then fork a worker for each socket received on standard input, until it closes.
 
-    `settings_json` is the settings; `load` makes the catalogue, in the place of `load_catalogue`.
+    `settings_json` holds the settings; `load` replaces `load_catalogue`.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the pool says when to end
-    # Here, for the front imports this module, and parses nothing.
+        signal.signal(number, signal.SIG_IGN)  # the pool decides when to end
+    # Imported here, since the front imports this module but must not load parsers.
     from edgegrasp_service.worker.answer import load_catalogue
 
     pool, settings = socket.socket(fileno=0), Settings(**json.loads(settings_json))
@@ -54,8 +54,8 @@ def main(settings_json: str, load: Callable[[Settings], Any] | None = None) -> N
     _send(pool, Ready(os.getpid(), []))
     signal.signal(signal.SIGCHLD, lambda *_: _tell_of_ended(pool))
     gc.collect()
-    gc.freeze()  # collecting would write to pages that are shared
-    gc.disable()  # it would look through millions of lists of points again and again
+    gc.freeze()  # collecting garbage would write to shared pages
+    gc.disable()  # it would scan millions of lists of points repeatedly
     while True:
         _, descriptors, _, _ = socket.recv_fds(pool, 1, 1)
         if not descriptors:
@@ -107,13 +107,13 @@ def _answer_jobs(pool: socket.socket, work: Callable[[Any], Answer]) -> None:
             return
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         _send(pool, answer)
-        del job, answer  # or the next request would add to them
+        del job, answer  # otherwise they would add to the next request's
         gc.collect()
 
 
 @contextlib.contextmanager
 def limited_memory(most: int) -> Iterator[None]:
-    """Let this process take so many bytes more than it has; an allocation beyond that fails."""
+    """Limit this process to so many more bytes; allocations beyond that fail."""
     before = resource.getrlimit(resource.RLIMIT_DATA)
     data_pages = int(Path("/proc/self/statm").read_text().split()[5])
     limit = data_pages * resource.getpagesize() + most
