@@ -65,8 +65,8 @@ from edgegrasp_model.tracking import (
 )
 
 NO_APPROACH_POINT = (
-    "the approach region holds no point of the processed cloud. Rows hold a voxel by "
-    "half of its points: around a single point, send a sphere."
+    "the approach region contains no point of the processed cloud. Rows contain a voxel if they "
+    "list at least half of its points; to select around a single point, send a sphere."
 )
 NO_CANDIDATE = "no candidate satisfies every constraint; see counts."
 MANY_HANDS = 30  # number of training grippers from which weights suit any gripper

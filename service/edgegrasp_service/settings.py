@@ -35,8 +35,8 @@ class Settings(BaseModel):
     )
     allowed_hosts: tuple[str, ...] = Field(
         (),
-        description="names in the header Host; * any; none: any with tokens, else addresses and "
-        "names without a dot",
+        description="names accepted in the Host header; *: any; empty: any if tokens are set, else "
+        "addresses and names without a dot",
     )
     http_port: Port = Field(8000, description="0: any free port")
     grpc_port: Port = Field(50051, description="0: any free port")
@@ -58,29 +58,37 @@ class Settings(BaseModel):
     )
     max_points: Count = Field(2_000_000, description="most points in a cloud, before downsampling")
     max_voxels: Count = Field(200_000, description="most points in a cloud, after downsampling")
-    workers: int = Field(0, ge=0, le=1024, description="processes that detect; 0: one a core")
+    workers: int = Field(0, ge=0, le=1024, description="worker processes; 0: one per core")
     max_worker_bytes: int = Field(
-        3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may take for its request"
+        3 * 1024 * MIB, ge=64 * MIB, description="memory that a worker may use for a request"
     )
     max_queue_length: int = Field(
-        32, ge=0, le=65536, description="most requests in the server beside those at work"
+        32, ge=0, le=65536, description="most requests waiting, beside those being processed"
     )
-    max_held_bytes: Size = Field(512 * MIB, description="most bytes of bodies held at a time")
+    max_held_bytes: Size = Field(
+        512 * MIB, description="most bytes of request bodies held in memory"
+    )
     max_streams: Count = Field(16, le=1024, description="most gRPC streams open at a time")
-    max_stream_requests: Count = Field(4, le=1024, description="most of one stream read ahead")
+    max_stream_requests: Count = Field(
+        4, le=1024, description="most unanswered requests read from a stream"
+    )
     max_connections: Count = Field(
         512, le=65536, description="most connections open at a time, of HTTP and of gRPC each"
     )
     max_request_seconds: float = Field(
-        120.0, gt=0.0, le=86400.0, description="longest a request may take, whatever its deadline"
+        120.0,
+        gt=0.0,
+        le=86400.0,
+        description="longest processing time of a request, whatever its deadline",
     )
     read_seconds: Timeout = Field(
-        10.0, description="time for a body to arrive, and more at min_bytes_per_second"
+        10.0, description="time for a body to arrive, plus its size at min_bytes_per_second"
     )
     write_seconds: Timeout = Field(
-        10.0, description="time for an answer to be taken, and more at min_bytes_per_second"
+        10.0,
+        description="time for a client to take an answer, plus its size at min_bytes_per_second",
     )
-    min_bytes_per_second: Count = Field(50_000, description="slowest that bodies and answers go")
+    min_bytes_per_second: Count = Field(50_000, description="least speed of bodies and answers")
     record_folder: Path | None = Field(None, description="folder to record requests and answers in")
     record_bytes: Size = Field(1024 * MIB, description="most recorded; the oldest are deleted")
     outcomes_file: Path | None = Field(
@@ -90,22 +98,24 @@ class Settings(BaseModel):
         32768, ge=4096, le=MIB, description="largest HTTP header or gRPC metadata accepted"
     )
     tls_certificate: Path | None = Field(
-        None, description="PEM file: the server's certificate and those between it and a CA"
+        None, description="PEM file: the server's certificate chain"
     )
     tls_key: Path | None = Field(None, description="PEM file: key of the certificate")
     tls_client_ca: Path | None = Field(
         None, description="PEM file: CAs of clients, which must then show a certificate"
     )
     token_file: Path | None = Field(
-        None, description="bearer tokens, one a line, which requests must carry; none: no need"
+        None,
+        description="bearer tokens, one per line; requests must carry one; none: no need",
     )
     admin_token_file: Path | None = Field(
-        None, description="tokens that may reload weights too, one a line; none: SIGHUP only"
+        None,
+        description="tokens that also permit reloading weights, one per line; none: SIGHUP only",
     )
-    grace_seconds: Wait = Field(10.0, description="for requests in flight when stopping, seconds")
-    playground: bool = Field(True, description="whether / is the playground; else it is /docs")
+    grace_seconds: Wait = Field(10.0, description="seconds for requests in progress when stopping")
+    playground: bool = Field(True, description="whether / shows the playground instead of /docs")
     samples: Path | None = Field(
-        None, description="folder of scenes the playground offers, open to all; samples.json in it"
+        None, description="folder with samples.json: scenes offered by the playground, public"
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         "info", description="least severe records logged"
