@@ -24,6 +24,7 @@ TILT = math.radians(30)  # between the plane and a given `up`
 NEAR_OBJECTS, FAR_WEIGHT = 0.15, 0.1  # metres around an object; what points count elsewhere
 FEWEST = 60  # points that a plane is fitted to, and by which its residual is measured
 CELL = 0.02  # metres, in which surfaces are counted
+LEAST_AREA = 0.008  # square metres of a support that are seen; the top of an object is smaller
 USUAL_DISTANCE = 0.7  # metres to a camera that is not known
 BELOW_WORKSPACE = 0.05  # metres, at most, from a given support up to the workspace over it
 TRIES, SAMPLE = 150, 1200  # planes tried, and points that judge them
@@ -158,7 +159,12 @@ def _fitted(
         # This plane is the top of something larger, and the objects stand below it.
         weight[plane.heights(part.points) > -MOST_MARGIN] = 0.0
         plane = fit_plane(part, weight, rng, up)
-    return None if plane is None else measured(part, plane, THICK)
+    if plane is None:
+        return None
+    found = measured(part, plane, THICK)
+    places = found.frame.points(part.points)
+    cells = np.floor(places[np.abs(places[:, 2]) < MOST_MARGIN, :2] / CELL)
+    return found if len(np.unique(cells, axis=0)) * CELL**2 > LEAST_AREA else None
 
 
 def near_objects(points: Float32, objects: Float32) -> Float64:
