@@ -187,7 +187,9 @@ def merged(
     first, became = previous.grasps[0].id, Following.LOST
     held = next((row for row in order if grasps[row].id == first), None)
     if held is not None and _worth(grasps[held]) >= ALIVE:
-        better = _worth(grasps[order[0]]) > _worth(grasps[held]) + MARGIN
+        # Without a search the others are the earlier answer's own, whose scores vary with noise.
+        best = _worth(grasps[order[0]])
+        better = previous.search and best > _worth(grasps[held]) + MARGIN
         became = Following.REPLACED if better else Following.KEPT
         order = order if better else [held, *(row for row in order if row != held)]
     return [grasps[row] for row in order], replace(tracking, first=became)
