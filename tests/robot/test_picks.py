@@ -10,19 +10,9 @@ from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import parse_options
-from edgegrasp_robot import load_robot, plan_picks
+from edgegrasp_robot import plan_picks
 
 CLOSE, CLOSE_ANGLE = 1e-3, np.deg2rad(0.2)  # metres, radians
-
-
-@pytest.fixture(scope="module", params=["fr3", "ur5"])
-def robot(request):
-    return load_robot(request.param)
-
-
-@pytest.fixture(scope="module")
-def fr3():
-    return load_robot("fr3")
 
 
 def assert_pose(found, wanted):

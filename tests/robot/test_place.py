@@ -7,19 +7,8 @@ from tests.robot.arms import BOXES, HALF, TURNED, picks_of, surface
 from tests.robot.test_picks import assert_motion, assert_pose, plans_of
 
 from edgegrasp_model.errors import InvalidRequest
-from edgegrasp_robot import load_robot
 
 TRAY = {"min": [0.3, -0.5, 0.0], "max": [0.6, -0.3, 0.3]}
-
-
-@pytest.fixture(scope="module", params=["fr3", "ur5"])
-def robot(request):
-    return load_robot(request.param)
-
-
-@pytest.fixture(scope="module")
-def fr3():
-    return load_robot("fr3")
 
 
 def placed(grasp, plan):
