@@ -22,7 +22,7 @@ INTRINSICS = (540.0, 540.0, 320.0, 239.0)  # fx, fy, cx, cy of the rendered imag
 
 
 def write_images(folder: Path, sensor: str, seed: int) -> None:
-    """Write depth.png and color.png of a table with things on it."""
+    """Write depth.png and color.png of a table with objects on it."""
     scene, noise = (np.random.default_rng([seed, stream]) for stream in range(2))
     T_world_camera = look_at(np.array([0.15, -0.30, 0.52]), np.array([0.15, 0.14, 0.06]))
     with ClutterSimulation() as simulation:

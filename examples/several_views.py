@@ -1,4 +1,4 @@
-"""One request of three views finds at least what the best of them does: one sees behind things.
+"""One request of three views finds at least what the best view does, which sees less of objects.
 
 usage: python examples/several_views.py [ADDRESS] [SCENES]
 

@@ -12,7 +12,7 @@ from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.trial import PlannedGrasp
 
 REACH = 0.09  # metres from the hand frame to the point that is grasped
-AROUND = 0.02  # metres from the highest point; what lies so near says where its thing is longest
+AROUND = 0.02  # metres from the highest point; points this near show where its object is longest
 
 
 def plan(observation: Observation, seed: int) -> PlannedGrasp | None:

@@ -755,7 +755,7 @@ class DetectOptions(Strict):
 
     @property
     def known_up(self) -> NDArray[np.float64] | None:
-        """(3,) unit, away from gravity; None where neither it nor the support is told."""
+        """(3,) unit, away from gravity; None if neither it nor the support is given."""
         plane = self.support.normal if isinstance(self.support, SupportPlane) else None
         known = plane if self.up is None else self.up
         return None if known is None else np.asarray(known) / np.linalg.norm(known)

@@ -84,15 +84,15 @@ def _lowest(scene: Scene, points: Float64) -> float:
 
 
 def load_of(
-    held: Held, thing: DetectedObject | None, scene: Scene, T_base_cloud: Float64
+    held: Held, seen: DetectedObject | None, scene: Scene, T_base_cloud: Float64
 ) -> Load | None:
     """The upright box of what is held: that of its object, else of its points; None: no points."""
     if not len(held.points):
         return None
     T_cloud_box = np.eye(4)
-    if thing is not None:
-        T_cloud_box[:3, :3] = Rotation.from_quat(thing.quaternion).as_matrix()
-        T_cloud_box[:3, 3], half = thing.center, thing.half_extents.astype(np.float64)
+    if seen is not None:
+        T_cloud_box[:3, :3] = Rotation.from_quat(seen.quaternion).as_matrix()
+        T_cloud_box[:3, 3], half = seen.center, seen.half_extents.astype(np.float64)
     else:
         upright = scene.frame.points(held.points)
         low, high = upright.min(axis=0), upright.max(axis=0)

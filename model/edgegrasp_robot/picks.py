@@ -267,8 +267,8 @@ class _Arm:
         assert pick.plan is not None
         assert pick.line is not None
         held = held_by(pick.grasp, self._scene, self._robot.gripper)
-        thing = None if pick.grasp.object is None else self._objects.get(pick.grasp.object)
-        load = load_of(held, thing, self._scene, self._T_base_cloud)
+        seen = None if pick.grasp.object is None else self._objects.get(pick.grasp.object)
+        load = load_of(held, seen, self._scene, self._T_base_cloud)
         back = self._retreat(pick.grasp, pick.line, held)
         if load is not None and back is not None:
             around = self._around.without(load)

@@ -1,6 +1,6 @@
 """Health check for containers: is the server of these settings ready?
 
-usage: python -m edgegrasp_service.probe exits with 0 if it is
+`python -m edgegrasp_service.probe` exits with 0 if it is.
 """
 
 import contextlib
