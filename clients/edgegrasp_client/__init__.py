@@ -55,6 +55,7 @@ from edgegrasp_client.results import Evaluation as Evaluation
 from edgegrasp_client.results import Grasp as Grasp
 from edgegrasp_client.results import GripperOutline as GripperOutline
 from edgegrasp_client.results import Model as Model
+from edgegrasp_client.results import Robot as Robot
 from edgegrasp_client.results import Scoring as Scoring
 from edgegrasp_client.results import StreamAnswer as StreamAnswer
 from edgegrasp_client.results import Tracking as Tracking

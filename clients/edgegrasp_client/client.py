@@ -34,7 +34,7 @@ from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, DepthImage, Request, StreamRequest
-from edgegrasp_client.results import Detection, Grasp, Model, Scoring, StreamAnswer
+from edgegrasp_client.results import Detection, Grasp, Model, Robot, Scoring, StreamAnswer
 
 POLL_SECONDS = 0.1
 
@@ -176,6 +176,14 @@ class AsyncGraspClient:
         """
         return (await self._retried(self._transport.models, timeout)).models
 
+    async def robots(self, *, timeout: float | None = None) -> list[Robot]:
+        """The robots that `robot` can name.
+
+        Raises:
+            GraspClientError: As in edgegrasp_client.errors.
+        """
+        return (await self._retried(self._transport.robots, timeout)).robots
+
     async def record_outcome(
         self, detection: Detection, grasp: Grasp, held: bool, *, timeout: float | None = None
     ) -> None:
@@ -306,6 +314,7 @@ class GraspClient:
     detect = _waiting(AsyncGraspClient.detect)
     score = _waiting(AsyncGraspClient.score)
     models = _waiting(AsyncGraspClient.models)
+    robots = _waiting(AsyncGraspClient.robots)
     record_outcome = _waiting(AsyncGraspClient.record_outcome)
     ready = _waiting(AsyncGraspClient.ready)
     wait_until_ready = _waiting(AsyncGraspClient.wait_until_ready)

@@ -30,7 +30,7 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Detection, Models, StreamAnswer, read_as
+from edgegrasp_client.results import Detection, Models, Robots, StreamAnswer, read_as
 
 Answer = TypeVar("Answer")
 
@@ -92,6 +92,11 @@ class GrpcTransport:
         """The weights that the server has loaded."""
         answer = await self._call(self._stub.ListModels, grasp_pb2.ListModelsRequest(), timeout)
         return read_as(Models, answer, read_field)
+
+    async def robots(self, timeout: float) -> Robots:
+        """The robots that the server plans for."""
+        answer = await self._call(self._stub.ListRobots, grasp_pb2.ListRobotsRequest(), timeout)
+        return read_as(Robots, answer, read_field)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Refused: gRPC has no such call."""

@@ -30,7 +30,7 @@ from edgegrasp_client.requests import (
     npy_bytes,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Detection, Models, StreamAnswer, read_as
+from edgegrasp_client.results import Detection, Models, Robots, StreamAnswer, read_as
 
 MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
 KIND_PREFIX = "urn:edgegrasp:error:"
@@ -67,6 +67,10 @@ class RestTransport:
     async def models(self, timeout: float) -> Models:
         """The weights that the server has loaded."""
         return await self._call(Models, {"method": "GET", "url": "/v1/models"}, timeout)
+
+    async def robots(self, timeout: float) -> Robots:
+        """The robots that the server plans for."""
+        return await self._call(Robots, {"method": "GET", "url": "/v1/robots"}, timeout)
 
     async def record_outcome(self, tried: dict[str, Any], timeout: float) -> None:
         """Tell the server what became of a grasp."""

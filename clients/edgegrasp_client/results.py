@@ -208,6 +208,33 @@ class Models:
 
 
 @dataclass(frozen=True, eq=False)
+class Robot:
+    """An arm with a gripper on it. J joints; radians and seconds, metres of sliding joints."""
+
+    name: str
+    gripper: str  # which grasps are for
+    base_frame: str  # link that `T_base_cloud` refers to
+    joint_names: list[str]  # J
+    home: Float64  # (J,) where it touches nothing of itself
+    lower: Float64  # (J,) limits
+    upper: Float64
+    max_velocity: Float64
+    max_acceleration: Float64
+    # (J + 1, 4, 4) the frame of each joint at 0 in that of the joint before, the first in the base
+    # frame; the last is the hand's in the last joint's
+    frames: Annotated[Float64, (-1, 4, 4)]
+    axes: Annotated[Float64, (-1, 3)]  # (J, 3) that it turns about or slides along, own frame
+    sliding: list[bool]  # J
+
+
+@dataclass(frozen=True, eq=False)
+class Robots:
+    """All robots that a server plans for."""
+
+    robots: list[Robot]
+
+
+@dataclass(frozen=True, eq=False)
 class StreamAnswer:
     """The answer to one request of a stream: a detection or an error."""
 

@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -85,6 +86,7 @@ class Robot:
     upper: Float64  # (J,)
     max_velocity: Float64  # (J,)
     max_acceleration: Float64  # (J,)
+    kinematics: dict[str, list[Any]]  # the same as numbers: as `edgegrasp.v1.Robot` has it
     model: "Model"
     scene: core.Scene  # for the free motion
     straight: core.Scene  # for straight ways, on which the hand may touch what it grasps
@@ -117,6 +119,7 @@ class Robot:
             "upper": self.upper.tolist(),
             "max_velocity": self.max_velocity.tolist(),
             "max_acceleration": self.max_acceleration.tolist(),
+            **self.kinematics,
         }
 
 
@@ -226,13 +229,37 @@ def _load(path: Path, file: RobotFile) -> Robot:
         path.stem, gripper,
         hand, file.base_frame, file.flange_frame, T_flange_hand, joint_names, home,
         lower, upper, scenes[0].getVelocityLimitVectors(GROUP)[1],
-        scenes[0].getAccelerationLimitVectors(GROUP)[1], model, *scenes,
+        scenes[0].getAccelerationLimitVectors(GROUP)[1],
+        _kinematics(root, scenes[0], joint_names, file), model, *scenes,
     )  # fmt: skip
     if scenes[0].hasCollisions(home):
         pair = touching(scenes[0], model, home)
         fix = "Name other joints, or the pair in the SRDF's disable_collisions"
         raise InvalidRobot(f"{path.name}: home: {pair} touch there. {fix}.")
     return robot
+
+
+def _kinematics(
+    root: Element, scene: core.Scene, joint_names: Sequence[str], file: RobotFile
+) -> dict[str, list[Any]]:
+    """Frames between joints, joint axes and which joints slide."""
+    by_name = {str(joint.get("name")): joint for joint in root.findall("joint")}
+    joints = [by_name[name] for name in joint_names]
+    zero = np.zeros(len(joints))
+    links = [str(joint.find("child").get("link")) for joint in joints]  # type: ignore[union-attr]
+    poses = [scene.forwardKinematics(zero, link, file.base_frame) for link in links]
+    hand = scene.forwardKinematics(zero, file.flange_frame, file.base_frame)
+    poses = [np.eye(4), *poses, hand @ file.T_flange_hand.matrix]
+    frames = [np.linalg.inv(before) @ pose for before, pose in pairwise(poses)]
+    found = [joint.find("axis") for joint in joints]
+    axes = np.array([(1, 0, 0) if one is None else one.get("xyz", "").split() for one in found])
+    axes = axes.astype(np.float64)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return {
+        "frames": np.ravel(frames).tolist(),
+        "axes": np.ravel(axes).tolist(),
+        "sliding": [joint.get("type") == "prismatic" for joint in joints],
+    }
 
 
 def touching(scene: core.Scene, model: Model, joints: Float64, around: Sequence[str] = ()) -> str:

@@ -5,15 +5,16 @@ import operator
 from pathlib import Path
 from types import SimpleNamespace
 
-import httpx
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.robot.arms import BOXES, TURNED, scene_of
 
 from edgegrasp.v1 import grasp_pb2
+from edgegrasp_client import GraspClient
 from edgegrasp_client.over_grpc import message_of, read_field
 from edgegrasp_client.requests import Request
 from edgegrasp_client.results import Detection, read_as
@@ -131,6 +132,16 @@ def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
 
 
 def test_a_server_lists_its_robots(start_dummy, robot):
+    joints = np.random.default_rng(0).uniform(robot.lower, robot.upper)
     with start_dummy("--robots", "fr3") as server:
-        listed = httpx.get(f"{server.http_url}/v1/robots").json()
-    assert listed == {"robots": [robot.describe()]}
+        for transport in ("grpc", "http"):
+            with GraspClient(server.address(transport)) as client:
+                (listed,) = client.robots()
+            for field, value in robot.describe().items():
+                np.testing.assert_array_equal(np.ravel(getattr(listed, field)), np.ravel(value))
+            T_base_hand = listed.frames[0]
+            for axis, turn, frame in zip(listed.axes, joints, listed.frames[1:], strict=True):
+                about = np.eye(4)
+                about[:3, :3] = Rotation.from_rotvec(turn * axis).as_matrix()
+                T_base_hand = T_base_hand @ about @ frame
+            np.testing.assert_allclose(T_base_hand, robot.hand_pose(joints), atol=1e-6)

@@ -2663,6 +2663,121 @@ class ListModelsResponse(_message.Message):
 Global___ListModelsResponse: _TypeAlias = ListModelsResponse  # noqa: Y015
 
 @_typing.final
+class ListRobotsRequest(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ListRobotsRequest: _TypeAlias = ListRobotsRequest  # noqa: Y015
+
+@_typing.final
+class ListRobotsResponse(_message.Message):
+    DESCRIPTOR: _descriptor.Descriptor
+
+    ROBOTS_FIELD_NUMBER: _builtins.int
+    @_builtins.property
+    def robots(self) -> _containers.RepeatedCompositeFieldContainer[Global___Robot]: ...
+    def __init__(
+        self,
+        *,
+        robots: _abc.Iterable[Global___Robot] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["robots", b"robots"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___ListRobotsResponse: _TypeAlias = ListRobotsResponse  # noqa: Y015
+
+@_typing.final
+class Robot(_message.Message):
+    """An arm with a gripper on it. J joints; radians and seconds, metres of sliding joints."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    NAME_FIELD_NUMBER: _builtins.int
+    GRIPPER_FIELD_NUMBER: _builtins.int
+    BASE_FRAME_FIELD_NUMBER: _builtins.int
+    JOINT_NAMES_FIELD_NUMBER: _builtins.int
+    HOME_FIELD_NUMBER: _builtins.int
+    LOWER_FIELD_NUMBER: _builtins.int
+    UPPER_FIELD_NUMBER: _builtins.int
+    MAX_VELOCITY_FIELD_NUMBER: _builtins.int
+    MAX_ACCELERATION_FIELD_NUMBER: _builtins.int
+    FRAMES_FIELD_NUMBER: _builtins.int
+    AXES_FIELD_NUMBER: _builtins.int
+    SLIDING_FIELD_NUMBER: _builtins.int
+    name: _builtins.str
+    """What options.robot.name takes."""
+    gripper: _builtins.str
+    """The gripper on it, which grasps are for."""
+    base_frame: _builtins.str
+    """Link that T_base_cloud refers to."""
+    @_builtins.property
+    def joint_names(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
+        """J, in the order of options.robot.joints."""
+
+    @_builtins.property
+    def home(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J, joints at which it touches nothing of itself."""
+
+    @_builtins.property
+    def lower(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J, limits of the joints."""
+
+    @_builtins.property
+    def upper(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def max_velocity(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def max_acceleration(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]: ...
+    @_builtins.property
+    def frames(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """(J + 1) * 16: the frame of each joint at position 0 in that of the joint before, the first in
+        the base frame, the last is the hand's in the last joint's; 4 x 4 row-major matrices.
+        """
+
+    @_builtins.property
+    def axes(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """J * 3: what each joint turns about, or slides along, in its own frame; unit."""
+
+    @_builtins.property
+    def sliding(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bool]:
+        """J: whether it slides."""
+
+    def __init__(
+        self,
+        *,
+        name: _builtins.str = ...,
+        gripper: _builtins.str = ...,
+        base_frame: _builtins.str = ...,
+        joint_names: _abc.Iterable[_builtins.str] | None = ...,
+        home: _abc.Iterable[_builtins.float] | None = ...,
+        lower: _abc.Iterable[_builtins.float] | None = ...,
+        upper: _abc.Iterable[_builtins.float] | None = ...,
+        max_velocity: _abc.Iterable[_builtins.float] | None = ...,
+        max_acceleration: _abc.Iterable[_builtins.float] | None = ...,
+        frames: _abc.Iterable[_builtins.float] | None = ...,
+        axes: _abc.Iterable[_builtins.float] | None = ...,
+        sliding: _abc.Iterable[_builtins.bool] | None = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["axes", b"axes", "base_frame", b"base_frame", "frames", b"frames", "gripper", b"gripper", "home", b"home", "joint_names", b"joint_names", "lower", b"lower", "max_acceleration", b"max_acceleration", "max_velocity", b"max_velocity", "name", b"name", "sliding", b"sliding", "upper", b"upper"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___Robot: _TypeAlias = Robot  # noqa: Y015
+
+@_typing.final
 class ReloadModelsRequest(_message.Message):
     DESCRIPTOR: _descriptor.Descriptor
 

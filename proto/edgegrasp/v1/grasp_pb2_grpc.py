@@ -54,6 +54,11 @@ class GraspServiceStub:
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.SerializeToString,
                 response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.FromString,
                 _registered_method=True)
+        self.ListRobots = channel.unary_unary(
+                '/edgegrasp.v1.GraspService/ListRobots',
+                request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsRequest.SerializeToString,
+                response_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsResponse.FromString,
+                _registered_method=True)
         self.ReloadModels = channel.unary_unary(
                 '/edgegrasp.v1.GraspService/ReloadModels',
                 request_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ReloadModelsRequest.SerializeToString,
@@ -100,6 +105,13 @@ class GraspServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ListRobots(self, request, context):
+        """Lists the robots that options.robot can name.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def ReloadModels(self, request, context):
         """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
         answer until the new ones are warm, and all that came before. Needs an admin token.
@@ -134,6 +146,11 @@ def add_GraspServiceServicer_to_server(servicer, server):
                     servicer.ListModels,
                     request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.FromString,
                     response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.SerializeToString,
+            ),
+            'ListRobots': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListRobots,
+                    request_deserializer=edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsRequest.FromString,
+                    response_serializer=edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsResponse.SerializeToString,
             ),
             'ReloadModels': grpc.unary_unary_rpc_method_handler(
                     servicer.ReloadModels,
@@ -249,6 +266,33 @@ class GraspService:
             '/edgegrasp.v1.GraspService/ListModels',
             edgegrasp_dot_v1_dot_grasp__pb2.ListModelsRequest.SerializeToString,
             edgegrasp_dot_v1_dot_grasp__pb2.ListModelsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListRobots(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/edgegrasp.v1.GraspService/ListRobots',
+            edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsRequest.SerializeToString,
+            edgegrasp_dot_v1_dot_grasp__pb2.ListRobotsResponse.FromString,
             options,
             channel_credentials,
             insecure,

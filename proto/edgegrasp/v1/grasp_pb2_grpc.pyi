@@ -56,6 +56,8 @@ class GraspServiceStub:
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]
     """Lists the weights that options.model can name."""
+    ListRobots: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ListRobotsRequest, _grasp_pb2.ListRobotsResponse]
+    """Lists the robots that options.robot can name."""
     ReloadModels: _grpc.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]
     """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
     answer until the new ones are warm, and all that came before. Needs an admin token.
@@ -86,6 +88,8 @@ class GraspServiceAsyncStub(GraspServiceStub):
     """Scores edges or hand poses that the caller gives, in their order; errors as DetectGrasps."""
     ListModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListModelsRequest, _grasp_pb2.ListModelsResponse]  # type: ignore[assignment]
     """Lists the weights that options.model can name."""
+    ListRobots: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ListRobotsRequest, _grasp_pb2.ListRobotsResponse]  # type: ignore[assignment]
+    """Lists the robots that options.robot can name."""
     ReloadModels: _aio.UnaryUnaryMultiCallable[_grasp_pb2.ReloadModelsRequest, _grasp_pb2.ReloadModelsResponse]  # type: ignore[assignment]
     """Loads weights anew, from where the server had them, and reads its tokens anew. The old weights
     answer until the new ones are warm, and all that came before. Needs an admin token.
@@ -137,6 +141,14 @@ class GraspServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_grasp_pb2.ListModelsResponse, _abc.Awaitable[_grasp_pb2.ListModelsResponse]]:
         """Lists the weights that options.model can name."""
+
+    @_abc_1.abstractmethod
+    def ListRobots(
+        self,
+        request: _grasp_pb2.ListRobotsRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_grasp_pb2.ListRobotsResponse, _abc.Awaitable[_grasp_pb2.ListRobotsResponse]]:
+        """Lists the robots that options.robot can name."""
 
     @_abc_1.abstractmethod
     def ReloadModels(

@@ -142,6 +142,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             "ScoreGrasps": partial(self._answer, "ScoreGrasps"),
             "DetectGraspsStream": self._stream,
             "ListModels": self._list_models,
+            "ListRobots": self._list_robots,
             "ReloadModels": self._reload_models,
         }
         # By path: what a method is called in metrics and the log, and what it does.
@@ -252,6 +253,10 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
     async def _list_models(self, context: Any) -> None:
         models = [grasp_pb2.Model(**facts) for facts in self._service.loaded().models]
         await context.write(grasp_pb2.ListModelsResponse(models=models))
+
+    async def _list_robots(self, context: Any) -> None:
+        robots = [grasp_pb2.Robot(**facts) for facts in self._service.loaded().robots]
+        await context.write(grasp_pb2.ListRobotsResponse(robots=robots))
 
     async def _reload_models(self, context: Any) -> None:
         call = current_call()
