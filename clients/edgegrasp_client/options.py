@@ -191,6 +191,7 @@ class RobotArm(TypedDict):
     joints: Sequence[float]
     plan: NotRequired[Literal["reach", "motion"]]
     place: NotRequired[Place | None]
+    avoid_unseen: NotRequired[bool]
 
 
 class Suppression(TypedDict, total=False):

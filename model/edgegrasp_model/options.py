@@ -530,6 +530,10 @@ class RobotArm(Strict):
         description="where to put the object: a grasp is within reach only if that is too; null: "
         "the motion ends with the object lifted",
     )
+    avoid_unseen: StrictBool = Field(
+        default=False,
+        description="whether the arm keeps out of what no camera saw, behind what was seen",
+    )
 
 
 class PreviousGrasp(Strict):

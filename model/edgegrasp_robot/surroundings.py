@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Bools, Float64
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
+from edgegrasp_model.scene.cloud import unit
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_robot.robot import HAND, Robot, touching
@@ -51,7 +52,7 @@ class Surroundings(NamedTuple):
 
     own: set[int | None]  # numbers of objects that are the arm itself, as the camera sees it
     boxes: list[Obstacle]  # the support and the request's obstacles
-    voxels: Float64  # (V, 3) centers of those of the cloud, scene frame
+    voxels: Float64  # (V, 3) centers of those of the cloud and of unseen space, scene frame
     T_base_scene: Float64  # (4, 4)
 
     def all(self) -> list[Obstacle]:
@@ -66,9 +67,11 @@ class Surroundings(NamedTuple):
 
     def without(self, load: Load) -> "Surroundings":
         """The same once a load is taken away."""
-        points = moved(np.linalg.inv(self.T_base_scene), load.points)
-        far = cKDTree(points).query(self.voxels, distance_upper_bound=NEAR)[0] > NEAR
-        return self._replace(voxels=self.voxels[far])
+        centers = moved(self.T_base_scene, self.voxels)
+        inside = np.abs(moved(np.linalg.inv(load.T_base_box), centers)) < load.half
+        own = inside.all(axis=1)
+        own |= cKDTree(load.points).query(centers, distance_upper_bound=NEAR)[0] <= NEAR
+        return self._replace(voxels=self.voxels[~own])
 
 
 @contextmanager
@@ -118,7 +121,8 @@ def surrounded(
         What it put there.
 
     Raises:
-        InvalidRequest: The start is in collision, or the base stands inside an object.
+        InvalidRequest: The start is in collision, the base stands inside an object, or what no
+            camera saw is to be avoided and no camera is known.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
@@ -128,6 +132,10 @@ def surrounded(
     if scene.support is not None:
         known.append(_support(scene, T_base_scene))
     voxels = _voxels(robot, joints, scene, points, T_base_scene)
+    if asked.avoid_unseen:
+        hidden = _hidden(scene, voxels, T_base_scene)
+        hidden = hidden[~_near_robot(robot, joints, moved(T_base_scene, hidden), SEEN_SELF)]
+        voxels = np.concatenate([voxels, hidden])
     around = Surroundings(own, known, voxels, T_base_scene)
     obstacles = around.all()
     names = [name for name, _, _ in obstacles]
@@ -224,14 +232,40 @@ def _voxels(
     seen = scene.frame.points(flat[kept])
     base = np.linalg.inv(T_base_scene)[:3, 3]
     seen = seen[np.einsum("ij,ij->i", seen - base, seen - base) < AROUND**2]
-    if len(seen) == 0:
-        return seen
-    cell = np.floor(seen / CELL).astype(np.int64)
-    corner = cell.min(axis=0)
-    taken = np.zeros(cell.max(axis=0) - corner + 1, dtype=bool)
-    taken[tuple((cell - corner).T)] = True
-    centers = (np.argwhere(taken) + corner + 0.5) * CELL
+    centers = _centers(seen)
     return centers[~_near_robot(robot, joints, moved(T_base_scene, centers), SEEN_SELF)]
+
+
+def _hidden(scene: Scene, voxels: Float64, T_base_scene: Float64) -> Float64:
+    """Centers (U, 3) of voxels that others hide from every camera, above the support."""
+    if scene.viewpoints is None:
+        fix = "Send the option viewpoint, or depth images with their poses."
+        raise InvalidRequest("options.robot.avoid_unseen", "true, without a camera's position", fix)
+    base = np.linalg.inv(T_base_scene)[:3, 3]
+    steps = np.arange(CELL, 2 * AROUND, CELL)[:, None, None]
+    hidden = []
+    for eye in scene.viewpoints.astype(np.float64):
+        places = (voxels + steps * unit(voxels - eye)).reshape(-1, 3)
+        kept = np.einsum("ij,ij->i", places - base, places - base) < AROUND**2
+        if scene.support is not None:
+            kept &= scene.support.heights(places) > CELL / 2
+        hidden.append(places[kept])
+    return _centers(*hidden)
+
+
+def _centers(*groups: Float64) -> Float64:
+    """Centers (V, 3) of the voxels in which each group of points (N, 3) has one."""
+    cells = [np.floor(points / CELL).astype(np.int64) for points in groups]
+    if not all(map(len, cells)):
+        return np.empty((0, 3))
+    corner = np.min([cell.min(axis=0) for cell in cells], axis=0)
+    size = np.max([cell.max(axis=0) for cell in cells], axis=0) - corner + 1
+    common = np.ones(size, dtype=bool)
+    for cell in cells:
+        taken = np.zeros(size, dtype=bool)
+        taken[tuple((cell - corner).T)] = True
+        common &= taken
+    return np.asarray((np.argwhere(common) + corner + 0.5) * CELL)
 
 
 def moved(T_b_a: Float64, points: ArrayLike) -> Float64:

@@ -36,7 +36,7 @@ def hand_over(gripper, x, y, half_height, tilt=0.0):
     return pose
 
 
-def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=()):
+def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=(), eyes=None):
     """A scene of boxes on a table, its whole cloud, and a detection with a hand over each box."""
     plane = np.stack(np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.4, 0.01)), -1)
     table = np.column_stack([plane.reshape(-1, 2), np.zeros(plane.size // 2)])
@@ -56,6 +56,7 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=()):
         frame=frame, cloud=None, points_in_cloud=objects, point_of_row=number,
         approach_allowed=every, contact_allowed=every, object_of_point=number,
         support=SupportPlane(normal=(0.0, 0.0, 1.0), offset=float(foot[2])), obstacles=None,
+        viewpoints=None if eyes is None else frame.points(in_cloud(np.array(eyes))),
     )  # fmt: skip
     poses = [T_cloud_base @ hand_over(robot.gripper, *box) for box in boxes]
     grasps = [
@@ -78,12 +79,19 @@ def scene_of(robot, T_base_cloud=TURNED, boxes=BOXES, more=()):
 
 
 def picks_of(
-    robot, T_base_cloud=TURNED, joints=None, plan="motion", options=None, place=None, **given
+    robot,
+    T_base_cloud=TURNED,
+    joints=None,
+    plan="motion",
+    options=None,
+    place=None,
+    avoid_unseen=False,
+    **given,
 ):
     """The detection with the arm's plans."""
     scene, cloud, detection = scene_of(robot, T_base_cloud, **given)
     asked = {"name": robot.name, "T_base_cloud": T_base_cloud.tolist(), "plan": plan}
-    asked["place"] = place
+    asked |= {"place": place, "avoid_unseen": avoid_unseen}
     asked["joints"] = (robot.home if joints is None else np.asarray(joints)).tolist()
     parsed = parse_options({"robot": asked, **(options or {})})
     with_robot(parsed, robot)

@@ -133,6 +133,20 @@ def test_a_lid_over_an_object_is_a_collision_of_the_arm(fr3):
     assert "arm's reach" in detection.warnings[0]
 
 
+BELOW_SIGN, ABOVE = (0.5, -0.8, 0.1), (0.5, 0.0, 1.2)
+
+
+@pytest.mark.parametrize(("eyes", "reachable"), [([BELOW_SIGN], 0), ([BELOW_SIGN, ABOVE], 1)])
+def test_what_no_camera_saw_is_avoided_where_asked(fr3, eyes, reachable):
+    """A low camera sees a box below a sign, and not whether anything hangs over the box."""
+    x, y, z = np.meshgrid(np.arange(0.3, 0.7, 0.008), [-0.4], np.arange(0.13, 0.6, 0.008))
+    sign = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    for avoid, expected in ((False, 1), (True, reachable)):
+        detection = picks_of(fr3, boxes=BOXES[:1], more=[sign], eyes=eyes, avoid_unseen=avoid)
+        assert detection.counts["reachable"] == expected
+        assert detection.counts["arm_collision"] == 1 - expected
+
+
 def test_obstacles_may_touch_each_other(fr3):
     boxes = [{"kind": "box", "min": (x, 0.5, -0.1), "max": (x + 0.2, 0.9, 0.3)} for x in (0.4, 0.5)]
     detection = picks_of(fr3, np.eye(4), options={"collision": {"obstacles": boxes}})
@@ -197,6 +211,7 @@ REFUSED = {
     "in itself": (
         {"joints": [0.0, -1.7, 0.0, -3.0, 0.0, 0.6, 0.0]}, "options.robot.joints", "touch",
     ),
+    "unseen by nobody": ({"avoid_unseen": True}, "options.robot.avoid_unseen", "viewpoint"),
     "in an object": ({"boxes": ((0.08, 0.0, 0.1),)}, "options.robot.T_base_cloud", "object"),
 }  # fmt: skip
 

@@ -1164,12 +1164,15 @@ class RobotArm(_message.Message):
     JOINTS_FIELD_NUMBER: _builtins.int
     PLAN_FIELD_NUMBER: _builtins.int
     PLACE_FIELD_NUMBER: _builtins.int
+    AVOID_UNSEEN_FIELD_NUMBER: _builtins.int
     name: _builtins.str
     """One of the server's robots."""
     plan: _builtins.str
     """Reach: joints before and at each grasp; motion: a timed trajectory too. One of "reach",
     "motion".
     """
+    avoid_unseen: _builtins.bool
+    """Whether the arm keeps out of what no camera saw, behind what was seen."""
     @_builtins.property
     def T_base_cloud(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """Where the cloud's frame is in the arm's base frame: a 4 x 4 matrix, row by row."""
@@ -1192,15 +1195,20 @@ class RobotArm(_message.Message):
         joints: _abc.Iterable[_builtins.float] | None = ...,
         plan: _builtins.str | None = ...,
         place: Global___Place | None = ...,
+        avoid_unseen: _builtins.bool | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_name", b"_name", "_plan", b"_plan", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_avoid_unseen", b"_avoid_unseen", "_name", b"_name", "_plan", b"_plan", "avoid_unseen", b"avoid_unseen", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_cloud", b"T_base_cloud", "_name", b"_name", "_plan", b"_plan", "joints", b"joints", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_base_cloud", b"T_base_cloud", "_avoid_unseen", b"_avoid_unseen", "_name", b"_name", "_plan", b"_plan", "avoid_unseen", b"avoid_unseen", "joints", b"joints", "name", b"name", "place", b"place", "plan", b"plan"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    _WhichOneofReturnType__avoid_unseen: _TypeAlias = _typing.Literal["avoid_unseen"]  # noqa: Y015
+    _WhichOneofArgType__avoid_unseen: _TypeAlias = _typing.Literal["_avoid_unseen", b"_avoid_unseen"]  # noqa: Y015
     _WhichOneofReturnType__name: _TypeAlias = _typing.Literal["name"]  # noqa: Y015
     _WhichOneofArgType__name: _TypeAlias = _typing.Literal["_name", b"_name"]  # noqa: Y015
     _WhichOneofReturnType__plan: _TypeAlias = _typing.Literal["plan"]  # noqa: Y015
     _WhichOneofArgType__plan: _TypeAlias = _typing.Literal["_plan", b"_plan"]  # noqa: Y015
+    @_typing.overload
+    def WhichOneof(self, oneof_group: _WhichOneofArgType__avoid_unseen) -> _WhichOneofReturnType__avoid_unseen | None: ...
     @_typing.overload
     def WhichOneof(self, oneof_group: _WhichOneofArgType__name) -> _WhichOneofReturnType__name | None: ...
     @_typing.overload
