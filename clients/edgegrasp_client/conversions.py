@@ -2,7 +2,7 @@
 
 - Hand frames with other axes and origins (Contact-GraspNet, GraspNet, VGN).
 - Rotations as quaternions xyzw.
-- `moveit_msgs/Grasp`, as a dictionary of its fields.
+- `moveit_msgs/Grasp` and `trajectory_msgs/JointTrajectory`, as dictionaries of their fields.
 - `isaac_grasp` YAML 1.0, as Isaac Sim's Grasp Editor and as Isaac ROS have it; needs the extra
   `yaml`.
 
@@ -11,6 +11,7 @@ Pictures of the frames stand in docs/frames.md.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import ModuleType
 from typing import Any, Literal
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_camera.arrays import Array, Float64
-from edgegrasp_client.results import Grasp
+from edgegrasp_client.results import ArmTrajectory, Grasp
 
 Message = dict[str, Any]
 
@@ -164,6 +165,33 @@ def moveit_grasp(
         "post_place_retreat": _translation(-approach, retreat_distance, header),
         "max_contact_force": 0.0,
         "allowed_touch_objects": [],
+    }
+
+
+def joint_trajectories(motion: ArmTrajectory) -> list[Message]:
+    """A motion as the fields of `trajectory_msgs/JointTrajectory`, to be executed one by one.
+
+    The first ends at the grasp, where the hand closes; where there is a place, the second ends
+    where it opens. Each begins and ends at rest.
+    """
+    stops = [0, motion.grasp_row, motion.release_row, len(motion.times) - 1]
+    parts = pairwise([row for row in stops if row is not None])
+    return [
+        {
+            "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},  # as soon as it comes
+            "joint_names": list(motion.joint_names),
+            "points": [_point(motion, row, first) for row in range(first, last + 1)],
+        }
+        for first, last in parts
+    ]
+
+
+def _point(motion: ArmTrajectory, row: int, first: int) -> Message:
+    seconds, nanoseconds = divmod(round(1e9 * (motion.times[row] - motion.times[first])), 10**9)
+    return {
+        "positions": motion.positions[row].tolist(),
+        "velocities": motion.velocities[row].tolist(),
+        "time_from_start": {"sec": seconds, "nanosec": nanoseconds},
     }
 
 

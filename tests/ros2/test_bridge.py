@@ -12,9 +12,10 @@ from tests.cloud_files import point_cloud2
 from edgegrasp_bridge import bridge
 from edgegrasp_bridge.bridge import Inbox, Scene, Settings
 from edgegrasp_camera import InvalidRequest
-from edgegrasp_client import GraspClient, InvalidRequestError
+from edgegrasp_client import GraspClient, InvalidRequestError, Robot
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
+from edgegrasp_client.results import ArmPlan, ArmTrajectory
 from edgegrasp_model.gripper import load_gripper
 
 STAMP = {"sec": 12, "nanosec": 345}
@@ -157,19 +158,19 @@ def test_a_depth_image_with_its_camera(client, make_image, camera, kind, encodin
 
 
 class Asked:
-    """In the place of a client: keeps what was asked, and answers with no grasp."""
+    """In the place of a client: keeps what was asked, and answers always the same."""
 
     def __init__(self, answer: Any) -> None:
         self._answer = answer
 
     def detect(self, cloud: Any = None, **given: Any) -> Any:
         self.cloud, self.given = cloud, given
-        return replace(self._answer, grasps=[])
+        return self._answer
 
 
 @pytest.fixture
 def asked(client, cloud) -> Asked:
-    return Asked(client.detect(cloud, top_k=1))
+    return Asked(replace(client.detect(cloud, top_k=1), grasps=[]))
 
 
 def test_frames_say_where_the_camera_stands_and_what_is_up(asked, make_cloud, cloud) -> None:
@@ -320,3 +321,59 @@ def test_messages_that_cannot_be_used(client, sent, make_cloud, make_image, came
     ):
         with pytest.raises((ValueError, InvalidRequest), match=message):
             bridge.detect(client, scene, Settings(), {}, lookup, cluster)
+
+
+ARM = Robot(
+    "arm", "panda", "base", ["a", "b"], *(np.zeros(2),) * 5,
+    frames=np.zeros((3, 4, 4)), axes=np.zeros((2, 3)), sliding=[False, False],
+)  # fmt: skip
+
+
+@pytest.fixture
+def planning(client, cloud) -> Asked:
+    """A client of a server with an arm, which plans a motion to the first grasp."""
+    found = client.detect(cloud, top_k=1)
+    rows = np.arange(14.0).reshape(7, 2)
+    motion = ArmTrajectory(["a", "b"], 0.75 * np.arange(7), rows, -rows, 1, 3, 5)
+    arm = ArmPlan(True, rows[1], rows[3], motion)
+    asked = Asked(replace(found, grasps=[replace(found.grasps[0], arm=arm)]))
+    asked.robots = lambda: [ARM]
+    return asked
+
+
+def test_the_best_pick_is_a_trajectory_of_the_arm(planning, sent, make_cloud, cloud) -> None:
+    inbox = Inbox()
+    inbox.take("cloud", make_cloud(cloud), 1.0)
+    for names, positions in ((["b", "finger"], [0.2, 0.04]), (["a"], [0.1])):
+        state = {"name": names, "position": positions}
+        assert not inbox.take("joints", sent("sensor_msgs/msg/JointState", state), 1.0)
+    _, options = bridge.read_parameters(bridge.parameters() | {"options.robot": "arm"})
+    found = bridge.detect(planning, inbox.scene(1.0), Settings(), options, lookup)
+    robot, first = planning.given["robot"], 0
+    assert robot["joints"] == [0.1, 0.2]
+    np.testing.assert_allclose(np.reshape(robot["T_base_cloud"], (4, 4)), T_base_camera)
+    for fields, last in zip(bridge.trajectories(found), (3, 5, 6), strict=True):
+        motion = sent("trajectory_msgs/msg/JointTrajectory", fields)
+        assert list(motion.joint_names) == ["a", "b"]
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in motion.points]
+        np.testing.assert_allclose(times, 0.75 * np.arange(last - first + 1))
+        assert list(motion.points[0].positions) == [2 * first, 2 * first + 1]
+        assert list(motion.points[-1].velocities) == [-2 * last, -2 * last - 1]
+        first = last
+
+
+@pytest.mark.parametrize(
+    ("name", "joints", "message"),
+    [("other", {}, "robots are arm"), ("arm", {"a": 0.1}, "joint_states: none has come of 'b'")],
+)
+def test_an_arm_that_is_not_known_is_not_planned_for(
+    planning, make_cloud, cloud, name, joints, message
+) -> None:
+    scene = Scene(make_cloud(cloud), joints=joints)
+    with pytest.raises(ValueError, match=message):
+        bridge.detect(planning, scene, Settings(), {"robot": {"name": name}}, lookup)
+
+
+def test_without_a_robot_there_is_no_trajectory(client, make_cloud, cloud) -> None:
+    found = bridge.detect(client, Scene(make_cloud(cloud)), Settings(), {}, lookup)
+    assert bridge.trajectories(found) == []

@@ -20,6 +20,7 @@ from edgegrasp_client import DepthImage, Detection, Grasp, GraspClient, object_i
 from edgegrasp_client.conversions import (
     PANDA_JOINTS,
     FingerJoints,
+    joint_trajectories,
     matrix_from_quaternion,
     moveit_grasp,
     pose_fields,
@@ -102,6 +103,7 @@ class Scene(NamedTuple):
     camera: Any = None  # sensor_msgs/CameraInfo of `depth`
     mask: Any = None  # sensor_msgs/Image: not 0 on what is to be grasped
     others: tuple[tuple[Any, Any], ...] = ()  # images and their cameras, beside `depth`
+    joints: Mapping[str, float] = {}  # the latest position of each joint, by its name
 
     @property
     def header(self) -> Any:
@@ -118,6 +120,7 @@ class Inbox:
         self._depths: deque[Any] = deque(maxlen=KEPT)
         self._cameras: dict[str, Any] = {}  # by their frames
         self._mask: Any = None
+        self._joints: dict[str, float] = {}
 
     def take(self, field: str, message: Any, mask_age: float) -> bool:
         """Keep a message of a field of Scene; whether there is something new to detect in."""
@@ -125,6 +128,8 @@ class Inbox:
             self._cameras[message.header.frame_id] = message
         elif field == "mask":
             self._mask = message
+        elif field == "joints":  # an arm's and a gripper's may come apart
+            self._joints |= zip(message.name, map(float, message.position), strict=False)
         else:
             (self._clouds if field == "cloud" else self._depths).append(message)
         masked = self._mask is not None and mask_age > 0
@@ -136,6 +141,9 @@ class Inbox:
         Raises:
             ValueError: The mask is too old, or the image that it was made of has not come.
         """
+        return self._seen(mask_age)._replace(joints=self._joints)
+
+    def _seen(self, mask_age: float) -> Scene:
         sources = self._clouds or self._depths
         if not sources:
             return Scene()
@@ -210,6 +218,8 @@ def detect(
     asked = _from_frames(scene, settings, lookup) | dict(options)
     if scene.mask is not None and object_cloud is None:
         asked = dict(on_mask(image_array(scene.mask), asked))
+    if asked.get("robot"):
+        asked["robot"] = _robot(client, asked["robot"], scene, lookup)
     cloud: Any = scene.cloud
     if object_cloud is not None:
         T = lookup(frame_id, object_cloud.header.frame_id, stamp)
@@ -263,6 +273,13 @@ def marker_array(found: Found) -> Message:
         }
         markers.append(marker)
     return {"markers": markers}
+
+
+def trajectories(found: Found) -> list[Message]:
+    """The motion to the best pick and on, as trajectory_msgs/JointTrajectory; empty: none."""
+    pick = found.detection.best_pick
+    motion = None if pick is None or pick.arm is None else pick.arm.trajectory
+    return [] if motion is None else joint_trajectories(motion)
 
 
 def moveit_grasps(found: Found, settings: Settings, lookup: Lookup) -> Message:
@@ -394,6 +411,24 @@ def matrix_of(transform: Any) -> Float64:
     T[:3, :3] = matrix_from_quaternion([turn.x, turn.y, turn.z, turn.w])
     T[:3, 3] = shift.x, shift.y, shift.z
     return T
+
+
+def _robot(
+    client: GraspClient, asked: str | Mapping[str, Any], scene: Scene, lookup: Lookup
+) -> dict[str, Any]:
+    """The option `robot`, of which a name is enough, with the arm's joints and pose."""
+    given = {"name": asked} if isinstance(asked, str) else asked
+    listed = {robot.name: robot for robot in client.robots()}
+    robot = listed.get(str(given.get("name")))
+    if robot is None:
+        name, known = given.get("name"), ", ".join(listed) or "none: set its setting `robots`"
+        raise ValueError(f"options.robot: got {name!r}. The server's robots are {known}.")
+    joints = [scene.joints.get(name) for name in robot.joint_names]
+    if None in joints and "joints" not in given:
+        missing = robot.joint_names[joints.index(None)]
+        raise ValueError(f"joint_states: none has come of {missing!r}.")
+    T_base_cloud = lookup(robot.base_frame, scene.header.frame_id, scene.header.stamp)
+    return {"joints": joints, "T_base_cloud": T_base_cloud.ravel().tolist(), **given}
 
 
 def _from_frames(scene: Scene, settings: Settings, lookup: Lookup) -> dict[str, Any]:

@@ -17,15 +17,22 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
 from rosidl_runtime_py.set_message import set_message_fields
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 from tf2_ros import Buffer, TransformListener
+from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from edgegrasp_bridge import bridge
 from edgegrasp_client import GraspClient
 
-INPUTS = {"points": PointCloud2, "depth": Image, "camera_info": CameraInfo, "mask": Image}
-FIELDS = {"points": "cloud", "depth": "depth", "camera_info": "camera", "mask": "mask"}
+INPUTS = {  # topics: kinds of message, and fields of bridge.Scene
+    "points": (PointCloud2, "cloud"),
+    "depth": (Image, "depth"),
+    "camera_info": (CameraInfo, "camera"),
+    "mask": (Image, "mask"),
+    "joint_states": (JointState, "joints"),
+}
+MOTIONS = ("trajectory_to_grasp", "trajectory_with_object", "trajectory_after_place")
 
 
 class EdgeGraspNode(Node):
@@ -45,8 +52,9 @@ class EdgeGraspNode(Node):
         self._before = self.create_publisher(PoseArray, "pregrasps", 1)
         self._markers = self.create_publisher(MarkerArray, "grasp_markers", 1)
         inputs, actions = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()
-        for topic, kind in INPUTS.items():
-            take = self._take(FIELDS[topic])
+        self._motions = [self.create_publisher(JointTrajectory, name, 1) for name in MOTIONS]
+        for topic, (kind, field) in INPUTS.items():
+            take = self._take(field)
             self.create_subscription(
                 kind, topic, take, qos_profile_sensor_data, callback_group=inputs
             )
@@ -88,10 +96,12 @@ class EdgeGraspNode(Node):
         found = bridge.detect(self._client, scene, settings, options, self._lookup, object_cloud)
         for warning in found.detection.warnings:
             self.get_logger().warning(warning)
+        motions = zip(self._motions, bridge.trajectories(found), strict=False)
         for publisher, message, fields in (
             (self._poses, PoseArray(), bridge.pose_array(found)),
             (self._before, PoseArray(), bridge.pose_array(found, settings.approach_distance)),
             (self._markers, MarkerArray(), bridge.marker_array(found)),
+            *((publisher, JointTrajectory(), fields) for publisher, fields in motions),
         ):
             set_message_fields(message, fields)
             publisher.publish(message)

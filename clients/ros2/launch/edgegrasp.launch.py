@@ -9,7 +9,7 @@ from launch_ros.actions import Node
 from launch import LaunchContext, LaunchDescription
 
 PARAMETERS = Path(__file__).with_name("edgegrasp.yaml")
-TOPICS = ("points", "depth", "camera_info", "mask")
+TOPICS = ("points", "depth", "camera_info", "mask", "joint_states")
 
 
 def generate_launch_description() -> LaunchDescription:
