@@ -27,15 +27,18 @@ if TYPE_CHECKING:
     from mcp.server.mcpserver.tools.base import Tool
 
     from edgegrasp_client import DepthImage, Detection, GraspClient
+    from edgegrasp_client.results import ArmPlan
 
 MOST_GRASPS = 20  # in one answer: some 5,000 characters
+IN_BASE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud
 BACK = 0.05  # metres from the pregrasp to the grasp
 INSTRUCTIONS = (
     "Finds 6-DoF grasps of a parallel-jaw gripper in point clouds and depth images. Lengths are "
     "metres, quaternions xyzw; poses are in the frame of the cloud, that of a depth image in its "
     "camera's: x right, y down, z forward. Scores are probabilities that the grasp holds. To "
     "grasp: open to `width`, go to `pregrasp_hand_position` in the orientation of the grasp, go in "
-    "straight, close. "
+    "straight, close. With `robot`, an arm of `edgegrasp_server_info`, grasps that it reaches come "
+    "first, each with `arm`: its joints there and the seconds of its motion. "
     "Read `warnings` before a robot moves."
 )
 
@@ -43,6 +46,10 @@ Option = typer.Option
 NumGrasps = Annotated[int, Field(ge=1, le=MOST_GRASPS)]
 Matrix = Annotated[
     list[list[float]], Field(description="4 x 4: camera to a base frame whose z is up, metres")
+]
+
+Arm = Annotated[
+    dict[str, Any] | None, Field(description="the arm; without T_base_cloud: in its base frame")
 ]
 
 
@@ -110,13 +117,14 @@ class _Tools:
         point_cloud_file: str,
         num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
+        robot: Arm = None,
         options: dict[str, Any] | None = None,
     ) -> str:
         """Grasps in a point cloud file (.npy, .npz, .ply, .pcd, .xyz), best first.
 
         `viewpoint` is the camera's position: give it if you know it.
         """
-        asked = _asked(options, num_grasps, viewpoint)
+        asked = _asked(options, num_grasps, robot, viewpoint)
         return _short(self._client.detect(self._path(point_cloud_file), **asked))
 
     def generate_grasps_from_depth(
@@ -127,6 +135,7 @@ class _Tools:
         depth_scale: float | None = None,
         T_base_camera: Matrix | None = None,
         num_grasps: NumGrasps = 5,
+        robot: Arm = None,
         options: dict[str, Any] | None = None,
     ) -> str:
         """Grasps in a depth image (.png of 16 bits, or .npy), best first.
@@ -137,7 +146,7 @@ class _Tools:
         answered is in the base frame.
         """
         image = self._image(depth_file, intrinsics, depth_scale, T_base_camera)
-        asked = self._in_image(_asked(options, num_grasps), mask_file, T_base_camera)
+        asked = self._in_image(_asked(options, num_grasps, robot), mask_file, T_base_camera)
         return _short(self._client.detect(depth_images=[image], **asked))
 
     def visualize_grasps(
@@ -150,6 +159,7 @@ class _Tools:
         T_base_camera: Matrix | None = None,
         num_grasps: NumGrasps = 5,
         viewpoint: list[float] | None = None,
+        robot: Arm = None,
         options: dict[str, Any] | None = None,
     ) -> list[Any]:
         """Two pictures of the grasps in a cloud file or a depth image: from the camera, from above.
@@ -160,7 +170,7 @@ class _Tools:
         """
         from mcp.server.mcpserver import Image
 
-        asked = _asked(options, num_grasps, viewpoint)
+        asked = _asked(options, num_grasps, robot, viewpoint)
         if (point_cloud_file is None) == (depth_file is None):
             raise ValueError("Give point_cloud_file, or depth_file and intrinsics.")
         file, images, eye = None, None, [0.0, 0.0, 0.0]
@@ -186,10 +196,21 @@ class _Tools:
         return "ready" if ready else "not there, or still loading its weights"
 
     def edgegrasp_server_info(self) -> str:
-        """The weights that the option `model` can name, and the gripper that each is for."""
+        """The weights that the option `model` can name, the robots, and the gripper of each."""
         names = ("name", "architecture", "gripper", "default", "device")
-        models = self._client.models()
-        return json.dumps([{name: getattr(model, name) for name in names} for model in models])
+        models = [[getattr(one, name) for name in names] for one in self._client.models()]
+        robots = [
+            {
+                "name": robot.name,
+                "gripper": robot.gripper,
+                "base_frame": robot.base_frame,
+                "joint_names": robot.joint_names,
+                "home": _digits(robot.home, 4),
+            }
+            for robot in self._client.robots()
+        ]
+        told = [dict(zip(names, model, strict=True)) for model in models]
+        return json.dumps({"models": told, "robots": robots})
 
     def _image(
         self, name: str, intrinsics: list[float], scale: float | None, pose: Matrix | None
@@ -209,6 +230,10 @@ class _Tools:
 
         if pose is not None:
             asked = {"up": [0.0, 0.0, 1.0], **asked}
+        elif asked.get("robot", {}).get("T_base_cloud") is IN_BASE:
+            raise ValueError(
+                "robot: give T_base_camera, in the arm's base frame."
+            )
         return asked if mask is None else dict(on_mask(pixels(self._path(mask)), asked))
 
     def _path(self, name: str) -> Path:
@@ -233,6 +258,8 @@ def _tool(function: Callable[..., Any], folder: Path) -> "Tool":
     if "options" in tool.parameters["properties"]:
         options, definitions = _schema_of_options()
         tool.parameters["properties"]["options"] = options
+        arm = {"anyOf": [{"$ref": "#/$defs/RobotArm"}, {"type": "null"}], "default": None}
+        tool.parameters["properties"]["robot"] |= arm
         tool.parameters["$defs"] = tool.parameters.get("$defs", {}) | definitions
     return tool
 
@@ -252,15 +279,24 @@ def _schema_of_options() -> tuple[dict[str, Any], dict[str, Any]]:
             if name not in definitions:
                 definitions[name] = schemas[name]
                 todo.append(schemas[name])
+    del options["properties"]["robot"]  # an argument of its own
+    definitions["RobotArm"]["required"].remove("T_base_cloud")
     return options, definitions
 
 
 def _asked(
-    options: dict[str, Any] | None, num_grasps: int, viewpoint: list[float] | None = None
+    options: dict[str, Any] | None,
+    num_grasps: int,
+    robot: dict[str, Any] | None,
+    viewpoint: list[float] | None = None,
 ) -> dict[str, Any]:
     """The options of a request; a tool's own arguments take precedence."""
-    given = {"top_k": num_grasps}
-    return {**(options or {}), **given, **({"viewpoint": viewpoint} if viewpoint else {})}
+    asked = {**(options or {}), "top_k": num_grasps}
+    if viewpoint:
+        asked["viewpoint"] = viewpoint
+    if robot:
+        asked["robot"] = {"T_base_cloud": IN_BASE, **robot}
+    return asked
 
 
 def _with_sentences(function: Callable[..., Any], folder: Path) -> Callable[..., Any]:
@@ -296,6 +332,7 @@ def _short(found: "Detection") -> str:
             "pregrasp_hand_position": _digits(grasp.pregrasp(BACK)[:3, 3], 4),
             "width": round(grasp.width, 4),
             "object": grasp.object,
+            **({} if grasp.arm is None else {"arm": _short_plan(grasp.arm)}),
         }
         for grasp in found.grasps
     ]
@@ -312,7 +349,20 @@ def _short(found: "Detection") -> str:
     ]
     up = _digits(found.up, 3)
     answer = {"grasps": grasps, "objects": objects, "up": up, "warnings": found.warnings}
-    return json.dumps(answer if grasps else {**answer, "counts": found.counts})
+    if not grasps or (found.grasps[0].arm and not found.best_pick):
+        answer["counts"] = found.counts
+    return json.dumps(answer)
+
+
+def _short_plan(plan: "ArmPlan") -> dict[str, Any]:
+    """The joints at each stop of an arm, and how long its motion takes."""
+    stops = ("pregrasp_joints", "grasp_joints", "place_joints")
+    joints = {name: value for name in stops if (value := getattr(plan, name)) is not None}
+    found: dict[str, Any] = {"reachable": plan.reachable}
+    found |= {name: _digits(value, 4) for name, value in joints.items()}
+    if plan.trajectory is not None:
+        found["seconds"] = round(float(plan.trajectory.times[-1]), 2)
+    return found
 
 
 def _digits(vector: Any, digits: int) -> list[float]:

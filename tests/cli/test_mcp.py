@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ import numpy as np
 import pytest
 from tests.programs import EDGEGRASP, run
 
-from edgegrasp_client import GraspClient
+from edgegrasp_cli.mcp import grasp_tools
+from edgegrasp_client import Detection, Grasp, GraspClient
+from edgegrasp_client.results import ArmPlan, ArmTrajectory
 
 mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
 image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
@@ -80,8 +83,9 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         assert client.server_info.version == importlib.metadata.version("edgegrasp")
         health = await client.call_tool("edgegrasp_health_check", {})
         assert health.content[0].text == "ready"
-        (info,) = answer(await client.call_tool("edgegrasp_server_info", {}))
-        assert info["name"] == "dummy"
+        info = answer(await client.call_tool("edgegrasp_server_info", {}))
+        assert [model["name"] for model in info["models"]] == ["dummy"]
+        assert info["robots"] == []
 
         asked = {"point_cloud_file": "cloud.npy", "num_grasps": 3, "options": {"seed": 7}}
         found = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
@@ -167,6 +171,21 @@ async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder
         ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
         (
             "generate_grasps_from_point_cloud",
+            {"point_cloud_file": "cloud.npy", "robot": {"name": "r2d2", "joints": [0.0]}},
+            "options.robot.name",
+        ),
+        (
+            "generate_grasps_from_point_cloud",
+            {"point_cloud_file": "cloud.npy", "robot": {"name": "fr3"}},
+            "options.robot.joints",
+        ),
+        (
+            "generate_grasps_from_depth",
+            {"depth_file": "depth.png", "intrinsics": CAMERA, "robot": {"name": "fr3"}},
+            "give T_base_camera",
+        ),
+        (
+            "generate_grasps_from_point_cloud",
             {"point_cloud_file": "cloud.npy", "options": {"tok_k": 1}},
             "options.tok_k",
         ),
@@ -178,6 +197,56 @@ async def test_what_is_wrong_reaches_the_agent(dummy_server, folder, tool, argum
         assert result.is_error
         assert told in result.content[0].text
         assert str(folder.parent) not in result.content[0].text
+
+
+class Planning:
+    """A client of a server with a robot, which reaches the second grasp, or none."""
+
+    def __init__(self, client: GraspClient, reaches: bool) -> None:
+        self._client, self._reaches = client, reaches
+
+    def detect(self, *cloud: Any, robot: dict[str, Any], **asked: Any) -> Detection:
+        self.robot = robot
+        found = self._client.detect(*cloud, **asked)
+        joints = np.array([0.123456, -1.0])
+        times, rows = np.array([0.0, 1.0, 2.5]), np.zeros((3, 2))
+        motion = ArmTrajectory(["a", "b"], times, rows, rows, 1, 2)
+        arm = ArmPlan(True, joints, 2 * joints, motion)
+        far = ArmPlan(False, None, None, None)
+        plans = [arm if self._reaches else far, far]
+        return replace(found, grasps=[*map(with_arm, found.grasps, plans)], counts={"reachable": 0})
+
+
+def with_arm(grasp: Grasp, arm: ArmPlan) -> Grasp:
+    return replace(grasp, arm=arm)
+
+
+@pytest.mark.parametrize("reaches", [True, False])
+async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches) -> None:
+    T_base_camera = np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+    asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "T_base_camera": T_base_camera}
+    robot = {"name": "arm", "joints": [0.0, 0.0]}
+    with GraspClient(dummy_server.grpc_address) as client:
+        planning = Planning(client, reaches)
+        async with mcp.Client(grasp_tools(planning, folder)) as agent:
+            (tool,) = [
+                tool for tool in (await agent.list_tools()).tools if tool.name.endswith("depth")
+            ]
+            jsonschema.validate(asked | {"robot": robot}, tool.input_schema)
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(asked | {"robot": {"name": "arm"}}, tool.input_schema)
+            call = asked | {"robot": robot, "num_grasps": 2}
+            found = answer(await agent.call_tool("generate_grasps_from_depth", call))
+    assert planning.robot == robot | {"T_base_cloud": np.eye(4).ravel().tolist()}
+    far = {"reachable": False}
+    near = {
+        "reachable": True,
+        "pregrasp_joints": [0.1235, -1.0],
+        "grasp_joints": [0.2469, -2.0],
+        "seconds": 2.5,
+    }
+    assert [grasp["arm"] for grasp in found["grasps"]] == [near if reaches else far, far]
+    assert ("counts" in found) != reaches  # which say why no grasp is within reach
 
 
 @pytest.fixture
