@@ -3,7 +3,6 @@
 import io
 import json
 import struct
-import zipfile
 import zlib
 from collections.abc import Iterator
 from functools import partial
@@ -81,19 +80,6 @@ def test_mutated_images_decode_or_are_refused(content: bytes) -> None:
     depth = File("png", content)
     decode(len(content), depth_images=[{"depth": depth, "intrinsics": [30.0, 30.0, 9.5, 9.5]}])
     decode(len(content), points=POINTS.tobytes(), colors=depth)
-
-
-def packed(compression: int) -> bytes:
-    """An archive that is compressed in another way than NumPy does."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", compression) as archive:
-        archive.writestr("points.npy", npy(POINTS))
-    return file.getvalue()
-
-
-@given(mutated([packed(zipfile.ZIP_LZMA), packed(zipfile.ZIP_BZIP2)]))
-def test_archives_of_other_compressions_decode_or_are_refused(content: bytes) -> None:
-    decode(len(content), cloud=File("npz", content))
 
 
 @given(st.lists(st.tuples(st.sampled_from(PNG_CHUNKS), st.none() | st.binary(max_size=40))))

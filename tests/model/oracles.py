@@ -1,9 +1,6 @@
 """Straightforward NumPy versions of the compiled loops, which the kernels are tested against."""
 
-import itertools
-
 import numpy as np
-from scipy.spatial import cKDTree
 
 
 def in_hand(points: np.ndarray, T_cloud_hand: np.ndarray) -> np.ndarray:
@@ -29,14 +26,3 @@ def signed_distance_to_boxes(
     beyond = np.maximum(boxes[:, 0] - position, position - boxes[:, 1])
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=3)
     return np.where(outside > 0, outside, beyond.max(axis=3)).min(axis=(1, 2))
-
-
-def nearest_in_groups(points: np.ndarray, bounds: np.ndarray, k: int) -> np.ndarray:
-    """The k nearest (P, k) of the same group; the own row where there are fewer."""
-    nearest = np.repeat(np.arange(len(points))[:, None], k, axis=1)
-    for start, stop in itertools.pairwise(bounds.tolist()):
-        if stop > start:
-            _, rows = cKDTree(points[start:stop]).query(points[start:stop], k=range(1, k + 1))
-            known = rows < stop - start
-            nearest[start:stop] = np.where(known, rows + start, nearest[start:stop])
-    return nearest

@@ -86,11 +86,6 @@ def test_poses_follow_the_definition_of_an_edge_grasp(name: str, seed: int) -> N
     np.testing.assert_allclose(tips - contact_z, gripper.tip_z - gripper.contact_z, atol=1e-6)
 
 
-def test_a_point_makes_no_edge_with_itself() -> None:
-    cloud, same = random_pairs(0)[0], np.arange(200)
-    assert len(edge_grasps(cloud, same, same, PANDA)) == 0
-
-
 def can(diameter: float, seed: int = 0) -> Cloud:
     """The lid and the side of an upright can, lid at z = 0."""
     rng = np.random.default_rng(seed)

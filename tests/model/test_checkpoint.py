@@ -158,13 +158,6 @@ def write_layout(directory: Path, number: int = 1, **weights: object) -> None:
         torch.save(weights.get(part, {}), directory / f"{part}-ckpt-{number}.pt")
 
 
-def test_radius_voxel_and_gripper_of_an_import_are_noted(shared_dir: Path) -> None:
-    folder = shared_dir / "reference" / "edge_grasp_random"
-    _, metadata = import_checkpoint(folder, voxel_size=0.004, crop_radius=0.03, gripper="other")
-    assert metadata.network == replace(EDGEGRASP, crop_radius=0.03)
-    assert (metadata.voxel_size, metadata.gripper) == (0.004, "other")
-
-
 def test_none_and_two_checkpoints_in_one_directory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidCheckpoint, match="0 files"):
         import_checkpoint(tmp_path)

@@ -11,7 +11,7 @@ from tests.programs import run
 from edgegrasp_sim.camera import look_at
 from edgegrasp_sim.engine import Intrinsics, World, choose_engine, make_world
 from edgegrasp_sim.engine.urdf import read_obj, read_urdf
-from edgegrasp_sim.hand import FINGERTIP, Gripper, panda, retreat_pose
+from edgegrasp_sim.hand import FINGERTIP, Gripper, retreat_pose
 from edgegrasp_sim.objects import ObjectModel
 from edgegrasp_sim.poses import translation
 from edgegrasp_sim.scene import load_object
@@ -82,15 +82,6 @@ def test_shapes_are_read_as_they_are_described(tmp_path: Path) -> None:
     (tmp_path / "shapes.urdf").write_text(SHAPES.replace("two.obj", "two.dae"))
     with pytest.raises(ValueError, match=r"two\.dae is not an OBJ file"):
         read_urdf(tmp_path / "shapes.urdf", 1.0)
-
-
-def test_both_engines_have_one_hand() -> None:
-    data = pytest.importorskip("pybullet_data", reason="pybullet is not installed")
-    meshes = Path(data.getDataPath()) / "franka_panda" / "meshes" / "collision"
-    for name, (points,) in (("hand", panda().palm), ("finger", panda().fingers[0])):
-        mesh = np.concatenate([part.points for _, part in read_obj(meshes / f"{name}.obj")])
-        np.testing.assert_allclose(mesh.min(axis=0), points.min(axis=0), atol=1e-4)
-        np.testing.assert_allclose(mesh.max(axis=0), points.max(axis=0), atol=1e-4)
 
 
 def test_both_engines_see_the_same() -> None:

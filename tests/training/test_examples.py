@@ -13,9 +13,7 @@ from edgegrasp_training.examples import (
     TriedGrasps,
     pack_balls,
     pack_hands,
-    random_turn,
     tried_grasps,
-    turned,
 )
 from edgegrasp_training.recipes import LENGTH_UNIT
 from edgegrasp_training.views import TABLE, UP, WORKSPACE, LabelledView
@@ -72,20 +70,6 @@ def test_packed_hands_are_what_the_detector_would_pack_and_vary_with_a_stream(ma
     there = torch.arange(hands.hand_points) < varied.point_count[:, None]
     assert (varied.points[there].abs().sum(dim=1) > 0).all()
     assert (varied.points[~there] == 0).all()
-
-
-def test_augmentation_turns_points_normals_and_approach_alike(made_up_view, balls) -> None:
-    grasps = grasps_of(made_up_view(2), balls)
-    batch = pack_balls(grasps, grasps.balls(), balls).batch
-    other = turned(batch, random_turn("any", np.random.default_rng(0)))
-    assert not torch.allclose(batch.points, other.points)
-    lengths, cosines = batch.points.norm(dim=1), (batch.points * batch.normals).sum(dim=1)
-    torch.testing.assert_close(other.points.norm(dim=1), lengths, atol=1e-5, rtol=1e-4)
-    other_cosines = (other.points * other.normals).sum(dim=1)
-    torch.testing.assert_close(other_cosines, cosines, atol=1e-4, rtol=1e-4)
-    along = (batch.points[batch.contact] * batch.approach).sum(dim=1)
-    along_other = (other.points[other.contact] * other.approach).sum(dim=1)
-    torch.testing.assert_close(along, along_other, atol=1e-4, rtol=1e-4)
 
 
 def test_a_grasp_that_stays_when_shaken_is_worth_a_little_more(made_up_view, balls) -> None:
