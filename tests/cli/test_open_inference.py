@@ -1,8 +1,7 @@
-"""The gateway as others see it: Triton's and KServe's clients, and plain JSON."""
+"""The gateway as others see it: Triton's client, and plain JSON."""
 
 import importlib.util
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -62,16 +61,10 @@ def points_of(cloud: np.ndarray, **changes: Any) -> dict[str, Any]:
     return {"inputs": [tensor | changes]}
 
 
-KSERVE_PYTHON = os.environ.get("KSERVE_PYTHON", "")
-
-
 @pytest.mark.parametrize("transport", ["http", "grpc"])
 @pytest.mark.parametrize("kind", ["points", "depth"])
-@pytest.mark.parametrize("client", ["triton", "kserve"])
-def test_others_clients_get_grasps(gateway, client, transport, kind, cloud, tmp_path, dummy_server):
-    if client == "kserve" and not KSERVE_PYTHON:
-        pytest.skip("kserve wants older packages than ours: name a Python with it, KSERVE_PYTHON")
-    for module in ("tritonclient", "geventhttpclient") if client == "triton" else ():
+def test_tritons_client_gets_grasps(gateway, transport, kind, cloud, tmp_path, dummy_server):
+    for module in ("tritonclient", "geventhttpclient"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed")
     file = tmp_path / "inputs.npz"
@@ -79,15 +72,13 @@ def test_others_clients_get_grasps(gateway, client, transport, kind, cloud, tmp_
     camera = np.array([60.0, 60.0, 15.5, 11.5], np.float32)
     tensors = {"points": cloud} if kind == "points" else {"depth": depth, "intrinsics": camera}
     np.savez(file, **tensors)
-    python = KSERVE_PYTHON if client == "kserve" else sys.executable
-    script = Path(__file__).with_name(f"{client}_client.py")
-    command = [python, "-P", script, transport, gateway[transport], "grasps", file]
+    script = Path(__file__).with_name("triton_client.py")
+    command = [sys.executable, "-P", script, transport, gateway[transport], "grasps", file]
     told = json.loads(run(*command).stdout)
     assert told["health"] == [True, True, True]
-    if client == "triton":  # KServe's has no call for metadata
-        assert told["alone"] == [True, True]
-        assert told.get("models", ["grasps", "dummy"]) == ["grasps", "dummy"]
-        assert [t["name"] for t in told["inputs"]] == ["points", "depth", "intrinsics"]
+    assert told["alone"] == [True, True]
+    assert told.get("models", ["grasps", "dummy"]) == ["grasps", "dummy"]
+    assert [t["name"] for t in told["inputs"]] == ["points", "depth", "intrinsics"]
     with GraspClient(dummy_server.grpc_address) as ours:
         images = [{"depth": depth, "intrinsics": camera}]
         sent = {"cloud": cloud} if kind == "points" else {"depth_images": images}
