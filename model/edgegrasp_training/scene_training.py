@@ -20,7 +20,8 @@ from torch.optim import swa_utils
 from edgegrasp_camera.arrays import Float32, Float64, Int64
 from edgegrasp_model.scene.network import VOTE_UNIT, SceneNet, SceneOutput, scene_features
 from edgegrasp_model.scene.segment import group, instance_traits, look
-from edgegrasp_training.scene_images import DEPTH_UNIT, OBJECT, SceneImage
+from edgegrasp_training.scene_images import DEPTH_UNIT, SceneImage
+from edgegrasp_training.scene_layouts import OBJECT
 
 UP_SHARE = 0.5  # share of the images for which the network gets `up`
 UP_ERROR = 0.02  # radians, standard deviation of the `up` that it is given

@@ -7,18 +7,11 @@ import pytest
 
 pytest.importorskip("open3d", reason="rays are cast by Open3D")
 
-from edgegrasp_training.scene_images import (
-    DEPTH_UNIT,
-    OBJECT,
-    SUPPORT,
-    PoolMesh,
-    box,
-    draw_pose,
-    draw_scene,
-    generate,
-    make_image,
-    pool_mesh,
-)
+from edgegrasp_model.scene.network import SceneNet
+from edgegrasp_training import scene_images, scene_pool, scene_training
+from edgegrasp_training.scene_images import DEPTH_UNIT, draw_pose, generate, make_image
+from edgegrasp_training.scene_layouts import OBJECT, SUPPORT, box, draw_scene
+from edgegrasp_training.scene_pool import PoolMesh, pool_mesh
 from edgegrasp_training.scene_training import (
     SceneImages,
     image_points,
@@ -80,10 +73,9 @@ def test_the_same_scene_is_made_again_from_its_seed(pool: list[PoolMesh]) -> Non
 
 
 def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from edgegrasp_training import scene_images, scene_training
-
-    for name, value in {"SCENES_PER_FILE": 4, "NUM_POOL": 12, "NUM_ARMS": 0}.items():
-        monkeypatch.setattr(scene_images, name, value)
+    monkeypatch.setattr(scene_images, "SCENES_PER_FILE", 4)
+    monkeypatch.setattr(scene_pool, "NUM_POOL", 12)
+    monkeypatch.setattr(scene_pool, "NUM_ARMS", 0)
     monkeypatch.setattr(scene_training, "HELD_OUT", 1)
     monkeypatch.setattr(scene_training, "BATCH", 4)
     mesh = tmp_path / "cube.obj"
@@ -95,8 +87,6 @@ def test_a_file_is_made_and_learned_from(tmp_path: Path, monkeypatch: pytest.Mon
     train(tmp_path / "data", tmp_path / "run", seconds=2.0)
     assert (tmp_path / "run" / "scene.safetensors").is_file()
     assert "iou_object" in (tmp_path / "run" / "log.txt").read_text()
-    from edgegrasp_model.scene.network import SceneNet
-
     output = SceneNet().eval()(batch.features)
     assert output.classes.shape[2:] == batch.classes.shape[1:]
     assert all(np.isfinite(each.item()) for each in scene_loss(output, batch).values())

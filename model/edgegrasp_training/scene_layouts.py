@@ -1,0 +1,505 @@
+"""The scenes that the `scene` network's training images show.
+
+A scene is a set of meshes: objects on a table, on the floor, in a bin, in a tray or on shelves, and
+what else stands around. Objects are put down geometrically, each as low as what lies there already
+lets it: no physics engine could make as many scenes in the time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from edgegrasp_camera.arrays import Float64, Int64
+from edgegrasp_training.scene_pool import Mesh, PoolMesh, merged, pool_mesh
+
+OTHER, SUPPORT, OBJECT = 0, 1, 2  # labels; objects are numbered from OBJECT
+MAX_OBJECTS = 96
+CELL = 0.005  # metres, of the height map that objects are put down on
+REACH = 0.9  # metres that it extends to either side
+APART = np.array([0.015, 0.015, 0.0])  # metres between objects that do not touch
+LONGEST_OBJECT = 0.36  # metres; a longer one is background
+EMPTY_SHARE = 0.03  # of the scenes that have no object
+
+
+@dataclass(eq=False)
+class SceneMeshes:
+    """What a scene is made of, and where a camera should look."""
+
+    rng: np.random.Generator  # of all that is drawn
+    pool: Sequence[PoolMesh]  # objects to draw from
+    arms: Sequence[Mesh]  # the same of robots
+    parts: list[tuple[Mesh, int]] = field(default_factory=list)  # and the label of each
+    centres: list[Float64] = field(default_factory=list)  # of the objects
+    elevation: tuple[float, float] = (0.25, 1.5)  # radians above level, of the camera
+    azimuth: tuple[float, float] = (-np.pi, np.pi)  # radians, 0 along x
+    distance: tuple[float, float] = (0.3, 1.9)  # metres
+    spread: float = 0.1  # metres around the target
+    level: float = 0.0  # metres, of the main support
+
+    def add(self, mesh: Mesh, label: int = OTHER) -> None:
+        """Add background or a support."""
+        self.parts.append((mesh, label))
+
+    def add_box(self, size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> None:
+        """Add a box to the background; see `box`."""
+        self.add(box(size, centre, yaw))
+
+    def add_object(self, mesh: Mesh) -> None:
+        """Add an object, numbered in order; the last ones are left out where there are too many."""
+        if len(self.centres) < MAX_OBJECTS:
+            self.parts.append((mesh, OBJECT + len(self.centres)))
+            self.centres.append((mesh[0].min(axis=0) + mesh[0].max(axis=0)) / 2)
+
+    def any_of_pool(self) -> PoolMesh:
+        """An object of the pool."""
+        return self.pool[int(self.rng.integers(len(self.pool)))]
+
+
+def draw_scene(
+    rng: np.random.Generator, pool: Sequence[PoolMesh], arms: Sequence[Mesh]
+) -> SceneMeshes:
+    """Any of the kinds of scenes."""
+    kinds = {_table: 0.34, _bin: 0.33, _shelf: 0.17, _tray: 0.09, _floor: 0.07}
+    shares = np.array(list(kinds.values()))
+    make = list(kinds)[int(rng.choice(len(kinds), p=shares / shares.sum()))]
+    scene = SceneMeshes(rng, pool, arms)
+    make(scene)
+    return scene
+
+
+def _table(scene: SceneMeshes) -> None:
+    rng, scene.elevation = scene.rng, (0.12, 1.57)
+    x, y = half = (rng.uniform(0.25, 0.9), rng.uniform(0.2, 0.6))
+    height = rng.uniform(0.3, 0.95)
+    scene.add(_surface(rng, half, rng.choice([0.0, 0.0, 0.012])), SUPPORT)
+    scene.add_box((2 * x, 2 * y, 0.03), (0, 0, -0.03))
+    middle = -0.04 - height / 2
+    if rng.random() < 0.5:
+        scene.add_box((2 * x, 2 * y, height), (0, 0, middle))
+    else:
+        for leg in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            place = leg[0] * 0.9 * x, leg[1] * 0.9 * y, middle
+            scene.add_box((0.05, 0.05, height), place)
+    _room(scene, -height - 0.04)
+    if rng.random() < 0.25:  # a step in the table, or another one beside it
+        side = rng.uniform(0.15, 0.6)
+        step = rng.choice([-1, 1, -1]) * rng.uniform(0.01, 0.25)
+        scene.add_box((2 * side, 2.2 * y, 0.3), (x + side, 0, step - 0.15))
+    heights = HeightMap(half)
+    _distractors(scene, heights)
+    _fill(scene, heights)
+    _add_arm(scene)
+
+
+def _floor(scene: SceneMeshes) -> None:
+    scene.elevation, scene.distance = (0.2, 1.57), (0.5, 2.2)
+    _room(scene, 0.0, SUPPORT)
+    heights = HeightMap((0.7, 0.7))
+    _distractors(scene, heights)
+    _fill(scene, heights)
+    _add_arm(scene)
+
+
+def _bin(scene: SceneMeshes) -> None:
+    rng, scene.distance, scene.spread = scene.rng, (0.4, 1.5), 0.07
+    half = (rng.uniform(0.12, 0.35), rng.uniform(0.1, 0.28))
+    depth = rng.uniform(0.03, 0.35)
+    flush = rng.random() < 0.2
+    scene.elevation = (0.45 if depth < 0.1 else 0.75, 1.57)
+    scene.add(_surface(rng, half, 0.004), SUPPORT)
+    _open_box(scene, half, depth, flush)
+    scene.add_box((2 * half[0] + 0.004, 2 * half[1] + 0.004, 0.01), (0, 0, -0.012))
+    heights = HeightMap(half, walls=depth)
+    fill = rng.uniform(-0.15, 1.5)
+    around = rng.uniform(0.3, 1.0) * max(half)
+    while fill > 0 and len(scene.centres) < 70:
+        if heights.within(half).mean() > fill * depth * 0.9:
+            break
+        put = _lay_objects(scene, heights, 3, "heap", around=around, ceiling=depth + 0.16)
+        if not put and rng.random() < 0.3:
+            break
+    below = -0.013
+    if rng.random() < 0.5 and not flush:  # on a table, on which others may lie
+        x, y = table = (half[0] + rng.uniform(0.1, 0.6), half[1] + rng.uniform(0.1, 0.6))
+        beside = rng.random() < 0.25
+        top = box((2 * x, 2 * y, 0.04), (0, 0, below - 0.02))
+        scene.add(top, SUPPORT if beside else OTHER)
+        if beside:
+            near = HeightMap(table)
+            near.within((half[0] + 0.08, half[1] + 0.08))[:] = 1.0
+            _lay_objects(scene, near, int(rng.integers(1, 6)), "spread", (0, 0, below))
+        below -= 0.04 + rng.uniform(0.2, 0.8)
+    elif not flush and rng.random() < 0.5:
+        below -= rng.uniform(0.0, 0.8)
+    _room(scene, below - 0.001)
+    _add_arm(scene, 0.15)
+
+
+def _tray(scene: SceneMeshes) -> None:
+    """A low tray on a table, objects in it and perhaps beside it."""
+    rng, scene.elevation = scene.rng, (0.35, 1.57)
+    half = (rng.uniform(0.14, 0.32), rng.uniform(0.1, 0.22))
+    depth = rng.uniform(0.01, 0.05)
+    scene.add(_surface(rng, half, 0.002), SUPPORT)
+    _open_box(scene, half, depth, flush=False)
+    _fill(scene, HeightMap(half))
+    x, y = table = (half[0] + rng.uniform(0.1, 0.6), half[1] + rng.uniform(0.1, 0.5))
+    scene.add(box((2 * x, 2 * y, 0.04), (0, 0, -0.031)), SUPPORT)
+    near = HeightMap(table)
+    near.within((half[0] + 0.07, half[1] + 0.07))[:] = 1.0
+    if rng.random() < 0.6:
+        _lay_objects(scene, near, int(rng.integers(1, 7)), "spread", (0, 0, -0.011))
+    _room(scene, -0.05 - rng.uniform(0.3, 0.8))
+    _add_arm(scene)
+
+
+def _shelf(scene: SceneMeshes) -> None:
+    """Boards one above the other, seen from the front (+x)."""
+    rng, scene.azimuth, scene.distance = scene.rng, (-0.7, 0.7), (0.4, 1.4)
+    x, y = half = (rng.uniform(0.12, 0.3), rng.uniform(0.2, 0.6))
+    gap, board = rng.uniform(0.22, 0.55), rng.uniform(0.01, 0.04)
+    levels = int(rng.integers(1, 4))
+    main = int(rng.integers(levels))
+    back, sides = rng.random() < 0.8, rng.random() < 0.8
+    for number in range(levels):
+        level = (number - main) * (gap + board)
+        before = len(scene.centres)
+        if number == main or rng.random() < 0.6:
+            how = str(rng.choice(["spread", "touching", "heap"], p=[0.5, 0.35, 0.15]))
+            count, origin = _count(rng, 6), (0.0, 0.0, level)
+            _lay_objects(scene, HeightMap(half), count, how, origin, 0.15, gap - 0.02)
+        used = number == main or len(scene.centres) > before
+        slab = box((2 * x, 2 * y, board), (0, 0, level - board / 2))
+        scene.add(slab, SUPPORT if used else OTHER)
+    top = (levels - main) * (gap + board)
+    low = -main * (gap + board) - board
+    tall, middle = top - low, (top + low) / 2
+    if rng.random() < 0.8:
+        scene.add_box((2 * x, 2 * y, board), (0, 0, top - board / 2))
+    if back:
+        scene.add_box((0.01, 2 * y, tall), (-x - 0.005, 0, middle))
+    if sides:
+        for sign in (-1, 1):
+            scene.add_box((2 * x, board, tall), (0, sign * (y + board / 2), middle))
+    for wall in np.arange(-y, y, rng.uniform(0.3, 0.9))[1:]:
+        if rng.random() < 0.15:
+            scene.add_box((2 * x, board, tall), (0, wall, middle))
+    scene.add_box((0.1, 8, 4), (-x - rng.uniform(0.05, 1.5), 0, 0))
+    _room(scene, low - rng.uniform(0.02, 1.2))
+    scene.elevation = (0.2, 1.0) if rng.random() < 0.3 else (-0.05, 0.75)
+    _add_arm(scene, 0.1)
+
+
+def _fill(scene: SceneMeshes, heights: "HeightMap") -> None:
+    """Objects on a table: apart, touching, or in a heap."""
+    rng = scene.rng
+    how = str(rng.choice(["spread", "touching", "heap"], p=[0.45, 0.3, 0.25]))
+    count = _count(rng, {"spread": 6, "touching": 9, "heap": 11}[how])
+    _lay_objects(scene, heights, count, how, around=rng.uniform(0.05, 0.22))
+
+
+def _count(rng: np.random.Generator, mean: float) -> int:
+    return 0 if rng.random() < EMPTY_SHARE else 1 + int(rng.poisson(mean))
+
+
+def _room(scene: SceneMeshes, floor: float, label: int = OTHER) -> None:
+    """A floor at a height, walls, and large background around."""
+    rng = scene.rng
+    if label == SUPPORT or rng.random() < 0.85:
+        scene.add(box((30, 30, 0.02), (0, 0, floor - 0.01)), label)
+    for yaw in rng.uniform(0, 2 * np.pi) + np.arange(4) * np.pi / 2:
+        if rng.random() < 0.45:
+            away = rng.uniform(0.6, 6.0)
+            scene.add_box((0.1, 14, 3.5), (*_aside(yaw, away), floor + 1.7), yaw)
+    for _ in range(int(rng.integers(0, 6))):
+        yaw, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.9, 4.0)
+        size = rng.uniform(0.1, 0.9, 3)
+        stand = floor + (rng.uniform(0, 0.6) if rng.random() < 0.3 else 0.0)
+        scene.add_box(size, (*_aside(yaw, away), stand + size[2] / 2), rng.uniform(0, 3))
+    for _ in range(int(rng.integers(0, 5))):  # small background out of reach
+        yaw, away = rng.uniform(0, 2 * np.pi), rng.uniform(1.2, 3.0)
+        points, triangles = scene.any_of_pool().mesh
+        points = points * rng.uniform(1.0, 3.0)
+        place = np.array([*_aside(yaw, away), floor - points[:, 2].min()])
+        scene.add((points + place, triangles))
+
+
+def _aside(yaw: float, away: float) -> Float64:
+    """A place (2,) at a distance in a direction."""
+    return away * np.array([np.cos(yaw), np.sin(yaw)])
+
+
+def _distractors(scene: SceneMeshes, heights: "HeightMap") -> None:
+    """Large or fixed background on a support: cartons, boards, monitors, pillars, cables."""
+    rng = scene.rng
+    boxes = {  # least and greatest size: cartons, boards, pillars
+        0: ((0.38, 0.1, 0.04), (0.75, 0.5, 0.5)),
+        2: ((0.38, 0.04, 0.006), (0.9, 0.45, 0.06)),
+        3: ((0.03, 0.03, 0.4), (0.12, 0.12, 1.2)),
+    }
+
+    def put(mesh: Mesh) -> None:
+        samples = pool_mesh(rng, mesh)
+        centre = (mesh[0].min(axis=0) + mesh[0].max(axis=0)) / 2
+        heights.put(samples.samples + centre)
+        scene.add(mesh)
+
+    for _ in range(int(rng.integers(0, 5))):
+        yaw, sides = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 1.1)
+        place = sides * np.array([rng.choice([-1, 1]), rng.choice([-1, 1])]) * heights.half
+        if rng.random() < 0.5:
+            place[int(rng.integers(2))] *= rng.uniform(-1, 1)
+        kind = int(rng.integers(7))
+        if kind in boxes:
+            size = rng.uniform(*boxes[kind])
+            put(box(size, (*place, size[2] / 2), yaw))
+        elif kind == 1:  # a monitor
+            size = rng.uniform((0.38, 0.015, 0.2), (0.7, 0.05, 0.6))
+            stand = rng.uniform(0.0, 0.2)
+            panel = box(size, (*place, stand + size[2] / 2), yaw)
+            pole = box((0.05, 0.05, stand + 0.01), (*place, stand / 2), yaw)
+            foot = box((0.22, 0.18, 0.012), (*place, 0.006), yaw)
+            put(merged([panel, pole, foot]))
+        elif kind == 4:  # boards or cartons on top of each other
+            low = 0.0
+            for _ in range(int(rng.integers(2, 4))):
+                size = rng.uniform((0.38, 0.12, 0.01), (0.6, 0.35, 0.12))
+                shift = rng.normal(0.0, 0.02, 2)
+                put(box(size, (*(place + shift), low + size[2] / 2), yaw + rng.normal(0.0, 0.1)))
+                low += size[2]
+        elif kind == 5:  # something of any shape, too large to lift
+            points, triangles = scene.any_of_pool().mesh
+            points = points * (rng.uniform(0.42, 0.9) / np.ptp(points, axis=0).max())
+            put((points @ _turn(yaw).T + (*place, -points[:, 2].min()), triangles))
+        else:
+            put(_cable(rng, place))
+
+
+def _cable(rng: np.random.Generator, place: Float64) -> Mesh:
+    """A long bent tube on the support."""
+    heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0.0, 0.18, 50))
+    step = rng.uniform(0.012, 0.03)
+    way = place + np.cumsum(step * np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
+    radius = rng.uniform(0.002, 0.008)
+    angle = 2 * np.pi * np.arange(6) / 6
+    side = np.stack([-np.sin(heading), np.cos(heading)], 1)
+    points = np.concatenate(
+        [
+            (way[:, None] + radius * np.cos(angle)[None, :, None] * side[:, None]),
+            np.broadcast_to(radius + radius * np.sin(angle)[None, :, None], (50, 6, 1)),
+        ],
+        axis=2,
+    )
+    this = (np.arange(49)[:, None] * 6 + np.arange(6)).ravel()
+    beside = (np.arange(49)[:, None] * 6 + (np.arange(6) + 1) % 6).ravel()
+    return points.reshape(-1, 3), np.concatenate(
+        [np.stack([this, beside, beside + 6], 1), np.stack([this, beside + 6, this + 6], 1)]
+    )
+
+
+def _add_arm(scene: SceneMeshes, share: float = 0.25) -> None:
+    """A robot that reaches into the picture."""
+    rng = scene.rng
+    if scene.arms and rng.random() < share:
+        points, triangles = scene.arms[int(rng.integers(len(scene.arms)))]
+        turn = _turn(rng.uniform(0, 2 * np.pi))
+        place = (*rng.normal(0.0, 0.25, 2), scene.level + rng.uniform(0.02, 0.5))
+        scene.add((points @ turn.T + place, triangles))
+
+
+def _open_box(scene: SceneMeshes, half: tuple[float, float], depth: float, flush: bool) -> None:
+    """Four walls of an open box whose floor is at 0: vertical or sloped, perhaps ribbed."""
+    rng = scene.rng
+    slope = depth * rng.uniform(0.0, 0.6) if rng.random() < 0.5 else 0.0
+    wall = rng.uniform(0.003, 0.025)
+    if flush:
+        rim, low, behind = rng.uniform(0.3, 1.0), 0.0, depth - 0.02
+    else:
+        rim = wall + (rng.uniform(0.0, 0.03) if rng.random() < 0.5 else 0.0)
+        low, behind = -0.01, depth - 0.008
+    inner, top = np.array(half), np.array(half) + slope
+    outline = [(inner, low), (top, depth), (top + rim, depth), (top + wall, behind)]
+    outline.append((inner + wall, low))
+    strips = np.array([(0, 1, 3), (0, 3, 2)]) + 2 * np.arange(len(outline) - 1)[:, None, None]
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    for k in range(4):
+        ends = corners[k], corners[(k + 1) % 4]
+        points = np.array([(*(end * size), z) for size, z in outline for end in ends])
+        scene.add((points, strips.reshape(-1, 3)))
+    if rng.random() < 0.3:
+        pitch = rng.uniform(0.03, 0.1)
+        for axis in (0, 1):
+            size = np.full(3, 0.006)
+            size[axis], size[2] = slope + 0.008, depth
+            for place in np.arange(-half[1 - axis] + 0.02, half[1 - axis], pitch):
+                for sign in (-1, 1):
+                    centre = np.full(3, depth / 2)
+                    centre[axis], centre[1 - axis] = sign * (half[axis] + slope / 2), place
+                    scene.add_box(size, centre)
+
+
+def _surface(rng: np.random.Generator, half: tuple[float, float], bow: float) -> Mesh:
+    """A level rectangle, bowed by up to `bow` metres as a cloth or a warped board is."""
+    n = 24
+    x, y = np.meshgrid(np.linspace(-half[0], half[0], n), np.linspace(-half[1], half[1], n))
+    z = np.zeros_like(x)
+    for _ in range(4):
+        wave = rng.normal(0.0, 4.0, 2)
+        z += rng.normal(0.0, 0.5) * np.sin(wave[0] * x + wave[1] * y + rng.uniform(0, 6.3))
+    z = bow * z / max(np.abs(z).max(), 1e-9) * (rng.random() if bow else 0.0)
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    return points, np.concatenate(
+        [np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)]
+    )
+
+
+def box(size: ArrayLike, centre: ArrayLike, yaw: float = 0.0) -> Mesh:
+    """A box; size and centre (3,) metres."""
+    corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    return (corners * np.asarray(size)) @ _turn(yaw).T + np.asarray(centre), _BOX_FACES
+
+
+_BOX_FACES = np.array(
+    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+)  # fmt: skip
+
+
+class HeightMap:
+    """How high what lies on a level surface reaches; objects are put down on it."""
+
+    def __init__(self, half: tuple[float, float], walls: float = 0.0) -> None:
+        """Free inside of a rectangle.
+
+        Args:
+            half: of its length and width, metres.
+            walls: metres, height outside of it.
+        """
+        size = round(2 * REACH / CELL)
+        self.height = np.full((size, size), walls)
+        self.half = half
+        self.within(half)[:] = 0.0
+
+    def within(self, half: tuple[float, float]) -> Float64:
+        """The heights in a rectangle around the origin; a view."""
+        low = [round((REACH - min(each, REACH)) / CELL) for each in half]
+        size = len(self.height)
+        return self.height[low[0] : size - low[0], low[1] : size - low[1]]
+
+    def cells(self, points: Float64) -> tuple[Int64, Int64]:
+        """The cells below points (N, 3)."""
+        index = ((points[:, :2] + REACH) / CELL).astype(np.int64)
+        index = np.clip(index, 0, len(self.height) - 1)
+        return index[:, 0], index[:, 1]
+
+    def rest(self, points: Float64) -> float:
+        """How far an object with these surface points (N, 3) has to be raised to lie."""
+        return float((self.height[self.cells(points)] - points[:, 2]).max())
+
+    def put(self, points: Float64) -> None:
+        """Let an object lie there."""
+        np.maximum.at(self.height, self.cells(points), points[:, 2])
+
+
+def _lay_objects(
+    scene: SceneMeshes,
+    heights: HeightMap,
+    count: int,
+    how: str,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    around: float = 0.25,
+    ceiling: float = np.inf,
+) -> int:
+    """Put objects down: `spread` apart, `touching` beside each other, or in a `heap`.
+
+    Args:
+        scene: Gets them.
+        heights: What lies there; its origin is `origin` of the scene.
+        count: How many are tried.
+        how: As above.
+        origin: (3,) metres.
+        around: Metres, standard deviation of their places where they lie in a heap.
+        ceiling: Metres above which nothing reaches.
+
+    Returns:
+        How many were put down.
+    """
+    rng, put = scene.rng, 0
+    pose = ("any", "lying") if how == "heap" else ("upright", "lying")
+    lying = rng.random()
+    for _ in range(count):
+        drawn = scene.any_of_pool()
+        (points, triangles), samples = _turned(rng, drawn, pose[int(rng.random() < lying)])
+        half = np.ptp(points, axis=0)[:2] / 2
+        room = np.array(heights.half) - half
+        if (room <= 0).any():
+            continue
+        offset = _lowest_place(rng, samples, heights, how, room, around, ceiling)
+        if offset is None:
+            continue
+        heights.put(samples + offset)
+        scene.add_object((points + offset + origin, triangles))
+        put += 1
+    return put
+
+
+def _lowest_place(
+    rng: np.random.Generator,
+    samples: Float64,
+    heights: HeightMap,
+    how: str,
+    room: Float64,
+    around: float,
+    ceiling: float,
+) -> Float64 | None:
+    """The shift (3,) that puts an object's points lowest, of some tried; None: it fits nowhere."""
+    best: tuple[float, Float64] | None = None
+    for _ in range(1 if how == "heap" else 10):
+        place = rng.uniform(-room, room)
+        if how != "spread":
+            place = np.clip(rng.normal(0.0, around, 2), -room, room)
+        moved = samples + np.array([*place, 0.0])
+        apart = [moved, moved + APART, moved - APART] if how == "spread" else [moved]
+        rise = heights.rest(np.concatenate(apart))
+        lowest = rise + samples[:, 2].min()
+        if how != "heap" and lowest > 0.004:
+            continue
+        if rise + samples[:, 2].max() < ceiling and (best is None or lowest < best[0]):
+            best = (lowest, np.array([*place, rise]))
+        if best is not None and how == "spread":
+            break
+    return None if best is None else best[1]
+
+
+def _turned(rng: np.random.Generator, drawn: PoolMesh, how: str) -> PoolMesh:
+    """An object stretched and turned: upright, lying on a face of its hull, or any way."""
+    (points, triangles), samples = drawn
+    factor = np.exp(rng.normal(0.0, 0.12, 3) + rng.normal(0.0, 0.12))
+    longest = np.ptp(points, axis=0).max() * factor.max()
+    factor *= min(1.0, LONGEST_OBJECT / longest)
+    turn = _turn(rng.uniform(0, 2 * np.pi))
+    if how == "any":
+        turn = Rotation.random(rng=rng).as_matrix()
+    elif how == "lying":
+        try:
+            hull = ConvexHull(samples * factor)
+            size = 0.5 * np.linalg.norm(
+                np.cross(*np.diff(hull.points[hull.simplices], axis=1).transpose(1, 0, 2)), axis=1
+            )
+            down = hull.equations[int(rng.choice(len(size), p=size / size.sum())), :3]
+            to_down, _ = Rotation.align_vectors([[0, 0, -1]], [down])
+            turn = turn @ to_down.as_matrix()
+        except QhullError:
+            pass
+    scaled = factor * np.ones(3)
+    return PoolMesh(((points * scaled) @ turn.T, triangles), (samples * scaled) @ turn.T)
+
+
+def _turn(yaw: float) -> Float64:
+    """A rotation (3, 3) about z."""
+    return Rotation.from_euler("z", yaw).as_matrix()
