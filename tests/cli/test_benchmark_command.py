@@ -124,21 +124,3 @@ def test_a_server_killed_and_restarted_changes_nothing(
         again = benchmark(shaken, "server", "--server", first.grpc_address, rounds=2)
         thread.join()
     assert again["attempts_digest"] == calm["attempts_digest"]
-
-
-def test_a_server_that_asks_for_a_token_gets_it(
-    start_dummy: Callable,
-    benchmark: Callable,
-    refused,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("EDGEGRASP_CLIENT_TOKEN", raising=False)
-    token = tmp_path / "token"
-    token.write_text("user-token-0123456789\n")
-    with start_dummy("--token-file", str(token)) as server:
-        asked = ("--server", server.grpc_address)
-        known = benchmark(tmp_path / "known", "server", *asked, "--token-file", token, rounds=1)
-        assert known["attempts"] > 0
-        where = ("--rounds", 1, "--seed", 0, "--workers", 1)
-        assert "authorization: got nothing" in refused("benchmark", *where, *asked)

@@ -29,6 +29,7 @@ image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
 
 PROGRAM = [*EDGEGRASP[1:], "mcp"]
 CAMERA = [60.0, 60.0, 15.5, 11.5]
+CLOUD, DEPTH = "generate_grasps_from_point_cloud", "generate_grasps_from_depth"
 
 
 @pytest.fixture
@@ -48,12 +49,10 @@ def folder(tmp_path: Path) -> Path:
 
 @asynccontextmanager
 async def agent(address: str, folder: Path) -> AsyncIterator[Any]:
-    flags = ["--server", address, "--folder", str(folder)]
-    program = mcp.StdioServerParameters(
-        command=sys.executable, args=[*PROGRAM, *flags], env=dict(os.environ)
-    )
-    async with mcp.Client(program, read_timeout_seconds=120) as client:
-        yield client
+    """A client of the tools, in this process."""
+    with GraspClient(address) as client:
+        async with mcp.Client(grasp_tools(client, folder)) as agent:
+            yield agent
 
 
 def answer(result: Any) -> Any:
@@ -62,16 +61,18 @@ def answer(result: Any) -> Any:
 
 
 async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) -> None:
-    async with agent(dummy_server.grpc_address, folder) as client:
+    words = [*PROGRAM, "--server", dummy_server.grpc_address, "--folder", str(folder)]
+    program = mcp.StdioServerParameters(command=sys.executable, args=words, env=dict(os.environ))
+    async with mcp.Client(program, read_timeout_seconds=120) as client:
         tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         assert set(tools) == {
-            "generate_grasps_from_point_cloud",
-            "generate_grasps_from_depth",
+            CLOUD,
+            DEPTH,
             "visualize_grasps",
             "edgegrasp_health_check",
             "edgegrasp_server_info",
         }
-        schema = tools["generate_grasps_from_depth"].input_schema
+        schema = tools[DEPTH].input_schema
         options = schema["properties"]["options"]["properties"]
         assert {"objects", "near", "workspace"} <= set(options)
         jsonschema.Draft202012Validator.check_schema(schema)
@@ -88,8 +89,8 @@ async def test_an_agent_gets_grasps_and_sees_them(dummy_server, folder: Path) ->
         assert info["robots"] == []
 
         asked = {"point_cloud_file": "cloud.npy", "num_grasps": 3, "options": {"seed": 7}}
-        found = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
-        again = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
+        found = answer(await client.call_tool(CLOUD, asked))
+        again = answer(await client.call_tool(CLOUD, asked))
         assert found == again
         assert len(found["grasps"]) == 3
         grasp = found["grasps"][0]
@@ -116,7 +117,7 @@ async def test_a_camera_pose_puts_answers_into_the_base_frame(dummy_server, fold
     with GraspClient(dummy_server.grpc_address) as client:
         expected = client.detect(depth_images=[view], top_k=5).grasps
     async with agent(dummy_server.grpc_address, folder) as client:
-        found = answer(await client.call_tool("generate_grasps_from_depth", asked))
+        found = answer(await client.call_tool(DEPTH, asked))
     for grasp, wanted in zip(found["grasps"], expected, strict=True):
         np.testing.assert_allclose(grasp["tcp_position"], wanted.T_cloud_tcp[:3, 3], atol=1e-4)
 
@@ -127,7 +128,7 @@ async def test_a_file_with_a_depth_image_and_its_camera(dummy_server, folder: Pa
     np.savez(folder / "scene.npz", depth=depth, intrinsics=np.array(CAMERA), rgb=rgb, labels=depth)
     async with agent(dummy_server.grpc_address, folder) as client:
         asked = {"point_cloud_file": "scene.npz", "num_grasps": 2}
-        found = answer(await client.call_tool("generate_grasps_from_point_cloud", asked))
+        found = answer(await client.call_tool(CLOUD, asked))
         assert len(found["grasps"]) == 2
         shown = await client.call_tool("visualize_grasps", asked)
     seen = np.asarray(
@@ -144,59 +145,40 @@ def test_a_folder_that_is_not_there_is_refused() -> None:
 async def test_a_mask_is_sent_and_most_grasps_fit_a_context(dummy_server, folder: Path) -> None:
     async with agent(dummy_server.http_url, folder) as client:
         asked = {"depth_file": "depth.png", "intrinsics": CAMERA, "num_grasps": 20}
-        result = await client.call_tool("generate_grasps_from_depth", asked)
+        result = await client.call_tool(DEPTH, asked)
         assert 1 <= len(answer(result)["grasps"]) <= 20
         assert len(result.content[0].text) < 300 * 20
         shown = await client.call_tool("visualize_grasps", asked | {"mask_file": "mask.png"})
         assert shown.content[1].type == "image"
 
 
+NO_BASE = {"depth_file": "depth.png", "intrinsics": CAMERA, "robot": {"name": "fr3"}}
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments", "told"),
     [
-        ("generate_grasps_from_point_cloud", {"point_cloud_file": "none.npy"}, "none.npy"),
-        ("generate_grasps_from_point_cloud", {"point_cloud_file": "../outside.npy"}, "not below"),
-        ("generate_grasps_from_point_cloud", {"point_cloud_file": "pipe.npy"}, "no file"),
-        ("generate_grasps_from_depth", {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
-        (
-            "generate_grasps_from_point_cloud",
-            {"point_cloud_file": "cloud.npy", "object": "bottle"},
-            "object",
-        ),
-        (
-            "generate_grasps_from_point_cloud",
-            {"point_cloud_file": "cloud.npy", "num_grasps": -3},
-            "greater than or equal to 1",
-        ),
+        (CLOUD, {"point_cloud_file": "none.npy"}, "none.npy"),
+        (CLOUD, {"point_cloud_file": "../outside.npy"}, "not below"),
+        (CLOUD, {"point_cloud_file": "pipe.npy"}, "no file"),
+        (CLOUD, {"object": "bottle"}, "object"),
+        (CLOUD, {"num_grasps": -3}, "greater than or equal to 1"),
+        (CLOUD, {"robot": {"name": "r2d2", "joints": [0.0]}}, "options.robot.name"),
+        (CLOUD, {"robot": {"name": "fr3"}}, "options.robot.joints"),
+        (CLOUD, {"options": {"tok_k": 1}}, "options.tok_k"),
+        (DEPTH, {"depth_file": "depth.png", "intrinsics": [1]}, "fx, fy"),
+        (DEPTH, NO_BASE, "give T_base_camera"),
         ("visualize_grasps", {}, "Give point_cloud_file, or depth_file"),
-        (
-            "generate_grasps_from_point_cloud",
-            {"point_cloud_file": "cloud.npy", "robot": {"name": "r2d2", "joints": [0.0]}},
-            "options.robot.name",
-        ),
-        (
-            "generate_grasps_from_point_cloud",
-            {"point_cloud_file": "cloud.npy", "robot": {"name": "fr3"}},
-            "options.robot.joints",
-        ),
-        (
-            "generate_grasps_from_depth",
-            {"depth_file": "depth.png", "intrinsics": CAMERA, "robot": {"name": "fr3"}},
-            "give T_base_camera",
-        ),
-        (
-            "generate_grasps_from_point_cloud",
-            {"point_cloud_file": "cloud.npy", "options": {"tok_k": 1}},
-            "options.tok_k",
-        ),
     ],
 )
 async def test_what_is_wrong_reaches_the_agent(dummy_server, folder, tool, arguments, told) -> None:
+    if tool == CLOUD:
+        arguments = {"point_cloud_file": "cloud.npy"} | arguments
     async with agent(dummy_server.grpc_address, folder) as client:
         result = await client.call_tool(tool, arguments)
-        assert result.is_error
-        assert told in result.content[0].text
-        assert str(folder.parent) not in result.content[0].text
+    assert result.is_error
+    assert told in result.content[0].text
+    assert str(folder.parent) not in result.content[0].text
 
 
 class Planning:
@@ -236,7 +218,7 @@ async def test_an_agent_gets_the_joints_of_a_robot(dummy_server, folder, reaches
             with pytest.raises(jsonschema.ValidationError):
                 jsonschema.validate(asked | {"robot": {"name": "arm"}}, tool.input_schema)
             call = asked | {"robot": robot, "num_grasps": 2}
-            found = answer(await agent.call_tool("generate_grasps_from_depth", call))
+            found = answer(await agent.call_tool(DEPTH, call))
     assert planning.robot == robot | {"T_base_cloud": np.eye(4).ravel().tolist()}
     far = {"reachable": False}
     near = {
@@ -269,7 +251,5 @@ def http_address(dummy_server, folder: Path) -> Iterator[str]:
 
 async def test_the_tools_over_http(http_address: str) -> None:
     async with mcp.Client(http_address) as client:
-        found = await client.call_tool(
-            "generate_grasps_from_point_cloud", {"point_cloud_file": "cloud.npy"}
-        )
+        found = await client.call_tool(CLOUD, {"point_cloud_file": "cloud.npy"})
         assert len(answer(found)["grasps"]) == 5

@@ -20,13 +20,16 @@ def test_pages_work_without_internet(dummy_server) -> None:
                 assert http.get(page.url.join(link)).status_code == 200
 
 
-def test_the_front_page_is_the_playground_or_that_of_the_api(dummy_server, start_dummy) -> None:
-    front = httpx.get(dummy_server.http_url, follow_redirects=True)
-    assert front.url.path == "/playground/"
-    assert "default-src 'none'" in front.headers["content-security-policy"]
-    with start_dummy("--no-playground") as server:
-        assert httpx.get(server.http_url, follow_redirects=True).url.path == "/docs"
-        assert httpx.get(f"{server.http_url}/playground/").status_code == 404
+async def test_the_front_page_is_the_playground_or_that_of_the_api(serve) -> None:
+    for playground, path, status in ((True, "/playground/", 200), (False, "/docs", 404)):
+        url = (await serve(playground=playground)).server.http_url
+        async with httpx.AsyncClient(base_url=url, follow_redirects=True) as http:
+            front = await http.get("/")
+            assert front.url.path == path
+            assert (
+                "default-src 'none'" in front.headers["content-security-policy"] or not playground
+            )
+            assert (await http.get("/playground/")).status_code == status
 
 
 def test_head_is_get_without_the_body(dummy_server) -> None:
