@@ -1,5 +1,6 @@
 // The page: what is asked, of the same API as anyone's, and what is shown of the answer.
 
+import { beside } from "./arm.js";
 import { NeedsCamera, readScene } from "./files.js";
 import { View, colorOf, partsOf } from "./view.js";
 
@@ -15,7 +16,7 @@ const FIELDS = { region: BOX, workspace: BOX, cone: ["direction"] }; // of shape
 const $ = (id) => document.getElementById(id);
 const state = {
   files: [], scene: null, answer: null, fresh: true, // answer: its grasps by score; fresh: the first of its scene
-  shapes: {}, target: {}, objects: [], // of the request; target: options; objects: what it may be
+  robots: [], shapes: {}, target: {}, objects: [], // of the request; target: options; objects: what it may be
   grippers: {}, gripper: null, chosen: null, busy: null,
 };
 const view = picture();
@@ -63,6 +64,7 @@ async function openSample() {
 async function open(files) {
   state.files = files;
   [state.answer, state.scene, state.fresh, state.target] = [null, null, true, {}];
+  $("base").value = "";
   const image = files.some(({ name }) => /\.png$/i.test(name));
   $("camera").hidden = !image;
   try {
@@ -107,9 +109,20 @@ function options() {
     found.workspace = rounded({ min: corner(-1), max: corner(1) });
   }
   Object.assign(found, state.target);
+  const base = numbers($("base").value, 16);
+  if (robot() && base) found.robot = { name: robot().name, T_base_cloud: base, joints: joints() };
   if ($("debug").checked) found.debug = true;
   const more = $("more").value.trim();
   return more ? { ...found, ...JSON.parse(more) } : found;
+}
+
+/** The arm that is chosen. */
+function robot() {
+  return state.robots.find(({ name }) => name === $("robot").value);
+}
+
+function joints() {
+  return numbers($("joints").value, robot().home.length) ?? robot().home;
 }
 
 function rounded(shape, digits = 5) {
@@ -126,6 +139,7 @@ function parts(asked) {
 /** Ask for grasps, and show them; the newest request wins. */
 async function ask() {
   if (!state.scene && !(state.files.length && (await open(state.files)))) return;
+  if (robot() && !$("base").value && state.answer?.objects.length) $("base").value = rounded(beside(state.answer, view.eye ?? [0, 0, 0]), 6);
   let asked;
   try {
     asked = options();
@@ -141,12 +155,14 @@ async function ask() {
     const body = new FormData();
     for (const [name, value] of parts(asked)) body.append(name, value);
     const answer = await call("/v1/grasps", { method: "POST", signal: stop.signal, body });
-    answer.grasps.sort((one, other) => other.score - one.score);
+    if (!asked.robot) answer.grasps.sort((one, other) => other.score - one.score);
     [state.answer, state.gripper] = [answer, gripperOf(asked, answer.model)];
     view.showAnswer(answer, state.gripper, state.fresh);
     state.fresh = false;
+    view.showArm(asked.robot && robot(), asked.robot?.T_base_cloud);
     showAnswer();
     say(`${((performance.now() - start) / 1000).toFixed(2)} s, of which ${answer.seconds.total.toFixed(2)} s detecting, by ${answer.model}.`);
+    if (robot() && !asked.robot && answer.objects.length) return ask();
   } catch (error) {
     if (error.name !== "AbortError") say(error.message, true);
   } finally {
@@ -161,7 +177,7 @@ function gripperOf(asked, model) {
     return { ...rest, hand_boxes: hand.boxes, finger_boxes: finger.boxes, linkage: swing ?? null, palm_z };
   }
   const own = state.models.find(({ name }) => name === model)?.gripper;
-  return state.grippers[asked.gripper || own] ?? state.grippers.panda;
+  return state.grippers[asked.robot ? robot().gripper : asked.gripper || own] ?? state.grippers.panda;
 }
 
 /** What the API answers; its errors are thrown with their own words. */
@@ -183,6 +199,7 @@ async function call(path, { headers = {}, ...rest } = {}) {
 async function listModels() {
   try {
     state.models = (await call("/v1/models")).models;
+    state.robots = (await call("/v1/robots")).robots;
   } catch (error) {
     say(error.message, true);
     if (error.kind !== "urn:edgegrasp:error:not-ready") return false;
@@ -191,6 +208,8 @@ async function listModels() {
   }
   $("model").replaceChildren(...state.models.map(({ name, default: first }) => new Option(name, first ? "" : name)));
   $("model").value = "";
+  $("robot").replaceChildren(new Option("none", ""), ...state.robots.map(({ name }) => new Option(name)));
+  $("robot_row").hidden = !state.robots.length;
   return true;
 }
 
@@ -226,7 +245,8 @@ function line(grasp, row) {
   const meter = Object.assign(element("meter", ""), { min: 0, max: 1, value: grasp.score });
   meter.style.setProperty("--tint", `#${colorOf(grasp.score).getHexString()}`);
   const cells = [row + 1, grasp.score.toFixed(3)].map((text) => element("span", text));
-  button.append(...cells, meter, element("small", grasp.object === null ? "" : `object ${grasp.object}`));
+  const object = grasp.object === null ? "" : `object ${grasp.object}`;
+  button.append(...cells, meter, element("small", grasp.arm?.reachable === false ? `${object}, out of reach` : object));
   button.addEventListener("click", () => choose(row));
   const item = element("li", "");
   item.append(button);
@@ -249,6 +269,7 @@ function choose(row) {
   state.chosen = row;
   const grasp = row === null ? null : state.answer.grasps[row];
   if (state.answer) view.choose(grasp);
+  if (robot()) view.bendArm(grasp?.arm?.grasp_joints ?? joints());
   [...$("grasps").children].forEach((item, each) => item.firstChild.setAttribute("aria-pressed", each === row));
   $("chosen").hidden = !grasp;
   if (!grasp) return;
@@ -265,7 +286,10 @@ function choose(row) {
     "contact point": metres(grasp.contact_point),
     clearance: `${(1000 * grasp.clearance).toFixed(1)} mm${grasp.collision_free ? "" : ", collides"}`,
     object: grasp.object ?? "none",
+    ...(grasp.arm && { arm: grasp.arm.reachable ? "within reach" : "out of reach" }),
+    ...(grasp.arm?.trajectory && { motion: `${grasp.arm.trajectory.times.at(-1).toFixed(1)} s` }),
   };
+  $("play").hidden = !grasp.arm?.trajectory;
   $("numbers").replaceChildren(...Object.entries(facts).flatMap(([name, text]) => [element("dt", name), element("dd", text)]));
   $("chosen_json").textContent = JSON.stringify(grasp, null, 1);
 }
@@ -450,6 +474,12 @@ $("pick").addEventListener("click", ({ target }) => {
   const on = target.getAttribute("aria-pressed") !== "true";
   press(on ? target : null);
   if (on) say("Click a point of the object that is meant.");
+});
+$("play").addEventListener("click", () => view.playArm(state.answer.grasps[state.chosen].arm.trajectory));
+$("robot").addEventListener("change", () => {
+  $("arm_row").hidden = !robot();
+  $("joints").value = robot() ? rounded(robot().home, 4) : "";
+  ask();
 });
 $("keep").addEventListener("click", () => ($("debug").checked = true) && ask());
 $("approach").addEventListener("change", ({ target }) => {

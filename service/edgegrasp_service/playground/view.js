@@ -4,6 +4,7 @@
 
 import * as THREE from "./vendor/three.module.min.js";
 import { OrbitControls } from "./vendor/OrbitControls.js";
+import { Arm } from "./arm.js";
 import { TransformControls } from "./vendor/TransformControls.js";
 
 const UP = new THREE.Vector3(0, 0, 1);
@@ -52,7 +53,7 @@ export class View {
     sun.position.set(0.5, -1, 2);
     this.world.add(this.root, new THREE.HemisphereLight("white", "#556", 2.2), sun);
     this.groups = {};
-    for (const name of ["cloud", "frame", "plane", "objects", "hands", "chosen", "rejected"]) {
+    for (const name of ["cloud", "frame", "plane", "objects", "hands", "chosen", "rejected", "arm"]) {
       this.root.add((this.groups[name] = new THREE.Group()));
     }
     this.shapes = {};
@@ -307,6 +308,30 @@ export class View {
       group.add(hand, arrow, ...ends(grasp));
     }
     this.draw();
+  }
+
+  /** Draw an arm of /v1/robots at its home; null: none. */
+  showArm(robot, T_base_cloud) {
+    this.groups.arm.clear();
+    this.arm = null;
+    if (robot) {
+      const hand = this._body({ T_cloud_hand: new THREE.Matrix4().elements, width: this.gripper.max_opening }, "#c9d3e3");
+      this.groups.arm.add((this.arm = new Arm(robot, T_base_cloud, hand)));
+      this.bendArm(robot.home);
+    }
+    this.draw();
+  }
+
+  /** Let the arm be at these joints, or follow a motion. */
+  bendArm(joints) {
+    if (!this.arm) return;
+    this.arm.playing = null;
+    this.arm.bend(joints);
+    this.draw();
+  }
+
+  playArm(motion) {
+    this.arm?.play(motion, () => this.draw());
   }
 
   /** Show outlines of candidates: `T_cloud_hand` of each. */
