@@ -243,14 +243,7 @@ class MujocoWorld(World):
         palm = self._build_hand(body, model)
         for joint in arm.joint_names:
             self.spec.joint(f"{name} {joint}").armature = JOINT_INERTIA
-            self.spec.add_actuator(
-                name=f"{name} {joint}",
-                trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                target=f"{name} {joint}",
-                gainprm=[JOINT_STIFFNESS] + 9 * [0.0],
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                biasprm=[0.0, -JOINT_STIFFNESS, -JOINT_DAMPING] + 7 * [0.0],
-            )
+            self._drive(f"{name} {joint}").set_to_position(JOINT_STIFFNESS, JOINT_DAMPING)
         self._changed = True
         self._hand = added_arm = MujocoArm(self, body, palm, model)
         added_arm.home = np.asarray(arm.home)
@@ -292,16 +285,8 @@ class MujocoWorld(World):
                     priority=2,
                     contype=_HAND,
                 )
-            self.spec.add_actuator(
-                name=finger.name,
-                trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                target=finger.name,
-                gainprm=[FINGER_DAMPING] + 9 * [0.0],
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                biasprm=[0.0, 0.0, -FINGER_DAMPING] + 7 * [0.0],
-                forcelimited=True,
-                forcerange=(-model.finger_force, model.finger_force),
-            )
+            drive = self._drive(finger.name, model.finger_force)
+            drive.set_to_velocity(FINGER_DAMPING)
         *slide, one, other = (joint.name for joint in body.find_all("joint") if joint.name)
         self._couple(one, other, (0.0, 1.0))
         if model.advance is not None:
@@ -344,6 +329,14 @@ class MujocoWorld(World):
         slide.add_joint(name=slide.name, type=kind, axis=(0.0, 0.0, 1.0), armature=FINGER_INERTIA)
         return slide
 
+    def _drive(self, joint: str, force: float | None = None) -> Any:
+        """Add a drive of a joint; it exerts at most a force."""
+        kind = mujoco.mjtTrn.mjTRN_JOINT
+        drive = self.spec.add_actuator(name=joint, trntype=kind, target=joint)
+        if force is not None:
+            drive.forcelimited, drive.forcerange = True, (-force, force)
+        return drive
+
     def _couple(self, joint: str, other: str, polynomial: Sequence[float]) -> None:
         """Keep a joint where a polynomial of another's place has it."""
         self.spec.add_equality(
@@ -363,18 +356,16 @@ class MujocoWorld(World):
         inertia = ARM_INERTIA + body.mass
         damping = 2.0 * (ARM_STIFFNESS * inertia) ** 0.5
         for axis in range(6):
-            self.spec.add_actuator(
+            spring = self.spec.add_actuator(
                 name=f"arm {axis}",
                 trntype=mujoco.mjtTrn.mjTRN_SITE,
                 target="hand",
                 refsite="target",
                 gear=np.eye(6)[axis],
-                gainprm=[ARM_STIFFNESS] + 9 * [0.0],
-                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                biasprm=[0.0, -ARM_STIFFNESS, -damping] + 7 * [0.0],
                 forcelimited=True,
                 forcerange=(-force, force),
             )
+            spring.set_to_position(ARM_STIFFNESS, damping)
 
     def remove(self, body: Any) -> None:
         """Take a body and its meshes away."""
