@@ -1,10 +1,6 @@
-"""A detector of known service time and made-up grasps, to measure and test the service alone.
-
-usage: python benchmarks/dummy.py serve [FLAG ...]    `edgegrasp serve` with it, and no weights
-"""
+"""A detector of known service time and made-up grasps, to measure and test the service alone."""
 
 import os
-import sys
 import time
 import zlib
 from dataclasses import dataclass, field
@@ -158,20 +154,3 @@ def _top_down(point: Float32, score: float) -> Grasp:
     T_cloud_hand = T_cloud_tcp.copy()
     T_cloud_hand[:3, 3] -= TCP_Z * DOWN
     return Grasp(score, T_cloud_hand, T_cloud_tcp, 0.08, point, point, DOWN, True, 0.0)
-
-
-def main() -> None:
-    """The program `edgegrasp` with the dummy; with settings as JSON, what its workers fork from."""
-    from edgegrasp_service.worker import pool, process
-
-    if sys.argv[1].startswith("{"):
-        process.main(sys.argv[1], lambda settings: DummyCatalogue(SECONDS))
-        return
-    pool.NURSERY = (sys.executable, "-P", __file__)
-    from edgegrasp_cli.main import main
-
-    main()
-
-
-if __name__ == "__main__":
-    main()

@@ -35,6 +35,7 @@ from typing import Any
 import grpc
 import httpx
 import numpy as np
+from benchmarks import serve_dummy
 from benchmarks.measuring import RESULTS, Served, served, write_results
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
@@ -47,7 +48,6 @@ from edgegrasp_client import (
     StreamRequest,
 )
 
-DUMMY = Path(__file__).with_name("dummy.py")  # not imported: attackers would load the model
 ANSWERED = "answered"
 REFUSED = "refused"
 CANCELLED = "cancelled"
@@ -79,7 +79,7 @@ def main() -> None:
     given = parser.parse_args()
     os.environ["DUMMY_SECONDS"] = "0.002"
     results: dict[str, Any] = {"clients": given.clients, "minutes": given.minutes}
-    with served(*ROOM, program=["-P", str(DUMMY)]) as server:
+    with served(*ROOM, program=["-P", serve_dummy.__file__]) as server:
         seconds, random = given.minutes * 60, itertools.count(given.seed)
         results["alone"] = run(server, given.clients, seconds * ALONE, next(random), ())
         attacks = (poison, lock_out)

@@ -14,7 +14,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # two test processes and their servers shar
 
 import numpy as np
 import pytest
-from benchmarks import dummy
+from benchmarks import serve_dummy
 from hypothesis import HealthCheck, settings
 
 # PyTorch with CUDA loads it for training, which on Debian 12 crashes once MuJoCo has drawn: both
@@ -98,7 +98,7 @@ def real_server() -> Iterator[RunningServer]:
 @pytest.fixture(scope="session")
 def start_dummy() -> Callable[..., contextlib.AbstractContextManager[RunningServer]]:
     """As `start_server`, with the dummy detector, which takes `seconds`."""
-    return partial(running_server, program=("-P", dummy.__file__))
+    return partial(running_server, program=("-P", serve_dummy.__file__))
 
 
 @pytest.fixture(scope="session")

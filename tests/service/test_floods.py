@@ -393,7 +393,7 @@ async def test_a_message_of_a_stream_with_very_many_fields(serve) -> None:
 
 OUT_OF_DESCRIPTORS = """
 import resource, sys
-from benchmarks.dummy import main
+from benchmarks.serve_dummy import main
 resource.setrlimit(resource.RLIMIT_NOFILE, (96, 96))
 main()
 """

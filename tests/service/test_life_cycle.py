@@ -196,7 +196,7 @@ def test_sigterm_under_load(start_dummy, cloud: np.ndarray) -> None:
 SERVE_AT_A_TERMINAL = """
 import fcntl, sys, termios
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-from benchmarks.dummy import main
+from benchmarks.serve_dummy import main
 main()
 """
 

@@ -1,0 +1,26 @@
+"""A server with the dummy detector, whose front does not import what detectors need.
+
+usage: python benchmarks/serve_dummy.py serve [FLAG ...]    `edgegrasp serve` without weights
+"""
+
+import runpy
+import sys
+from pathlib import Path
+
+
+def main() -> None:
+    """The program `edgegrasp` with the dummy; with settings as JSON, what its workers fork from."""
+    from edgegrasp_service.worker import pool, process
+
+    if sys.argv[1].startswith("{"):
+        dummy = runpy.run_path(str(Path(__file__).with_name("dummy.py")))
+        process.main(sys.argv[1], lambda settings: dummy["DummyCatalogue"](dummy["SECONDS"]))
+        return
+    pool.NURSERY = (sys.executable, "-P", __file__)
+    from edgegrasp_cli.main import main
+
+    main()
+
+
+if __name__ == "__main__":
+    main()
