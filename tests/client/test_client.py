@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cloud_files import ply
+from tests.many_options import MANY
 
 import edgegrasp_client
 from edgegrasp_client import (
@@ -51,7 +52,8 @@ def test_files_and_arrays_give_the_same(client, cloud, tmp_path: Path) -> None:
         assert_same(client.detect(str(tmp_path / name)), expected)
 
 
-ALL_OPTIONS: dict[str, Any] = {
+# As arrays and numbers of NumPy too.
+ALL_OPTIONS: dict[str, Any] = MANY | {
     "model": "dummy",
     "gripper": {
         "name": "mine",
@@ -64,34 +66,13 @@ ALL_OPTIONS: dict[str, Any] = {
         "swing": None,
     },
     "num_approach_points": np.int64(12),
-    "num_candidates": 100,
-    "sampling": "uniform",
-    "seed": 2**62 + 1,
     "viewpoint": np.array([0.1, 0.2, 0.7], np.float32),
-    "up": (0, 0, 2),
-    "support": {"normal": np.array([0.0, 0.0, 1.0]), "offset": np.float32(-0.05)},
     "objects": {"include": np.array([0, 2]), "exclude": (1,)},
     "at": (3, 4.5),
     "near": np.array([0.1, 0.2, 0.3]),
     "max_object_size": 0.3,
-    "workspace": {"min": [-1, -1, -1], "max": (1, 1, 1)},
-    "approach_region": {
-        "include": [
-            {"kind": "mask", "mask": np.arange(500) % 2 == 0},
-            {"kind": "indices", "indices": np.arange(10)},
-            {"kind": "half_space", "normal": (0, 0, 1), "offset": 0},
-        ]
-    },
-    "contact_region": {"exclude": ({"kind": "segments", "ids": np.array([3, -1])},)},
-    "approach_direction": {"cones": [{"direction": (0, 0, -1), "max_angle": 1}], "preset": None},
-    "collision": {
-        "mode": "penalise",
-        "obstacles": [{"kind": "box", "min": [0] * 3, "max": [1] * 3}],
-    },
-    "min_score": 0.25,
+    "approach_region": {"include": [{"kind": "mask", "mask": np.arange(500) % 2 == 0}]},
     "top_k": 3,
-    "suppression": {"translation": 0.02},
-    "order": "clearance",
     "previous": {
         "gripper": "panda",
         "next_id": 8,
@@ -99,7 +80,6 @@ ALL_OPTIONS: dict[str, Any] = {
         "objects": [{"number": 3, "surface": np.zeros(6, np.float32), "confidence": None}],
         "search": True,
     },
-    "debug": True,
 }
 
 

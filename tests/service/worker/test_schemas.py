@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -71,3 +72,17 @@ def test_answers(message: str, name: str) -> None:
     assert (
         set(SCHEMAS[name]["properties"]) == set(SCHEMAS[name]["required"]) == set(fields(message))
     )
+
+
+def parts(value: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(value, dict):
+        yield value
+    for part in value.values() if isinstance(value, dict) else value:
+        if isinstance(part, dict | list):
+            yield from parts(part)
+
+
+def test_generators_of_clients_find_nothing_to_stumble_over() -> None:
+    for part in parts(DOCUMENT):
+        assert "/properties/" not in str(part.get("$ref", ""))
+        assert "type" in part.get("default", {"type": ""})  # a field of that name: no value
