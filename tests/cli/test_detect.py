@@ -12,19 +12,6 @@ from PIL import Image
 from edgegrasp_cli.flags import option_flags
 from edgegrasp_model.options import DetectOptions
 
-OPTIONS = [
-    *("--model", "dummy", "--gripper", "panda", "--sampling", "uniform", "--seed", "4"),
-    *("--num-approach-points", "12", "--num-candidates", "9"),
-    *("--viewpoint", "-0.1,0,-0.5", "--up", "0,0,1"),
-    *("--support", '{"kind":"ransac","distance":0.01}'),
-    *("--workspace", '{"min":[-1,-1,-1],"max":[1,1,1]}'),
-    *("--approach-region", '{"exclude":[{"kind":"indices","indices":[1,2]}]}'),
-    *("--contact-region", '{"include":[{"kind":"sphere","center":[0,0,0],"radius":1}]}'),
-    *("--approach-direction", '{"preset":"side"}', "--collision", '{"margin":0.001}'),
-    *("--min-score", "0.1", "--top-k", "2", "--suppression", "null", "--order", "highest"),
-    "--debug",
-]
-
 
 @pytest.fixture
 def file(cloud: np.ndarray, tmp_path: Path) -> str:
@@ -34,15 +21,6 @@ def file(cloud: np.ndarray, tmp_path: Path) -> str:
 
 def test_every_option_is_a_flag() -> None:
     assert [flag.name for flag in option_flags()] == list(DetectOptions.model_fields)
-
-
-def test_options_of_every_kind_are_flags(transport: str, file: str, dummy_server, run) -> None:
-    address = dummy_server.address(transport)
-    document = json.loads(run("detect", file, "--server", address, "--json", *OPTIONS))
-    assert len(document["grasps"]) == 2
-    assert document["counts"]["scored"] == 12
-    assert len(document["debug"]["outcome"]) == len(document["debug"]["score"]) == 12
-    assert document["debug"]["score"][-1] is None
 
 
 def test_flags_win_over_the_options_file(file, dummy_server, run, refused, tmp_path) -> None:
