@@ -231,9 +231,7 @@ class _Tools:
         if pose is not None:
             asked = {"up": [0.0, 0.0, 1.0], **asked}
         elif asked.get("robot", {}).get("T_base_cloud") is IN_BASE:
-            raise ValueError(
-                "robot: give T_base_camera, in the arm's base frame."
-            )
+            raise ValueError("robot: give T_base_camera, in the arm's base frame.")
         return asked if mask is None else dict(on_mask(pixels(self._path(mask)), asked))
 
     def _path(self, name: str) -> Path:
