@@ -53,7 +53,7 @@ class Grasp:
         Float32, (4, 4)
     ]  # hand link frame: z out of the palm, y the closing direction
     T_cloud_tcp: Annotated[Float32, (4, 4)]  # tool centre point, same axes
-    width: float  # metres to open to before the approach; the maximum if an end is hidden
+    width: float  # metres to open to before the approach; the maximum if the far side is hidden
     approach_point: Float32  # (3,) p_a, metres, cloud frame
     contact_point: Float32  # (3,) p_c, metres, cloud frame
     approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
@@ -62,6 +62,7 @@ class Grasp:
     object: int | None = None  # number of the object that the contact is on; None: no object
     arm: ArmPlan | None = None  # None: no robot was given, or time ran out
     id: int | None = None  # the same in all answers that follow it; None without `previous`
+    far_side_hidden: bool = False  # whether no camera saw where the object ends beside a finger
 
     def pregrasp(self, distance: float = 0.05) -> Float32:
         """The hand's pose (4, 4) `distance` metres back, where the straight approach begins."""

@@ -138,7 +138,7 @@ def grasps_in_cloud(
     """Grasps in the cloud's frame, of E candidates; all arrays are (E,)."""
     T_cloud_hand = scene.frame.poses_in_cloud(candidates.T_cloud_hand)
     T_cloud_tcp = T_cloud_hand @ gripper.T_hand_tcp
-    width = openings(scene, candidates.T_cloud_hand, gripper)
+    width, hidden = openings(scene, candidates.T_cloud_hand, gripper)
     number = scene.object_of_point[candidates.contact_index]
     return [
         Grasp(
@@ -152,20 +152,22 @@ def grasps_in_cloud(
             collision_free=bool(collision_free[row]),
             clearance=float(clearance[row]),
             object=None if number[row] < 0 else int(number[row]),
+            far_side_hidden=bool(hidden[row]),
         )
         for row in range(len(candidates))
     ]
 
 
-def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> Float32:
-    """Opening (E,) to approach with, metres: the visible extent between the fingers, and clearance.
+def openings(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) -> tuple[Float32, Bools]:
+    """Opening (E,) to approach with, metres, and whether the far side is hidden (E,).
 
-    The gripper's maximum if no camera saw where the object ends on the side of a finger.
+    The opening is the visible extent between the fingers, and clearance; the gripper's maximum if
+    no camera saw where the object ends on the side of a finger.
     """
     met = met_first(hand_views(scene.cloud, T_cloud_hand, reach_of(gripper)), gripper)
     width = required_openings(met, gripper)
     hidden = _far_side_hidden(scene, T_cloud_hand, met, gripper)
-    return np.where(hidden, np.float32(gripper.max_opening), width)
+    return np.where(hidden, np.float32(gripper.max_opening), width), hidden
 
 
 def _far_side_hidden(scene: Scene, T_cloud_hand: Float32, met: Float32, gripper: Gripper) -> Bools:

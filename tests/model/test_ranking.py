@@ -22,14 +22,14 @@ def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
 
 
 @pytest.mark.parametrize(
-    ("camera", "opening"),
+    ("camera", "opening", "hidden"),
     [
-        ((1.0, 0.0, 0.1), 2 * (0.015 + FINGER_CLEARANCE)),  # sees past both sides
-        ((0.0, 1.0, 0.1), PANDA.max_opening),  # sees the side of one finger alone
-        (None, 2 * (0.015 + FINGER_CLEARANCE)),  # nothing is known to be hidden
+        ((1.0, 0.0, 0.1), 2 * (0.015 + FINGER_CLEARANCE), False),  # sees past both sides
+        ((0.0, 1.0, 0.1), PANDA.max_opening, True),  # sees the side of one finger alone
+        (None, 2 * (0.015 + FINGER_CLEARANCE), False),  # nothing is known to be hidden
     ],
 )
-def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening) -> None:
+def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening, hidden) -> None:
     along, height = np.meshgrid(np.arange(-0.015, 0.0155, 0.003), np.arange(0.09, 0.13, 0.003))
     flat = np.zeros_like(along)
     # A plate that faces the camera: across the closing direction y, or along it.
@@ -37,8 +37,9 @@ def test_a_hand_opens_fully_where_the_far_side_is_hidden(camera, opening) -> Non
     points = np.stack(axes, axis=-1).reshape(-1, 3).astype(np.float32)
     viewpoints = None if camera is None else np.array([camera], dtype=np.float32)
     scene = scene_of(points, viewpoints=viewpoints)
-    width = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
+    width, far_side_hidden = openings(scene, np.eye(4, dtype=np.float32)[None], PANDA)
     np.testing.assert_allclose(width, opening, atol=1e-6)
+    assert far_side_hidden == hidden
 
 
 def test_of_hands_that_are_near_each_other_the_first_is_kept() -> None:

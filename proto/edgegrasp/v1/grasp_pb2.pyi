@@ -2262,10 +2262,11 @@ class Grasp(_message.Message):
     OBJECT_FIELD_NUMBER: _builtins.int
     ARM_FIELD_NUMBER: _builtins.int
     ID_FIELD_NUMBER: _builtins.int
+    FAR_SIDE_HIDDEN_FIELD_NUMBER: _builtins.int
     score: _builtins.float
     """Probability that the grasp holds, in [0, 1]."""
     width: _builtins.float
-    """Opening to command before closing, metres."""
+    """Opening to approach with, metres; the hand's maximum if far_side_hidden."""
     collision_free: _builtins.bool
     """Whether the open hand meets nothing at the grasp and on its ways."""
     clearance: _builtins.float
@@ -2276,6 +2277,8 @@ class Grasp(_message.Message):
     """The same in every answer that follows this grasp; absent (null in JSON) without
     options.previous.
     """
+    far_side_hidden: _builtins.bool
+    """Whether no camera saw where the object ends beside a finger."""
     @_builtins.property
     def T_cloud_hand(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """16 floats, 4 x 4 row-major. Hand frame: z out of the palm, y the closing direction."""
@@ -2317,10 +2320,11 @@ class Grasp(_message.Message):
         object: _builtins.int | None = ...,
         arm: Global___ArmPlan | None = ...,
         id: _builtins.int | None = ...,
+        far_side_hidden: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_id", b"_id", "_object", b"_object", "arm", b"arm", "id", b"id", "object", b"object"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_id", b"_id", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "arm", b"arm", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "id", b"id", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["T_cloud_hand", b"T_cloud_hand", "T_cloud_tcp", b"T_cloud_tcp", "_id", b"_id", "_object", b"_object", "approach_direction", b"approach_direction", "approach_point", b"approach_point", "arm", b"arm", "clearance", b"clearance", "collision_free", b"collision_free", "contact_point", b"contact_point", "far_side_hidden", b"far_side_hidden", "id", b"id", "object", b"object", "score", b"score", "width", b"width"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__id: _TypeAlias = _typing.Literal["id"]  # noqa: Y015
     _WhichOneofArgType__id: _TypeAlias = _typing.Literal["_id", b"_id"]  # noqa: Y015

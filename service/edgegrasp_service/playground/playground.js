@@ -281,7 +281,7 @@ function choose(row) {
     score: grasp.score.toFixed(3),
     TCP: metres(grasp.T_cloud_tcp.slice(0, 3).map((each) => each[3])),
     approach: grasp.approach_direction.map((value) => value.toFixed(2)).join(", "),
-    width: `${(1000 * grasp.width).toFixed(1)} mm`,
+    width: `${(1000 * grasp.width).toFixed(1)} mm${grasp.far_side_hidden ? ", far side hidden" : ""}`,
     "approach point": metres(grasp.approach_point),
     "contact point": metres(grasp.contact_point),
     clearance: `${(1000 * grasp.clearance).toFixed(1)} mm${grasp.collision_free ? "" : ", collides"}`,
