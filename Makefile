@@ -12,7 +12,7 @@ INSTALLED := $(VENV)/.installed
 TO_LOOK := $(VENV)/.to_look
 TOOLS := $(VENV)/.tools
 GENERATED := $(wildcard proto/edgegrasp/*/*_pb2*) proto/edgegrasp/v1/contract.json \
-	proto/edgegrasp/v1/openapi.json
+	proto/edgegrasp/v1/openapi.json clients/edgegrasp_client/options.py
 
 .DEFAULT_GOAL := help
 .PHONY: help venv lint format test bench fuzz view demo docs image-test proto constraints clean
@@ -42,7 +42,7 @@ lint: $(TOOLS) ## style, types, import boundaries, generated code
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy $(wildcard examples/*.py)
-	$(BIN)/mypy --python-version 3.10 --package edgegrasp_camera --package edgegrasp_client --module edgegrasp_bridge.bridge
+	$(BIN)/mypy --python-version 3.10 --package edgegrasp_camera --package edgegrasp_client --package edgegrasp_results --module edgegrasp_bridge.bridge
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
 	$(BIN)/kubernetes-validate --strict --quiet docker/kubernetes/*.yaml
@@ -80,7 +80,7 @@ docs: $(TOOLS) ## build the site of docs/ into build/site, without network; warn
 image-test: $(INSTALLED) ## build the container image, run it locked up (root, Debian: podman)
 	docker/test_image.sh $(BIN)/python
 
-proto: $(TOOLS) ## generate the gRPC code, the contract and the OpenAPI document
+proto: $(TOOLS) ## generate gRPC code, contract, OpenAPI document and the client's options
 	PYTHON=$(BIN)/python scripts/generate_proto.sh
 
 constraints: ## resolve the dependencies afresh into constraints.txt

@@ -13,18 +13,9 @@ from edgegrasp_model.errors import UnknownModel
 from edgegrasp_model.given import check_edges, check_hand_poses
 from edgegrasp_model.gripper import choose_gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import (
-    DebugInfo,
-    Detection,
-    Evaluation,
-    Grasp,
-    GripperOutline,
-    NoGrasp,
-    Outcome,
-    Pace,
-    Scoring,
-)
+from edgegrasp_model.results import NoGrasp, Outcome, Pace
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
+from edgegrasp_results import DebugInfo, Detection, Evaluation, Grasp, GripperOutline, Scoring
 
 NAME = "dummy"
 TCP_Z = 0.1  # metres along the hand's z

@@ -19,7 +19,7 @@ from edgegrasp_camera.arrays import Float32, Float64
 from edgegrasp_camera.depth import Intrinsics, metres, unproject
 from edgegrasp_model.detector import GraspDetector, ModelCatalogue
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.results import Detection
+from edgegrasp_results import Detection
 from edgegrasp_robot import Robot, load_robot, plan_picks, with_robot
 
 SAMPLE = "service/edgegrasp_service/playground/samples/seven_depth.png"

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Regenerates the Python stubs beside proto/edgegrasp/*/*.proto, the contract beside them, and the
-# options in the OpenAPI document.
+# Regenerates the Python stubs beside proto/edgegrasp/*/*.proto, the contract beside them, the options
+# in the OpenAPI document, and those of the Python client.
 # Into this checkout, or into the same places under the folder given.
 # PYTHON names the interpreter that has the dev extra.
 set -eu
@@ -15,3 +15,4 @@ mkdir -p "$out/proto"
     "$root"/proto/edgegrasp/oip/*.proto
 "$python" "$root/scripts/contract.py" "$out/proto"
 "$python" "$root/scripts/openapi.py" "$out/proto"
+"$python" "$root/scripts/client_options.py" "$out/clients"

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mcp.server.mcpserver.tools.base import Tool
 
     from edgegrasp_client import DepthImage, Detection, GraspClient
-    from edgegrasp_client.results import ArmPlan
+    from edgegrasp_results import ArmPlan
 
 MOST_GRASPS = 20  # in one answer: some 5,000 characters
 IN_BASE = [float(row == column) for row in range(4) for column in range(4)]  # T_base_cloud

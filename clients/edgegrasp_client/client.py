@@ -34,7 +34,8 @@ from edgegrasp_client.options import DetectOptions
 from edgegrasp_client.over_grpc import GrpcTransport
 from edgegrasp_client.over_rest import RestTransport
 from edgegrasp_client.requests import Cloud, DepthImage, Request, StreamRequest
-from edgegrasp_client.results import Detection, Grasp, Model, Robot, Scoring, StreamAnswer
+from edgegrasp_client.results import Model, Robot, StreamAnswer
+from edgegrasp_results import Detection, Grasp, Scoring
 
 POLL_SECONDS = 0.1
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edgegrasp_camera.arrays import Array, Float64
-from edgegrasp_client.results import ArmTrajectory, Grasp
+from edgegrasp_results import ArmTrajectory, Grasp
 
 Message = dict[str, Any]
 

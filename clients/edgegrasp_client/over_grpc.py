@@ -30,7 +30,8 @@ from edgegrasp_client.requests import (
     is_point_cloud2,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Detection, Models, Robots, StreamAnswer, read_as
+from edgegrasp_client.results import Models, Robots, StreamAnswer, read_as
+from edgegrasp_results import Detection
 
 Answer = TypeVar("Answer")
 

@@ -30,7 +30,8 @@ from edgegrasp_client.requests import (
     npy_bytes,
     point_cloud2_fields,
 )
-from edgegrasp_client.results import Detection, Models, Robots, StreamAnswer, read_as
+from edgegrasp_client.results import Models, Robots, StreamAnswer, read_as
+from edgegrasp_results import Detection
 
 MAX_QUERY = 4000  # characters; servers and proxies limit the length of an address
 KIND_PREFIX = "urn:edgegrasp:error:"

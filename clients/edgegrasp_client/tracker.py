@@ -11,7 +11,7 @@ from typing_extensions import Unpack
 from edgegrasp_client.client import GraspClient
 from edgegrasp_client.options import DetectOptions, Previous
 from edgegrasp_client.requests import StreamRequest
-from edgegrasp_client.results import DetectedObject, Detection
+from edgegrasp_results import DetectedObject, Detection
 
 FOLLOWED = 4  # grasps on one object, of which the first is the one to keep
 MOST = 64  # objects that a request may name

@@ -40,7 +40,7 @@ from edgegrasp_model.ranking import (
     grasps_in_cloud,
     select,
 )
-from edgegrasp_model.results import Detection, Evaluation, GripperOutline, NoGrasp, Pace, Scoring
+from edgegrasp_model.results import NoGrasp, Pace
 from edgegrasp_model.scene.cloud import (
     CheckedCloud,
     check_cloud,
@@ -63,6 +63,7 @@ from edgegrasp_model.tracking import (
     untracked,
     with_surfaces,
 )
+from edgegrasp_results import Detection, Evaluation, GripperOutline, Scoring
 
 NO_APPROACH_POINT = (
     "the approach region contains no point of the processed cloud. Rows contain a voxel if they "

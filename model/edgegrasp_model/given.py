@@ -26,8 +26,9 @@ from edgegrasp_model.networks.config import NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch, hand_batch
 from edgegrasp_model.options import MAX_CANDIDATES, Collision
 from edgegrasp_model.ranking import grasps_in_cloud
-from edgegrasp_model.results import Evaluation, NoGrasp
+from edgegrasp_model.results import NoGrasp
 from edgegrasp_model.scene.scene import Scene, object_probability
+from edgegrasp_results import Evaluation
 
 BALLS_AT_A_TIME = 64
 FIRST_TOUCH = 0.004  # metres behind the outermost point within which points count as touched first

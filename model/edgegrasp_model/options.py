@@ -1,7 +1,7 @@
 """The options of one detection; every option is defined here.
 
-The command line's flags, the OpenAPI document and the table in the documentation are made from
-these models; the gRPC messages and the client's types have the same fields, which a test compares.
+The command line's flags, the OpenAPI document, the client's types and the documentation's table are
+made from these models; the gRPC messages have the same fields, which a test compares.
 """
 
 import base64

@@ -18,18 +18,12 @@ from edgegrasp_model.hand_description import seen_part
 from edgegrasp_model.hand_kernels import non_max_suppression
 from edgegrasp_model.hand_view import hand_views, reach_of
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import (
-    DebugInfo,
-    DetectedObject,
-    FoundSupport,
-    Grasp,
-    Outcome,
-    Ungraspable,
-)
+from edgegrasp_model.results import Outcome, Ungraspable
 from edgegrasp_model.scene.cloud import UP
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.support import Support
 from edgegrasp_model.unseen import DepthMap, unseen_space
+from edgegrasp_results import DebugInfo, DetectedObject, FoundSupport, Grasp
 
 COLLIDING = 0.5  # factor on the score of a colliding grasp in the ranking
 GOOD_SCORE = 0.5  # score from which an object has a good grasp

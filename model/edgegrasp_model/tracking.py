@@ -25,16 +25,10 @@ from edgegrasp_model.options import (
     Workspace,
 )
 from edgegrasp_model.ranking import COLLIDING, objects_first, ranked
-from edgegrasp_model.results import (
-    OBSTACLE,
-    DetectedObject,
-    Evaluation,
-    Following,
-    Grasp,
-    Tracking,
-)
+from edgegrasp_model.results import OBSTACLE, Following
 from edgegrasp_model.scene.scene import Scene
 from edgegrasp_model.scene.segment import UNKNOWN
+from edgegrasp_results import DetectedObject, Evaluation, Grasp, Tracking
 
 MARGIN = 0.1  # of the score, by which another grasp must be better
 ALIVE = 0.25  # score from which a followed grasp may stay the first

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.options import Collision, Place
-from edgegrasp_model.results import DetectedObject, Grasp
 from edgegrasp_model.scene.obstacles import box_pose
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_results import DetectedObject, Grasp
 from edgegrasp_robot.surroundings import CELL, Load, moved
 
 STEP = 0.005  # metres along the way

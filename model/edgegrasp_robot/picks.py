@@ -17,9 +17,9 @@ from edgegrasp_camera.arrays import Float64
 from edgegrasp_model.detector import GraspDetector
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions, Place, RobotArm
-from edgegrasp_model.results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_model.scene.cloud import CloudInput
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_results import ArmPlan, ArmTrajectory, DetectedObject, Detection, Grasp
 from edgegrasp_robot.held import Held, can_leave, held_by, load_of, places_for
 from edgegrasp_robot.robot import GROUP, Robot
 from edgegrasp_robot.surroundings import (

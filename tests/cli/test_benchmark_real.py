@@ -9,7 +9,7 @@ import pytest
 
 from edgegrasp_cli.real_scenes import SceneFigures, judge, load_scene
 from edgegrasp_model.gripper import load_gripper
-from edgegrasp_model.results import Grasp
+from edgegrasp_results import Grasp
 
 SHAPE, INTRINSICS = (120, 160), (150.0, 150.0, 79.5, 59.5)
 NORMAL = np.array([0.0, -np.sqrt(0.75), -0.5])  # the camera looks down by 30 degrees

@@ -22,7 +22,7 @@ from tests.programs import EDGEGRASP, run
 
 from edgegrasp_cli.mcp import grasp_tools
 from edgegrasp_client import Detection, Grasp, GraspClient
-from edgegrasp_client.results import ArmPlan, ArmTrajectory
+from edgegrasp_results import ArmPlan, ArmTrajectory
 
 mcp = pytest.importorskip("mcp", reason="the extra `mcp` is not installed")
 image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")

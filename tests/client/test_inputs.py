@@ -9,7 +9,7 @@ from PIL import Image
 from tests.cloud_files import point_cloud2
 
 from edgegrasp_client import InvalidRequestError
-from edgegrasp_client.results import Detection
+from edgegrasp_results import Detection
 
 
 def contacts(detection: Detection) -> list[list[float]]:
@@ -127,7 +127,7 @@ def test_debug_returns_every_candidate(client, cloud) -> None:
     assert debug.T_cloud_hand.shape == (32, 4, 4)
     for array in (debug.points, debug.normals, debug.T_cloud_hand, debug.score):
         assert array.dtype == np.float32
-    assert debug.approach_index.dtype == debug.contact_index.dtype == np.int32
+    assert debug.approach_index.dtype == debug.contact_index.dtype == np.int64
     assert np.isnan(debug.score).sum() == 22
     assert (debug.outcome.count("returned"), debug.outcome.count("not-scored")) == (10, 22)
     assert debug.support_plane is None

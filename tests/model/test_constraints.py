@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.gripper import Gripper, load_gripper
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Detection, Grasp
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_results import Detection, Grasp
 
 from .oracles import any_point_in_boxes, signed_distance_to_boxes
 from .scenes import box_on_table, detector

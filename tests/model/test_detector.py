@@ -13,7 +13,8 @@ from edgegrasp_model.detector import GraspDetector, ModelCatalogue, choose_devic
 from edgegrasp_model.errors import InvalidCheckpoint, InvalidDevice, InvalidRequest, UnknownModel
 from edgegrasp_model.networks.checkpoint import save_checkpoint
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import Detection, Outcome
+from edgegrasp_model.results import Outcome
+from edgegrasp_results import Detection
 
 from .rendered import FOCAL_LENGTH, HEIGHT, WIDTH, boxes_on_table, camera, render, table
 from .scenes import PANDA, box_on_table, detector

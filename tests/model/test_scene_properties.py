@@ -5,8 +5,9 @@ import pytest
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.results import SUPPORT, Detection
+from edgegrasp_model.results import SUPPORT
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_results import Detection
 
 from .rendered import BACKGROUND, SolidBox, box, boxes_on_table, camera, render, table, to_world
 from .scenes import detector

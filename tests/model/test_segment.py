@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.results import Detection
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_results import Detection
 
 from .rendered import (
     BACKGROUND,

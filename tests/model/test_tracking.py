@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import parse_options
-from edgegrasp_model.results import Evaluation, Grasp
 from edgegrasp_model.tracking import Followed, Surface, merged, narrowed, registered, sampled
+from edgegrasp_results import Evaluation, Grasp
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -42,7 +42,6 @@ def test_sdist_and_wheel_hold_the_packages_and_no_caches(built: tuple[Path, Path
     assert v1 <= {name.removeprefix("edgegrasp/v1/") for name in ours}
     packages = {name.partition("/")[0] for name in ours}
     assert packages == {Path(name).parent.name for name in ours if name.endswith("/py.typed")}
-    assert len(packages) == 9
 
 
 def test_a_package_index_shows_a_page_without_dead_links(built: tuple[Path, Path]) -> None:

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import SupportPlane, parse_options
-from edgegrasp_model.results import DetectedObject, Detection, Grasp, GripperOutline
 from edgegrasp_model.scene.cloud import CanonicalFrame
 from edgegrasp_model.scene.scene import Scene
+from edgegrasp_results import DetectedObject, Detection, Grasp, GripperOutline
 from edgegrasp_robot import plan_picks, with_robot
 
 BOXES = ((0.5, 0.0, 0.05), (0.55, 0.2, 0.03), (0.45, -0.2, 0.04))  # x, y, half height; base frame

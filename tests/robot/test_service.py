@@ -17,8 +17,9 @@ from edgegrasp.v1 import grasp_pb2
 from edgegrasp_client import GraspClient
 from edgegrasp_client.over_grpc import message_of, read_field
 from edgegrasp_client.requests import Request
-from edgegrasp_client.results import Detection, read_as
+from edgegrasp_client.results import read_as
 from edgegrasp_model.results import Pace
+from edgegrasp_results import Detection
 from edgegrasp_robot import load_robots
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer

@@ -15,8 +15,8 @@ from edgegrasp_camera import InvalidRequest
 from edgegrasp_client import GraspClient, InvalidRequestError, Robot
 from edgegrasp_client.conversions import PANDA_LINK8, matrix_from_quaternion
 from edgegrasp_client.options import DetectOptions
-from edgegrasp_client.results import ArmPlan, ArmTrajectory
 from edgegrasp_model.gripper import load_gripper
+from edgegrasp_results import ArmPlan, ArmTrajectory
 
 STAMP = {"sec": 12, "nanosec": 345}
 HEADER = {"stamp": STAMP, "frame_id": "camera"}

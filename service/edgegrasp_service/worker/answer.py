@@ -16,8 +16,8 @@ from edgegrasp_camera.arrays import Array
 from edgegrasp_model.errors import EdgeGraspError, InvalidRequest
 from edgegrasp_model.options import DetectOptions, parse, parse_options
 from edgegrasp_model.request_cloud import GIVEN, decode_array, decode_cloud
-from edgegrasp_model.results import Detection, Scoring
 from edgegrasp_model.scene.cloud import CloudInput
+from edgegrasp_results import Detection, Scoring
 from edgegrasp_service import recording
 from edgegrasp_service.errors import (
     DeadlineExceeded,

@@ -22,7 +22,7 @@ from edgegrasp_camera.files import FILE_FORMATS
 from edgegrasp_model.errors import InvalidRequest, brief
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.request_cloud import CAMERA, GIVEN, PER_POINT, File
-from edgegrasp_model.results import Detection, Scoring
+from edgegrasp_results import Detection, Scoring
 from edgegrasp_service.errors import UnsupportedMediaType
 from edgegrasp_service.worker.job import Job
 

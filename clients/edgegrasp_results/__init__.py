@@ -1,0 +1,182 @@
+"""The answer to one request: as the model makes it, and as the client reads it.
+
+What an annotation says beside an array is the shape in which the client has it.
+"""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from edgegrasp_camera.arrays import Float32, Float64, Int64
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTrajectory:
+    """A timed motion of an arm: to the pregrasp, straight to the grasp, straight out. T rows.
+
+    With a place, it goes on to above it, straight down, and back. The gripper opens before
+    `pregrasp_row`, closes at `grasp_row` and opens at `release_row`; the arm rests at each.
+    """
+
+    joint_names: list[str]  # J
+    times: Float64  # (T,) seconds from the start
+    positions: Float64  # (T, J) radians, metres of sliding joints
+    velocities: Float64  # (T, J) per second
+    pregrasp_row: int
+    grasp_row: int
+    release_row: int | None = None  # with a place
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPlan:
+    """How an arm gets to a grasp."""
+
+    reachable: bool  # whether it gets there and straight on, and to the place, touching nothing
+    pregrasp_joints: Float64 | None = None  # (J,) where it is reachable
+    grasp_joints: Float64 | None = None  # (J,) where it is reachable
+    trajectory: ArmTrajectory | None = None  # if it was asked for and found in time
+    place_joints: Float64 | None = None  # (J,) where it lets go; None without a place
+    T_base_place: Annotated[Float64, (4, 4)] | None = None  # (4, 4) the hand there, base frame
+
+
+@dataclass(frozen=True, eq=False)
+class Grasp:
+    """One grasp: move to `T_cloud_hand` along `approach_direction`, then close."""
+
+    score: float  # probability that the grasp holds
+    # Hand link frame: z out of the palm, y the closing direction.
+    T_cloud_hand: Annotated[Float32, (4, 4)]
+    T_cloud_tcp: Annotated[Float32, (4, 4)]  # tool centre point (TCP), same axes
+    width: float  # metres to open to before the approach; the maximum if the far side is hidden
+    approach_point: Float32  # (3,) p_a, metres, cloud frame
+    contact_point: Float32  # (3,) p_c, metres, cloud frame
+    approach_direction: Float32  # (3,) unit, the direction the hand moves; +z of the hand
+    collision_free: bool  # whether the open hand touches nothing at the grasp and on its way
+    clearance: float  # metres from the open hand at the grasp to the nearest surface; <= 0: inside
+    object: int | None = None  # number of the object that the contact is on; None: no object
+    arm: ArmPlan | None = None  # None: no robot was given, or time ran out
+    id: int | None = None  # the same in all answers that follow it; None without `previous`
+    far_side_hidden: bool = False  # whether no camera saw where the object ends beside a finger
+
+    def pregrasp(self, distance: float = 0.05) -> Float32:
+        """The hand's pose (4, 4) `distance` metres back, where the straight approach begins."""
+        return self.retreat(distance)
+
+    def retreat(self, distance: float = 0.1, direction: ArrayLike | None = None) -> Float32:
+        """The hand's pose (4, 4) after a straight retreat.
+
+        Args:
+            distance: Metres.
+            direction: (3,) cloud frame, of any length but zero, such as the detection's `up`;
+                None: back along the approach.
+        """
+        way = -self.approach_direction if direction is None else np.asarray(direction, np.float32)
+        pose: Float32 = self.T_cloud_hand.copy()
+        pose[:3, 3] += distance * way / np.linalg.norm(way)
+        return pose
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSupport:
+    """The plane that objects rest on: the points x with normal . x = offset; cloud frame."""
+
+    normal: Float32  # (3,) unit, pointing up from the support
+    offset: float  # metres
+    residual: float | None  # metres, median distance of its points; None: none of it is seen
+    share: float  # of the seen surface that lies in it
+
+
+@dataclass(frozen=True)
+class GripperOutline:
+    """The gripper of the grasps, as needed for drawing it; metres along the hand's z."""
+
+    name: str
+    palm_z: float  # the palm's surface between the fingers
+    tip_z: float  # the fingertips of the open gripper
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedObject:
+    """A recognised object; cloud frame, metres."""
+
+    number: int  # as in `Grasp.object`; the segment, where segment_ids were sent
+    points: int  # its number of voxels in the processed cloud
+    center: Float32  # (3,) of the smallest upright box around them
+    half_extents: Float32  # (3,) of that box, along its own axes, the last of which is up
+    quaternion: Float32  # (4,) x, y, z, w: rotates the box's axes into the cloud's
+    best_score: float | None  # of the grasps returned; None: it has none
+    confidence: float | None  # probability that it is an object; None: given by the caller
+    # Why it has no good grasp: "too-wide", "too-flat", "blocked" or "hidden"; None: it has one, or
+    # nobody can say.
+    reason: str | None
+    # (K, 3) points by which `previous` finds it again; the client's are flat, as sent back.
+    surface: Annotated[Float32, (-1,)] | None = None
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How an answer follows the one before, which was sent as `previous`."""
+
+    first: str  # what became of the first grasp: "started", "kept", "replaced" or "lost"
+    next_id: int  # above all ids and numbers used so far
+
+
+@dataclass(frozen=True, eq=False)
+class DebugInfo:
+    """The processed cloud and every candidate with its outcome. V points, E candidates."""
+
+    points: Annotated[Float32, (-1, 3)]  # (V, 3) metres, cloud frame
+    normals: Annotated[Float32, (-1, 3)]  # (V, 3) unit
+    approach_index: Int64  # (E,) p_a, rows of `points`
+    contact_index: Int64  # (E,) p_c, rows of `points`
+    T_cloud_hand: Annotated[Float32, (-1, 4, 4)]  # (E, 4, 4)
+    score: Float32  # (E,) NaN where it was not scored
+    outcome: list[str]  # E of them: "returned", or what became of it
+    support_plane: Float32 | None  # (4,) unit normal and offset, given or found, metres
+    # (R,) of each row of the cloud as sent, images row by row: the number of its object; -1: an
+    # obstacle; -2: the support; -3: no reading, cut off or below the support.
+    labels: Int64
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Ranked grasps of one cloud, with counts and timings."""
+
+    grasps: list[Grasp]
+    counts: dict[str, int]  # points, candidates and grasps that passed each stage, in order
+    seconds: dict[str, float]  # spent in each stage, and their `total`
+    model: str  # name of the weights used
+    gripper: GripperOutline
+    warnings: list[str] = field(default_factory=list)
+    debug: DebugInfo | None = None  # where `debug` is asked for
+    support: FoundSupport | None = None  # given or found
+    # (3,) unit, away from gravity, as it was used
+    up: Float32 = field(default_factory=lambda: np.array([0, 0, 1], np.float32))
+    objects: list[DetectedObject] = field(default_factory=list)  # the largest first
+    tracking: Tracking | None = None  # where `previous` was sent
+
+    @property
+    def best_pick(self) -> Grasp | None:
+        """The first grasp within the robot's reach; the server puts those with a motion first."""
+        return next((one for one in self.grasps if one.arm and one.arm.reachable), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What the network says of one edge or hand pose."""
+
+    grasp: Grasp | None  # None if it defines no edge grasp
+    reason: str | None  # why it defines none, e.g. "too-long"
+
+
+@dataclass(frozen=True, eq=False)
+class Scoring:
+    """Evaluations, in the order of the edges or hand poses."""
+
+    evaluations: list[Evaluation]
+    counts: dict[str, int]
+    seconds: dict[str, float]
+    model: str
+    warnings: list[str] = field(default_factory=list)
