@@ -100,7 +100,8 @@ class Gripper:
         right = np.asarray(self.finger_boxes) + shift[..., None, None, :]  # (..., F, 2, 3)
         left = right.copy()
         left[..., 0, 1], left[..., 1, 1] = -right[..., 1, 1], -right[..., 0, 1]
-        hand = np.broadcast_to(np.asarray(self.hand_boxes), (*opening.shape, *self._hand_shape))
+        hand = np.asarray(self.hand_boxes)
+        hand = np.broadcast_to(hand, (*opening.shape, *hand.shape))
         return np.concatenate([hand, right, left], axis=-3)
 
     @cached_property
@@ -127,10 +128,6 @@ class Gripper:
             finger_boxes=forward,
             linkage=linkage,
         )
-
-    @property
-    def _hand_shape(self) -> tuple[int, int, int]:
-        return len(self.hand_boxes), 2, 3
 
 
 def gripper_from_fields(fields: Mapping[str, Any] | GripperGeometry) -> Gripper:

@@ -12,7 +12,6 @@ from edgegrasp_camera.arrays import Bools, Float32, Float64, Int64
 from edgegrasp_model.gripper import Gripper
 from edgegrasp_model.hand_kernels import distance_behind
 from edgegrasp_model.kernels import compiled
-from edgegrasp_model.options import Corner
 
 CELL = 0.0022  # metres across a cell of the depth map, at the middle of the cloud
 SPLAT = 2  # cells around its own that a point covers, up to the next point of the cloud
@@ -127,7 +126,8 @@ def probes(gripper: Gripper) -> list[Float32]:
         for layer in ([0.5, 0.85], [-0.25, 0.25], [-0.85, -0.5])
     ]
     inside = [
-        _grid(*(np.linspace(*ends)[1:-1] for ends in _spans(box))) for box in gripper.hand_boxes
+        _grid(*(np.linspace(*ends)[1:-1] for ends in zip(*box, (4, 7, 4), strict=True)))
+        for box in gripper.hand_boxes
     ]
     return [*fingers, *beyond, *between, np.concatenate(inside)]
 
@@ -152,11 +152,6 @@ def _closing_line(gripper: Gripper) -> tuple[Float32, Float32]:
     across = _grid([-0.5 * half, 0.5 * half], [0.0], gripper.tip_z - np.array([0.1, 0.3]) * length)
     line = across + y[:, None, None] * np.array([0.0, 1.0, 0.0], dtype=np.float32)
     return y, line.reshape(-1, 3)
-
-
-def _spans(box: tuple[Corner, Corner]) -> list[tuple[float, float, int]]:
-    """Along each axis the ends of a box, and how many points to take from one to the other."""
-    return list(zip(*box, (4, 7, 4), strict=True))
 
 
 def _grid(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Float32:

@@ -30,7 +30,7 @@ def extents(world: World, model: ObjectModel, scale: float = 1.0) -> np.ndarray:
     return found - MARGIN[world.name]
 
 
-@pytest.mark.parametrize("scene", SceneKind)
+@pytest.mark.parametrize("scene", [SceneKind.PACKED, SceneKind.PILE])  # others have theirs
 def test_builtin_objects_fit_between_the_fingers(world: World, scene: SceneKind) -> None:
     models = ObjectSet.builtin(scene).models
     assert len({model.urdf for model in models}) == len({model.name for model in models}) >= 8

@@ -166,7 +166,7 @@ def test_a_try_that_stops_early_saves_steps_and_comes_to_the_same(simulation, mo
     assert steps < 0.75 * whole_steps
 
 
-@pytest.mark.parametrize("scene", SceneKind)
+@pytest.mark.parametrize("scene", [SceneKind.PACKED, SceneKind.BIN, SceneKind.SHELF])
 def test_equal_seeds_make_equal_scenes(engine: str, scene: SceneKind) -> None:
     def run(simulation: ClutterSimulation, seed: int) -> tuple[object, np.ndarray]:
         simulation.reset(scene, np.random.default_rng(seed), 3)

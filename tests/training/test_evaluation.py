@@ -19,17 +19,13 @@ from edgegrasp_training.evaluation import (
 )
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_auroc_is_the_share_of_pairs_in_the_right_order(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_auroc_is_the_share_of_pairs_in_the_right_order() -> None:
+    rng = np.random.default_rng(0)
     logit, label = rng.integers(0, 5, 30).astype(float), rng.integers(0, 2, 30).astype(float)
     label[:2] = 0, 1
     pairs = np.subtract.outer(logit[label == 1], logit[label == 0])
     expected = ((pairs > 0) + 0.5 * (pairs == 0)).mean()
     assert auroc(logit, label) == pytest.approx(expected)
-
-
-def test_auroc_of_one_class_is_undefined() -> None:
     assert np.isnan(auroc(np.zeros(3), np.ones(3)))
 
 

@@ -73,12 +73,6 @@ def closes_on_background(scene: Scene, T_cloud_hand: Float32, gripper: Gripper) 
     return np.bincount(hand, minlength=len(T_cloud_hand)) >= MIN_FIXED
 
 
-def reach_of_motion(gripper: Gripper, request: Collision) -> Float32:
-    """The part of the hand frame that the hand sweeps during approach and retreat."""
-    lift = request.retreat_length if request.retreat_direction == "up" else 0.0
-    return reach_of(gripper, around=request.margin, back=approach_sweep_length(request), lift=lift)
-
-
 def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: Collision) -> Bools:
     """Which open hands contain a point of the cloud.  # (E,)."""
     boxes = inflated_boxes(gripper, request)
@@ -86,8 +80,10 @@ def hits_cloud(cloud: Cloud, T_cloud_hand: Float32, gripper: Gripper, request: C
     hit = any_point_in_boxes(cloud.points, T_cloud_hand, swept)
     if request.retreat_direction == "up" and request.retreat_length > 0:
         free = np.flatnonzero(~hit)
-        view = hand_views(cloud, T_cloud_hand[free], reach_of_motion(gripper, request))
-        lift = request.retreat_length * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
+        back, up = approach_sweep_length(request), request.retreat_length
+        reach = reach_of(gripper, around=request.margin, back=back, lift=up)
+        view = hand_views(cloud, T_cloud_hand[free], reach)
+        lift = up * (UP @ T_cloud_hand[free, :3, :3])[view.candidate]
         for low, high in boxes:
             hit[free[view.candidate[_swept_over(view.position, lift, low, high)]]] = True
     return hit

@@ -290,7 +290,8 @@ def centred_grasps(
     """
     axes, origin = candidates.T_cloud_hand[:, :3, :3], candidates.T_cloud_hand[:, :3, 3]
     outward = np.einsum("ed,ed->e", points[candidates.contact_index] - origin, axes[:, :, 1])
-    wide = np.flatnonzero(np.abs(outward) > min_contact_offset(gripper))
+    least = WIDE * gripper.max_opening / 2 - MAX_SHIFT  # from the hand's axis to a contact
+    wide = np.flatnonzero(np.abs(outward) > least)
     first, last = crop.bounds(crop.ball_of_point[candidates.pair[wide]])
     half = gripper.pad_half_width + BESIDE_PADS
     pads = np.array([[-half, gripper.palm_z], [half, gripper.max_tip_z]], dtype=np.float32)
@@ -302,8 +303,3 @@ def centred_grasps(
     further = candidates.take(wide[moved])
     further.T_cloud_hand[:, :3, 3] += middle[moved, None] * further.T_cloud_hand[:, :3, 1]
     return further
-
-
-def min_contact_offset(gripper: Gripper) -> float:
-    """Least distance between the hand's axis and a contact on a wide object, metres."""
-    return WIDE * gripper.max_opening / 2 - MAX_SHIFT

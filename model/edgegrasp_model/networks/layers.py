@@ -117,7 +117,7 @@ class PackedMlp:
     """The linear layers of an MLP as `PackedLinear`s, with their ReLUs."""
 
     def __init__(self, mlp: nn.Sequential) -> None:
-        layers = linear_layers(mlp)
+        layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
         self._products = [
             PackedLinear(layer.weight, layer.bias, rectified=layer is not layers[-1])
             for layer in layers
@@ -128,11 +128,6 @@ class PackedMlp:
         for product in self._products:
             values = product(values)
         return values
-
-
-def linear_layers(mlp: nn.Sequential) -> list[nn.Linear]:
-    """The linear layers of an MLP, in order."""
-    return [layer for layer in mlp if isinstance(layer, nn.Linear)]
 
 
 @cache
