@@ -40,6 +40,14 @@ class Gripper:
         transform[2, 3] = self.tcp_z
         return transform
 
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether the open gripper is the same after half a turn about its z."""
+        boxes = self.open_boxes.reshape(-1, 6)
+        turned = boxes[:, [3, 4, 2, 0, 1, 5]] * (-1, -1, 1, -1, -1, 1)
+        rows, others = (one[np.lexsort(one.round(6).T)] for one in (boxes, turned))
+        return bool(np.allclose(rows, others))
+
     @property
     def finger_depth(self) -> float:
         """Greatest distance of a contact in front of the palm (the paper's G_d), metres."""

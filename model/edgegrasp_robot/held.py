@@ -19,6 +19,7 @@ from edgegrasp_robot.surroundings import CELL, Load, moved
 STEP = 0.005  # metres along the way
 BESIDE = 0.01  # metres; points nearer to the held object already touch it
 MEETS = 0.003  # metres between points that touch
+STRAY = 0.1  # share of the held points that meet others where masks end and readings stray
 SINKS = 0.001  # metres that the held object may go down toward the support
 HIDDEN = 0.03  # metres that the foot of an object may be hidden from the camera
 PUT_DOWN = 0.005  # metres over a region's bottom at which the hand lets go
@@ -64,8 +65,10 @@ def can_leave(held: Held, scene: Scene, way: Float64, collision: Collision) -> b
     steps = max(1, int(np.ceil(np.linalg.norm(way) / STEP)))
     for share in np.arange(1, steps + 1) / steps:
         there = held.points + share * way
-        if tree is not None and np.isfinite(tree.query(there, distance_upper_bound=MEETS)[0]).any():
-            return False
+        if tree is not None:
+            away = tree.query(there, distance_upper_bound=MEETS)[0]
+            if np.isfinite(away).mean() > STRAY:
+                return False
         if _lowest(scene, there) < lowest - SINKS:
             return False
         for T_cloud_box, half in map(box_pose, collision.obstacles):

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from typing import NamedTuple
@@ -35,7 +35,7 @@ TRIED = 200  # most grasps that are tried with the arm, in their order
 PLACES = 6  # in a region, that the arm may be asked for with one grasp
 LEVEL = 0.9  # of the base's z, how much of it is up at least for a region
 SPARE = 4  # grasps tried beyond top_k, as some may get no motion
-LINE_STEP = 0.05  # metres between poses of a straight motion
+LINE_STEP = 0.025  # metres between poses of a straight motion
 MAX_JUMP = 1.0  # most radians that a joint turns between two of them
 OFF_LINE = 0.002  # most metres between the hand and its straight line
 SHARE = 0.99  # share of the limits that is used, as splines overshoot a little
@@ -44,6 +44,7 @@ FINE = 0.002  # radians between the joints that are checked along a trajectory
 PATH_STEP = 0.03  # radians between the joints that are checked along a path
 CLOSE, CLOSE_ANGLE = 5e-4, 1e-3  # metres and radians of the inverse kinematics
 TRAVEL_COST = 0.02  # cost, as a share of a score, per radian of the joint that turns most
+HALF_TURN = np.float32([-1.0, -1.0, 1.0, 1.0])  # of a hand about its z, by columns of its pose
 NO_REACH = "no grasp is within the arm's reach; see counts."
 
 
@@ -121,17 +122,17 @@ def plan_picks(
         grasps = [grasp for grasp in detection.grasps if grasp.object not in around.own]
         failures["on_arm"] = len(detection.grasps) - len(grasps)
         arm = _Arm(robot, asked, scene, options, around, detection.objects)
-        wanted = options.top_k + (SPARE if asked.plan == "motion" else 0)
-        for grasp in grasps:
-            if failures["reachable"] == wanted or time.monotonic() > until:
+        moves, waiting = asked.plan == "motion", iter(grasps)
+        missing = options.top_k
+        while missing > 0 and time.monotonic() < until:
+            tried = arm.reach_some(waiting, missing + (SPARE if moves else 0), until)
+            if not tried:
                 break
-            pick = arm.reach(grasp)
-            failures[pick.outcome] += 1
-            picks.append(pick)
-        untried = [_Pick(grasp, None, "untried") for grasp in grasps[len(picks) :]]
-        picks = _preferred(picks, np.array(asked.joints), options)
-        if asked.plan == "motion":
-            picks = _with_motions(arm, picks, options.top_k, until)
+            failures.update(pick.outcome for pick in tried)
+            tried = _preferred(tried, np.array(asked.joints), options)
+            picks += _with_motions(arm, tried, missing, until) if moves else tried
+            missing = options.top_k - sum(pick.tier <= (0 if moves else 1) for pick in picks)
+        untried = [_Pick(grasp, None, "untried") for grasp in waiting]
     picks = sorted([*picks, *untried], key=lambda pick: pick.tier)[: options.top_k]
     return _told(detection, picks, failures, asked, time.perf_counter() - start)
 
@@ -197,6 +198,7 @@ class _Arm:
         self._robot, self._scene, self._options, self._around = robot, scene, options, around
         self._place, self._objects = asked.place, {one.number: one for one in objects}
         self._start = np.array(asked.joints)
+        self._start_x = robot.hand_pose(self._start)[:3, 0]
         at_home = np.allclose(self._start, robot.home)
         self._starts = [self._start] if at_home else [self._start, robot.home]
         self._T_hand_flange = np.linalg.inv(robot.T_flange_hand)
@@ -211,10 +213,34 @@ class _Arm:
         self._along = self._solver(robot.straight, restarts=0)
         self._ignoring = self._solver(robot.straight, restarts=2, check=False)
 
-    def reach(self, grasp: Grasp) -> _Pick:
-        """Joints at the pregrasp and along the straight approach."""
+    def reach_some(self, grasps: Iterator[Grasp], wanted: int, until: float) -> list[_Pick]:
+        """The next picks, as many as it takes for some to be within reach."""
+        picks: list[_Pick] = []
+        while wanted > 0 and time.monotonic() < until and (grasp := next(grasps, None)) is not None:
+            picks.append(self._reach_either_way(grasp))
+            wanted -= picks[-1].line is not None
+        return picks
+
+    def _reach_either_way(self, grasp: Grasp) -> _Pick:
+        """Reach a grasp, or the same of a hand turned by 180 degrees: the nearer first."""
         if not grasp.collision_free:
             return _Pick(grasp, ArmPlan(reachable=False), "hand_collision")
+        ways = [grasp]
+        if self._robot.gripper.symmetric:
+            poses = grasp.T_cloud_hand * HALF_TURN, grasp.T_cloud_tcp * HALF_TURN
+            ways.append(replace(grasp, T_cloud_hand=poses[0], T_cloud_tcp=poses[1]))
+            if self._T_base_cloud[:3, :3] @ grasp.T_cloud_hand[:3, 0] @ self._start_x < 0.0:
+                ways.reverse()
+        failed = []
+        for way in ways:
+            pick = self._reach(way)
+            if pick.line is not None:
+                return pick
+            failed.append(replace(pick, grasp=grasp))
+        return min(failed, key=lambda pick: pick.outcome == "out_of_reach")
+
+    def _reach(self, grasp: Grasp) -> _Pick:
+        """Joints at the pregrasp and along the straight approach."""
         T_base_hand = self._T_base_cloud @ grasp.T_cloud_hand.astype(np.float64)
         length = self._options.collision.approach_length
         poses = _straight(T_base_hand, T_base_hand[:3, 2], -length, 0.0)
