@@ -51,7 +51,7 @@ class BenchmarkFlags(Cluster):
     scene: str = Field("pile", description="packed, pile, bin, bin-full, table or shelf")
     protocol: str = Field(
         "edgegrasp",
-        description="edgegrasp, giga, vgn, bin, table, shelf, ur5, or a .toml file like them",
+        description="edgegrasp, giga, vgn, bin, table, shelf, ur5-pile, or a .toml file like them",
     )
     planner: str = Field(
         "server", description="server, in-process, an installed one, or module:callable"

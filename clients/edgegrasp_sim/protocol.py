@@ -179,12 +179,26 @@ def load_protocol(name: str) -> Protocol:
             "or pass a .toml file"
         )
     try:
-        return protocol_from(tomllib.loads(path.read_text()))
+        return protocol_from(_constants(path))
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in error.errors())
         raise ValueError(f"protocol {name}: {'; '.join(wrong)}") from None
     except ValueError as error:
         raise ValueError(f"protocol {name}: {error}") from error
+
+
+def _constants(path: Path) -> dict[str, Any]:
+    """The tables of a file, and those constants of its `base`, which ships, that it leaves out."""
+    table = tomllib.loads(path.read_text())
+    if "base" not in table:
+        return table
+    base = table.pop("base")
+    if base not in protocol_names():
+        raise ValueError(f"base is {base!r}; name one of {', '.join(protocol_names())}")
+    inherited = _constants(FOLDER / f"{base}.toml")
+    for name, value in table.items():
+        inherited[name] = inherited.get(name, {}) | value if isinstance(value, dict) else value
+    return inherited
 
 
 def protocol_names() -> list[str]:

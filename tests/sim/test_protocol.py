@@ -22,6 +22,13 @@ def test_the_side_view_is_where_giga_has_it() -> None:
     np.testing.assert_allclose(view[:3, 3], expected, atol=1e-9)
 
 
+def test_a_file_gives_what_differs_from_its_base(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text('base = "ur5-pile"\nname = "own"\n[camera]\nviews = 2\n')
+    own, base = load_protocol(str(file)), load_protocol("ur5-pile")
+    assert own == replace(base, name="own", camera=replace(base.camera, views=2))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -29,6 +36,7 @@ def test_the_side_view_is_where_giga_has_it() -> None:
         ("views = 1", "views = 1\nzoom = 2", "camera.zoom: Unexpected"),
         ('table = "known"', 'table = "guess"', "planning.table: .* 'known', 'seen', 'around'"),
         ("version = 2", "version = ", "protocol .*toml"),
+        ("version = 2", 'version = 2\nbase = "nobody"', "base is 'nobody'; name one of bin"),
     ],
 )
 def test_a_wrong_file_is_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
