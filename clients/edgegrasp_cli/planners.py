@@ -13,10 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edgegrasp_cli.flags import connect
-from edgegrasp_client import GraspClient, GraspClientError, Model, ServerUnavailableError
+from edgegrasp_client import (
+    GraspClient,
+    GraspClientError,
+    Model,
+    ServerUnavailableError,
+    StartCollisionError,
+)
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.protocol import PlanningRules
-from edgegrasp_sim.trial import PlannedGrasp, Planner
+from edgegrasp_sim.trial import PlannedGrasp, Planner, StartCollides
 
 GROUP = "edgegrasp.planners"  # entry points under which packages may name their planners
 SHIPPED = ("server", "in-process")
@@ -148,10 +154,13 @@ class ServerPlanner:
             self._client.detect, observation.image, view_ids=view_ids(observation), **options
         )
         try:
-            return _best(ask().grasps, options)
-        except ServerUnavailableError:
-            self._client.wait_until_ready(REQUEST_SECONDS)
-            return _best(ask().grasps, options)
+            try:
+                return _best(ask().grasps, options)
+            except ServerUnavailableError:
+                self._client.wait_until_ready(REQUEST_SECONDS)
+                return _best(ask().grasps, options)
+        except StartCollisionError as error:
+            raise StartCollides(str(error)) from None
 
     def close(self) -> None:
         """Close the connection."""
@@ -183,6 +192,7 @@ class InProcessPlanner:
         """The best grasp; None if there is none."""
         import torch
 
+        from edgegrasp_model.errors import StartCollision
         from edgegrasp_model.options import parse_options
         from edgegrasp_model.scene.cloud import CloudInput
 
@@ -198,6 +208,8 @@ class InProcessPlanner:
 
             (robot,) = load_robots((Path(self._robot),)).values()
             return _best(detect_picks(self._detector, cloud, options, robot).grasps, asked)
+        except StartCollision as error:
+            raise StartCollides(str(error)) from None
         finally:
             torch.set_num_threads(threads)
 

@@ -21,6 +21,7 @@ from edgegrasp_client.errors import PayloadTooLargeError as PayloadTooLargeError
 from edgegrasp_client.errors import ProtocolError as ProtocolError
 from edgegrasp_client.errors import ServerFailedError as ServerFailedError
 from edgegrasp_client.errors import ServerUnavailableError as ServerUnavailableError
+from edgegrasp_client.errors import StartCollisionError as StartCollisionError
 from edgegrasp_client.errors import UnknownModelError as UnknownModelError
 from edgegrasp_client.errors import WorkerLostError as WorkerLostError
 from edgegrasp_client.options import ApproachDirection as ApproachDirection

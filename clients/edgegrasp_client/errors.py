@@ -3,6 +3,7 @@
 GraspClientError
   + InvalidRequestError         the cloud or an option is wrong: field, value, fix
       + UnknownModelError       the server has no weights of that name
+      + StartCollisionError     the arm touches something where the request has it
       + PayloadTooLargeError    the request exceeds the server's limits
   + AccessDeniedError           no token, an unknown one, or one without the right to this
   + ServerUnavailableError      no connection, weights still loading, the server is stopping, or
@@ -38,6 +39,10 @@ class InvalidRequestError(GraspClientError):
 
 class UnknownModelError(InvalidRequestError):
     """The server has no weights of that name."""
+
+
+class StartCollisionError(InvalidRequestError):
+    """Where the request has the arm, it touches itself or what the camera sees."""
 
 
 class PayloadTooLargeError(InvalidRequestError):
@@ -79,6 +84,7 @@ class ProtocolError(GraspClientError):
 _BY_KIND: dict[str, type[GraspClientError]] = {
     "invalid-request": InvalidRequestError,
     "unsupported-media-type": InvalidRequestError,
+    "start-collision": StartCollisionError,
     "unknown-model": UnknownModelError,
     "payload-too-large": PayloadTooLargeError,
     "headers-too-large": InvalidRequestError,

@@ -143,7 +143,8 @@ def summarise(rounds: Sequence[Round]) -> dict[str, Any]:
         },
         "failures": {
             **{cause.value: sum(a.cause is cause for a in attempts) for cause in FailureCause},
-            "no candidate": sum(item.no_grasp for item in rounds),
+            "start in collision": sum(item.start_collisions for item in rounds),
+            "no candidate": sum(item.no_grasp - item.start_collisions for item in rounds),
         },
         "wrong_object_successes": sum(attempt.wrong_object for attempt in attempts),
         "start_contacts": sum(attempt.start_contact for attempt in attempts),
@@ -210,7 +211,7 @@ def attempts_digest(rounds: Sequence[Round]) -> str:
     """SHA-256 of all but wall-clock times and the objects' widths; equal for equal attempts."""
     tables = [asdict(item) for item in sorted(rounds, key=lambda r: (r.seed, r.index))]
     for table in tables:
-        del table["too_wide"]
+        del table["too_wide"], table["start_collisions"]
         for attempt in table["attempts"]:
             for name in ("planning_seconds", "motion_seconds", "touched_on_the_way"):
                 del attempt[name]

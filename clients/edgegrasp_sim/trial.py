@@ -44,6 +44,10 @@ class PlannedGrasp:
 Planner: TypeAlias = Callable[[Observation, int], PlannedGrasp | None]
 
 
+class StartCollides(Exception):  # noqa: N818
+    """A planner's: in this view the arm touches something before it moves."""
+
+
 class RoundEnd(StrEnum):
     """Why a round ended."""
 
@@ -112,6 +116,7 @@ class Round:
         no_grasp: how often the planner found no grasp; not counted as attempts, as in the
             reference.
         end: why the round ended.
+        start_collisions: in how many of those the arm touched something where it started.
         too_wide: names of the objects that no grasp can hold: the hand does not open that far.
     """
 
@@ -122,6 +127,7 @@ class Round:
     no_grasp: int
     end: RoundEnd
     too_wide: tuple[str, ...] = ()
+    start_collisions: int = 0
 
     @property
     def successes(self) -> int:
@@ -223,7 +229,11 @@ class RoundDriver:
         """Ask the planner; None if it finds no grasp."""
         seed = int(self._policy.integers(2**31))
         started = time.perf_counter()
-        grasp = planner(observation, seed)
+        try:
+            grasp = planner(observation, seed)
+        except StartCollides:
+            grasp, started_in = None, self._round.start_collisions
+            self._round = replace(self._round, start_collisions=started_in + 1)
         self._planning_seconds = time.perf_counter() - started
         if grasp is None:
             self._round = replace(self._round, no_grasp=self._round.no_grasp + 1)

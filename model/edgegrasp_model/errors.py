@@ -2,6 +2,7 @@
 
 EdgeGraspError
   + InvalidRequest        the caller's input is wrong: names the field, the value and the fix
+      + StartCollision    the arm touches something where the request has it
   + UnknownModel          no weights of that name are loaded
   + InvalidCheckpoint     a weights file cannot be used
   + InvalidGripper        a gripper file cannot be used
@@ -89,6 +90,10 @@ class _Short(reprlib.Repr):
 
 
 _SHORT = _Short()
+
+
+class StartCollision(InvalidRequest):
+    """Where the request has the arm, it touches itself or what the camera sees."""
 
 
 class UnknownModel(EdgeGraspError):  # noqa: N818

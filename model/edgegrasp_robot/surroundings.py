@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_camera.arrays import Bools, Float64
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, StartCollision
 from edgegrasp_model.options import Box, OrientedBox, RobotArm
 from edgegrasp_model.scene.cloud import unit
 from edgegrasp_model.scene.obstacles import box_pose
@@ -121,8 +121,9 @@ def surrounded(
         What it put there.
 
     Raises:
-        InvalidRequest: The start is in collision, the base stands inside an object, or what no
-            camera saw is to be avoided and no camera is known.
+        StartCollision: The start is in collision.
+        InvalidRequest: The base stands inside an object, or what no camera saw is to be avoided
+            and no camera is known.
     """
     joints = np.array(asked.joints)
     T_base_cloud = np.reshape(asked.T_base_cloud, (4, 4))
@@ -148,7 +149,7 @@ def surrounded(
             _add(again, robot, obstacles)
             pair = touching(again, robot.model, joints, names)
             fix = "Send the joints as they are, T_base_cloud and obstacles in the right frame."
-            raise InvalidRequest("options.robot.joints", f"a start where {pair} touch", fix)
+            raise StartCollision("options.robot.joints", f"a start where {pair} touch", fix)
         yield around
     finally:
         for planned in (robot.scene, robot.straight):

@@ -7,7 +7,13 @@ import orjson
 
 from edgegrasp_camera import PayloadTooLarge as PayloadTooLarge
 from edgegrasp_camera import UnsupportedMediaType as UnsupportedMediaType
-from edgegrasp_model.errors import EdgeGraspError, InvalidRequest, UnknownModel, brief
+from edgegrasp_model.errors import (
+    EdgeGraspError,
+    InvalidRequest,
+    StartCollision,
+    UnknownModel,
+    brief,
+)
 
 STOPPING = "The server is stopping. Try another one."  # the message of a NotReady
 
@@ -91,6 +97,7 @@ class AddressInUse(ServiceError):  # noqa: N818
 # Names of gRPC codes, and HTTP statuses.
 STATUS: dict[type[Exception], tuple[str, int]] = {
     InvalidRequest: ("INVALID_ARGUMENT", 400),
+    StartCollision: ("INVALID_ARGUMENT", 400),
     UnknownModel: ("NOT_FOUND", 404),
     PayloadTooLarge: ("RESOURCE_EXHAUSTED", 413),
     UnsupportedMediaType: ("INVALID_ARGUMENT", 415),

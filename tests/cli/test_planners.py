@@ -7,11 +7,12 @@ import pytest
 
 from edgegrasp_cli.planners import PlannerChoice, named_planner, open_planner, request_options
 from edgegrasp_model.detector import WEIGHTS_FOLDER
+from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.objects import SceneKind
 from edgegrasp_sim.protocol import load_protocol
 from edgegrasp_sim.simulation import ClutterSimulation
-from edgegrasp_sim.trial import PlannedGrasp, RoundDriver
+from edgegrasp_sim.trial import PlannedGrasp, RoundDriver, StartCollides
 
 PAPER = load_protocol("edgegrasp").planning
 
@@ -59,6 +60,20 @@ def test_a_model_may_be_a_file_of_weights(tmp_path: Path) -> None:
     elsewhere = PlannerChoice("server", str(ablation), server="127.0.0.1:1")
     with pytest.raises(ValueError, match="server's own weights"), open_planner(elsewhere, PAPER):
         pass
+
+
+def test_a_view_in_which_the_arm_touches_the_table_is_told_from_other_errors() -> None:
+    pytest.importorskip("roboplan", reason="the extra robot is not installed")
+    from edgegrasp_cli.arm import benchmark_arm
+
+    fields = benchmark_arm("fr3", load_protocol("edgegrasp").camera).options
+    choice = PlannerChoice("in-process", options=FEW | fields, robot="fr3")
+    fields["robot"]["T_base_cloud"][2][3] += 0.5  # the table, up to the hand
+    with open_planner(choice, PAPER) as made, pytest.raises(StartCollides, match="support"):
+        made.make()(seen_under("edgegrasp"), 3)
+    fields["robot"]["joints"] = [9.0] * 7
+    with open_planner(choice, PAPER) as made, pytest.raises(InvalidRequest, match="joint1"):
+        made.make()(seen_under("edgegrasp"), 3)
 
 
 def test_another_package_may_name_its_planner(tmp_path, monkeypatch) -> None:

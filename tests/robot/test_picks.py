@@ -1,3 +1,6 @@
+from dataclasses import replace
+from itertools import count
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -8,7 +11,7 @@ pytest.importorskip("roboplan", reason="the extra robot is not installed")
 
 from tests.robot.arms import BOXES, TURNED, picks_of, scene_of
 
-from edgegrasp_model.errors import InvalidRequest
+from edgegrasp_model.errors import InvalidRequest, StartCollision
 from edgegrasp_model.options import parse_options
 from edgegrasp_robot import plan_picks
 
@@ -155,8 +158,6 @@ def test_obstacles_may_touch_each_other(fr3):
 
 def test_the_arm_itself_is_no_object(fr3):
     """The camera sees the hand, and takes it for an object."""
-    from dataclasses import replace
-
     scene, cloud, detection = scene_of(fr3)
     hand = fr3.hand_pose(fr3.home)[:3, 3] + np.random.default_rng(0).uniform(-0.02, 0.02, (50, 3))
     seen = (hand - TURNED[:3, 3]) @ TURNED[:3, :3]
@@ -189,9 +190,55 @@ def test_no_time_gives_no_motion_and_says_so(fr3):
     assert "time ran out" in found.warnings[-1]
 
 
-def test_a_colliding_hand_gets_no_motion(fr3):
-    from dataclasses import replace
+def test_out_of_time_is_within_reach_without_a_motion(fr3, monkeypatch):
+    scene, cloud, detection = scene_of(fr3, boxes=BOXES[:1])
+    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    clock = count()
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    # It is asked before each grasp, and before a motion.
+    found = plan_picks(detection, scene, cloud, parse_options({"robot": robot}), fr3, until=2.5)
+    assert found.grasps[0].arm.reachable
+    assert found.grasps[0].arm.trajectory is None
+    assert "1 grasps within reach have no trajectory" in found.warnings[0]
 
+
+def test_a_hand_that_is_the_same_turned_comes_the_nearer_way(robot):
+    (grasp, plan), *_ = plans_of(picks_of(robot))
+    scene, cloud, detection = scene_of(robot)
+    half = np.array([-1, -1, 1, 1], np.float32)
+    grasps = [
+        replace(one, T_cloud_hand=one.T_cloud_hand * half, T_cloud_tcp=one.T_cloud_tcp * half)
+        for one in detection.grasps
+    ]
+    asked = {"name": robot.name, "T_base_cloud": TURNED.tolist(), "joints": robot.home.tolist()}
+    options = parse_options({"robot": asked})
+    (other, same), *_ = plans_of(
+        plan_picks(replace(detection, grasps=grasps), scene, cloud, options, robot)
+    )
+    np.testing.assert_allclose(other.T_cloud_hand, grasp.T_cloud_hand, atol=1e-6)
+    np.testing.assert_array_equal(same.grasp_joints, plan.grasp_joints)
+
+
+@pytest.mark.parametrize(("share", "motions"), [(0.03, 1), (0.3, 0)])
+def test_strays_over_an_object_do_not_hold_it_down(fr3, share, motions):
+    """Some of its points are seen once more, 12 cm higher."""
+    scene, cloud, detection = scene_of(fr3, boxes=BOXES[:1])
+    own = np.arange(len(scene.points_in_cloud))[:: round(1 / share)]
+    up = np.linalg.inv(TURNED)[:3, 2].astype(np.float32)
+    over = scene.points_in_cloud[own] + 0.12 * up
+    scene = replace(
+        scene,
+        points_in_cloud=np.concatenate([scene.points_in_cloud, over]),
+        object_of_point=np.append(scene.object_of_point, np.full(len(over), -1)),
+    )
+    robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
+    lift = {"retreat_length": 0.15, "retreat_direction": "up"}
+    options = parse_options({"robot": robot, "collision": lift})
+    found = plan_picks(detection, scene, cloud, options, fr3)
+    assert found.counts["with_trajectory"] == motions
+
+
+def test_a_colliding_hand_gets_no_motion(fr3):
     scene, cloud, detection = scene_of(fr3)
     grasps = [replace(grasp, collision_free=False) for grasp in detection.grasps]
     robot = {"name": "fr3", "T_base_cloud": TURNED.tolist(), "joints": fr3.home.tolist()}
@@ -224,6 +271,11 @@ def test_a_robot_that_cannot_be_there_is_refused(fr3, case):
     assert error.value.field == field
     assert word in str(error.value)
     assert len(plans_of(picks_of(fr3))) == len(BOXES)  # nothing of it is left
+
+
+def test_the_start_s_collision_names_link_and_obstacle(fr3):
+    with pytest.raises(StartCollision, match=r"(fr3_link\d|the hand) and the support touch"):
+        picks_of(fr3, joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])
 
 
 @pytest.mark.parametrize("pose", [np.full(16, np.nan), np.zeros(16), 2 * np.eye(4)])

@@ -128,7 +128,7 @@ def test_a_robot_that_is_not_here_is_refused(robot, settings, fix):
 
 def test_a_start_that_collides_is_refused_as_a_wrong_request(robot):
     error = ask(robot, "grpc", joints=[0.0, 1.3, 0.0, -1.0, 0.0, 2.2, 0.8])[0].error
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", "options.robot.joints")
+    assert (error.kind, error.field) == ("start-collision", "options.robot.joints")
     assert "the support" in error.value
 
 

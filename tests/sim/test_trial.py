@@ -10,6 +10,7 @@ from edgegrasp_sim.camera import Observation
 from edgegrasp_sim.hand import FailureCause
 from edgegrasp_sim.objects import ObjectModel, ObjectSet, SceneKind
 from edgegrasp_sim.protocol import Protocol, load_protocol
+from edgegrasp_sim.results import summarise
 from edgegrasp_sim.simulation import ClutterSimulation
 from edgegrasp_sim.top_down import plan_top_down
 from edgegrasp_sim.trial import (
@@ -18,6 +19,7 @@ from edgegrasp_sim.trial import (
     Round,
     RoundDriver,
     RoundEnd,
+    StartCollides,
     run_round,
 )
 
@@ -80,6 +82,16 @@ def test_no_grasp_is_no_attempt_and_the_third_ends_a_round(run: Callable[..., Ro
     assert (done.attempts, done.no_grasp) == ((), 3)
     assert len(set(seeds)) == 3
     assert len(set(clouds)) == 3  # a new view every time
+
+
+def test_an_arm_that_cannot_start_in_a_view_takes_another_one(run: Callable[..., Round]) -> None:
+    def planner(seen: Observation, seed: int) -> None:
+        raise StartCollides
+
+    done = run(planner, PACKED, 2)
+    assert (done.end, done.no_grasp, done.start_collisions) == (RoundEnd.NO_GRASP, 3, 3)
+    failures = summarise([done])["failures"]
+    assert (failures["start in collision"], failures["no candidate"]) == (3, 0)
 
 
 def test_scenes_and_views_do_not_depend_on_the_planner(engine, run, paper_with) -> None:
