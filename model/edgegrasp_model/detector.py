@@ -201,7 +201,7 @@ class GraspDetector:
         """Second stage: sample candidates and score them; None if there is no scene.
 
         Starts with half of the approach points, then puts the other half on objects without a sure
-        grasp, then adds further ones if few hands are collision-free.
+        grasp, with tilted hands too, then adds further ones if few hands are collision-free.
         """
         scene = prepared.scene
         if scene is None or not scene.approach_allowed.any() or prepared.options.follows_only:

@@ -28,7 +28,7 @@ from edgegrasp_model.scene.cloud import UP
 OUTLINE_RADIUS = 0.016  # metres of surface from which the outline's direction is estimated
 MIN_OUTWARD = 0.002  # metres from a neighbourhood's mean to a point on the outline
 THIN = 0.003  # metres of standard deviation across a rim, all of which counts as outline
-LEAN, LEANING = np.float32(np.radians(30.0)), 8  # radians off vertical; directions around it
+LEAN, LEANING = np.float32(np.radians(30.0)), 4  # radians off vertical; directions around it
 DROP = 0.006  # metres below an edge from which a surface counts as another one
 GAP = 0.007  # metres without a point in which a surface ends
 ONE_VIEW = np.cos(np.radians(15.0))  # radians; directions closer than this show the same outline

@@ -126,7 +126,7 @@ class Sampler:
         left = (self._wanted - self._first).sum()
         unsure = np.where(np.isin(self._objects, () if sure is None else sure), 0, self._wanted)
         more = self._spread(unsure * left // max(unsure.sum(), 1))
-        return self._around(more) if len(more) else None
+        return self._around(more, leaning=True) if len(more) else None
 
     def further(self) -> Iterator[Sample]:
         """Candidates around further approach points, while few hands are collision-free."""
