@@ -33,6 +33,7 @@ from edgegrasp_service.observability import LogQueue, Metrics, log_call, start_l
 from edgegrasp_service.recording import Recorder, check_outcomes
 from edgegrasp_service.security import ServerTls, load_tokens
 from edgegrasp_service.settings import UNIX, Settings
+from edgegrasp_service.worker.job import PIECE
 from edgegrasp_service.worker.pool import NURSERY, WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -287,6 +288,8 @@ def _listen(host: str, port: int) -> socket.socket:
         # Connections inherit it; asyncio sets it only on its own sockets. Without it answers waited
         # for 40 ms.
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # What nobody reads stays in this process, which counts it, and not in the kernel.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, PIECE)
     return listening
 
 

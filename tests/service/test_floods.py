@@ -7,6 +7,8 @@ import asyncio
 import contextlib
 import json
 import os
+import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -19,7 +21,7 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-from benchmarks.soak import connect, http2_frame, http2_headers, http2_opening
+from benchmarks.soak import CHECK, STREAM, connect, http2_frame, http2_headers, http2_opening
 from grpc import aio
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from tests.cloud_files import npy
@@ -28,6 +30,7 @@ from tests.programs import run
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
+from edgegrasp_service.worker.job import PIECE
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 30
@@ -75,6 +78,19 @@ async def check_health(address: str) -> None:
         check = health_pb2_grpc.HealthStub(channel).Check
         answer = await check(health_pb2.HealthCheckRequest(), timeout=PATIENCE)
         assert answer.status == health_pb2.HealthCheckResponse.SERVING
+
+
+def is_ended(connection: socket.socket) -> bool:
+    """Whether the other side has closed it."""
+    connection.setblocking(False)
+    try:
+        while connection.recv(2**16):
+            pass
+    except BlockingIOError:
+        return False
+    except ConnectionResetError:
+        pass
+    return True
 
 
 def resident_bytes() -> int:
@@ -294,17 +310,57 @@ async def test_health_is_answered_while_every_connection_has_a_request(serve, cl
 
 
 async def test_silent_grpc_connections_are_closed_for_others(serve, cloud) -> None:
+    """None of those others is refused before that."""
     running = await serve(max_connections=30)
     held = [connect(running.server.grpc_address) for _ in range(90)]
     for connection in held:
-        with contextlib.suppress(OSError):  # of those that are not accepted
-            connection.sendall(http2_opening())
-    client = running.connect("grpc")
-    async with asyncio.timeout(PATIENCE):
-        while not (await client.detect(cloud)).fine:
-            await asyncio.sleep(0.1)
+        connection.sendall(http2_opening())
+    await check_health(running.server.grpc_address)
+    assert (await running.connect("grpc").detect(cloud)).fine
+    await running.until(lambda: sum(map(is_ended, held)) >= 60)
     for connection in held:
         connection.close()
+
+
+async def test_a_health_check_waits_for_no_other_calls(serve) -> None:
+    running = await serve(max_streams=100)
+    order, observe = [], running.server.service.observe
+    running.server.service.observe = lambda call: order.append(call.method) or observe(call)
+    with contextlib.closing(Http2(running.server.grpc_address)) as connection:
+        for number in range(90):
+            path = CHECK if number == 60 else STREAM
+            connection.begin(path, 2 * number + 1)
+        time.sleep(0.5)  # all of them arrive before this event loop looks
+        await running.until(lambda: len(order) == 90)
+    assert order.index("HealthCheck") < 10
+
+
+async def test_pages_take_no_threads(serve, monkeypatch) -> None:
+    running = await serve()
+    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=PATIENCE) as http:
+        with monkeypatch.context() as patched:
+            patched.setattr(threading.Thread, "start", lambda thread: pytest.fail("a thread"))
+            for path in ("/docs/assets/swagger-ui-bundle.js", "/playground/"):
+                assert (await http.get(path)).status_code == 200
+        assert (await http.post("/playground/style.css")).status_code == 405
+        assert (await http.get("/playground/none.css")).status_code == 404
+
+
+async def test_a_large_body_goes_to_its_worker_in_pieces(serve) -> None:
+    """Or the event loop copies 30 MB at once, for each of many bodies."""
+    running = await serve()
+    (worker,) = running.server.pool._workers
+    os.kill(worker.pid, signal.SIGSTOP)
+    try:
+        async with httpx.AsyncClient(base_url=running.server.http_url, timeout=PATIENCE) as http:
+            asked = asyncio.create_task(http.post("/v1/grasps", content=bytes(30 * MIB)))
+            await running.until(lambda: running.server.pool.busy == 1)
+            await asyncio.sleep(0.1)
+            assert 0 < worker._writer.transport.get_write_buffer_size() <= 2 * PIECE
+            os.kill(worker.pid, signal.SIGCONT)
+            assert (await asked).status_code >= 400
+    finally:
+        os.kill(worker.pid, signal.SIGCONT)
 
 
 async def test_answers_of_pages_are_given_up_too(serve) -> None:

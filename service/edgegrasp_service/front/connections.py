@@ -31,6 +31,7 @@ from edgegrasp_service.errors import (
 )
 from edgegrasp_service.observability import network_of
 from edgegrasp_service.settings import Settings
+from edgegrasp_service.worker.job import PIECE
 
 # Connections of HTTP
 HEALTH_PLACES = 16  # beside max_connections, never held by requests to /v1/
@@ -40,6 +41,7 @@ KEEP_ALIVE_SECONDS = 75  # longer than clients keep theirs: no request meets a c
 LINGER_SECONDS = 5.0  # seconds for a refused client to read its answer
 MANY_PIECES, SMALL_PIECE = 1024, 16  # more chunks than this, smaller than this, are refused
 PAGES = 16  # sent at a time
+PAGE_PAUSE_SECONDS = 0.001  # seconds between the beginnings of two pages
 PAGE_GRACE_SECONDS = 10.0  # seconds after which a page yields its place to another one
 
 # Calls of gRPC
@@ -53,8 +55,8 @@ STREAM_GRACE_SECONDS = 10.0  # seconds after which an idle stream yields its pla
 # Connections of gRPC
 LOOKAHEAD_BYTES = 2**20  # buffered bytes of a message that is not being read yet; 87,000 points
 SPARE_BYTES = 2**20  # an excess up to this is refused with field, value and fix
-SPARE_CONNECTIONS = 2  # times max_connections are accepted before the oldest are closed
-TRIM_SECONDS = 0.5  # between two checks for too many connections
+SPARE_CONNECTIONS = 4  # times max_connections are accepted before the oldest are closed
+TRIM_SECONDS = 0.05  # seconds between two checks for too many connections
 DESCRIPTORS = Path("/proc/self/fd")
 LAST_RECEIVED = struct.Struct("52xI")  # of struct tcp_info: tcpi_last_data_recv, milliseconds
 
@@ -193,6 +195,7 @@ class HttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: Any) -> None:
         """Take a place, and wait for the first headers."""
         super().connection_made(transport)
+        transport.max_size = PIECE  # read in one turn of the event loop
         self.transport = _GentleTransport(  # type: ignore[assignment]
             transport, lambda: self._receiving
         )

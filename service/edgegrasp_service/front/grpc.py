@@ -9,7 +9,7 @@ import logging
 import math
 import struct
 import urllib.parse
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
 from typing import Any, NoReturn
@@ -62,6 +62,7 @@ logger = logging.getLogger(__name__)
 
 SERVICE = grasp_pb2.DESCRIPTOR.services_by_name["GraspService"]
 HEALTH = health.SERVICE_NAME
+CHECK = f"/{HEALTH}/Check"
 STATES = health_pb2.HealthCheckResponse.ServingStatus
 REFLECTION = tuple(f"grpc.reflection.{version}.ServerReflection" for version in ("v1", "v1alpha"))
 
@@ -95,7 +96,15 @@ class GrpcServer:
         settings = service.settings
         self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # not in its stubs
         self._server = aio.server(options=grpc_bounds(settings))
-        self._server.add_generic_rpc_handlers((_Methods(service, reloader, self._health),))
+        methods = _Methods(service, reloader, self._health)
+        self._server.add_generic_rpc_handlers((methods,))
+        # It has a queue of its own: no other calls come before it.
+        checking = grpc.stream_stream_rpc_method_handler(
+            methods.check, response_serializer=_serialized
+        )
+        self._server.add_registered_method_handlers(  # type: ignore[attr-defined]
+            HEALTH, {"Check": checking}
+        )
         sockets = settings.host.startswith(UNIX)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         place = f"{settings.host}/grpc.sock" if sockets else f"{host}:{settings.grpc_port}"
@@ -135,6 +144,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         names = (SERVICE.full_name, HEALTH, *REFLECTION)
         self._reflection = reflection.aio.ReflectionServicer(names)  # type: ignore[attr-defined]
         self._small_reads = Places(SMALL_READS)
+        self._checking: Counter[str] = Counter()  # by connection
         self._watchers = Places(WATCHERS)
         self._streams = Places(service.settings.max_streams, STREAM_GRACE_SECONDS)
         ours: dict[str, Behaviour] = {
@@ -148,7 +158,7 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
         # By path: what a method is called in metrics and the log, and what it does.
         self._behaviours: dict[str, tuple[str, Behaviour]] = {
             **{f"/{SERVICE.full_name}/{name}": (name, does) for name, does in ours.items()},
-            f"/{HEALTH}/Check": ("HealthCheck", self._check_health),
+            CHECK: ("HealthCheck", self._check_health),
             f"/{HEALTH}/Watch": ("HealthWatch", self._watch_health),
             **{
                 f"/{name}/ServerReflectionInfo": ("Reflection", self._reflect)
@@ -164,6 +174,18 @@ class _Methods(grpc.GenericRpcHandler):  # type: ignore[type-arg]  # generic in 
             await self._handle(path, context)
 
         return grpc.stream_stream_rpc_method_handler(handle, response_serializer=_serialized)
+
+    async def check(self, messages: Any, context: Any) -> None:
+        """Answer a health check, or refuse one of many silent ones at little cost."""
+        peer = context.peer()
+        if self._checking[peer] and len(self._small_reads) >= SMALL_READS:
+            why = "This connection has a health check without a message."
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, why)
+        self._checking[peer] += 1
+        try:
+            await self._handle(CHECK, context)
+        finally:
+            self._checking -= Counter((peer,))  # forgets those without any
 
     async def _handle(self, path: str, context: Any) -> None:
         metadata = context.invocation_metadata() or ()

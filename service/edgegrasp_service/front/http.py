@@ -5,12 +5,14 @@ import ipaddress
 import json
 import logging
 import math
+import mimetypes
 import re
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+import fastapi_offline
 from fastapi.encoders import jsonable_encoder
 from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.datastructures import Headers
@@ -32,10 +34,15 @@ from edgegrasp_service.errors import (
     report,
 )
 from edgegrasp_service.front import connections
-from edgegrasp_service.front.connections import PAGE_GRACE_SECONDS, PAGES, Places
+from edgegrasp_service.front.connections import (
+    PAGE_GRACE_SECONDS,
+    PAGE_PAUSE_SECONDS,
+    PAGES,
+    Places,
+)
 from edgegrasp_service.front.service import GraspService, Reloader, check_headers
 from edgegrasp_service.observability import REQUEST_ID_HEADER, Call, Metrics, current_call
-from edgegrasp_service.worker.job import Answer, Job, Method
+from edgegrasp_service.worker.job import PIECE, Answer, Job, Method
 
 logger = logging.getLogger(__name__)
 
@@ -138,9 +145,9 @@ class HttpMiddleware:
 
     @asynccontextmanager
     async def _page(self, client: str) -> AsyncIterator[None]:
-        """Answer a page: one begins in a turn of the event loop, however many come at once."""
+        """Answer a page: each waits a moment, in which others are served, however many come."""
         async with self._page_begins:
-            await asyncio.sleep(0)
+            await asyncio.sleep(PAGE_PAUSE_SECONDS)
         async with self._pages.hold(client):
             yield
 
@@ -216,19 +223,36 @@ def create_router(service: GraspService, metrics: Metrics, reloader: Reloader) -
         Route("/openapi.json", JSONResponse(DOCUMENT), methods=["GET"]),
         Route("/docs", page, methods=["GET"]),
         Route("/", index, methods=["GET"]),
-        Mount(ASSETS, StaticFiles(packages=[("fastapi_offline", "static")])),
+        *_files(f"{ASSETS}/", Path(fastapi_offline.__file__).with_name("static")),
     ]
     if settings.playground:
         found = {name: load_gripper(name) for name in gripper_names()}
         found |= {file.stem: load_gripper(file) for file in settings.grippers}
         grippers = JSONResponse(jsonable_encoder(found))
-        samples = settings.samples or PLAYGROUND_FILES / "samples"
-        routes += [
-            Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]),
-            Mount(f"{PLAYGROUND}samples", StaticFiles(directory=samples)),
-            Mount(PLAYGROUND.rstrip("/"), StaticFiles(directory=PLAYGROUND_FILES, html=True)),
-        ]
+        routes.append(Route(f"{PLAYGROUND}grippers.json", grippers, methods=["GET"]))
+        if settings.samples is not None:
+            routes.append(Mount(f"{PLAYGROUND}samples", StaticFiles(directory=settings.samples)))
+        routes.append(Route(PLAYGROUND, _File(PLAYGROUND_FILES / "index.html"), methods=["GET"]))
+        routes += _files(PLAYGROUND, PLAYGROUND_FILES)
     return Router(routes, redirect_slashes=False)
+
+
+class _File:
+    """A route to a file, read at start: a thread for each read would delay others."""
+
+    def __init__(self, file: Path) -> None:
+        kind, _ = mimetypes.guess_type(file.name)
+        self._response = Response(file.read_bytes(), media_type=kind)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        await _send_slowly(self._response, send)
+
+
+def _files(path: str, folder: Path) -> list[BaseRoute]:
+    """Routes to all files of a folder."""
+    files = {one.relative_to(folder).as_posix(): one for one in folder.rglob("*") if one.is_file()}
+    return [Route(f"{path}{name}", _File(one), methods=["GET"]) for name, one in files.items()]
 
 
 class _Work:
@@ -250,31 +274,41 @@ class _Work:
             await connections.send(service.settings, sending, call.bytes_out)
 
     async def _read_job(self, scope: Scope, headers: Headers, receive: Receive) -> Job:
-        pieces: list[bytes] = []
+        pieces: list[bytearray] = []
         received, more = 0, True
         start = asyncio.get_running_loop().time()
         while more:
             message = await connections.receive(self._service.settings, receive(), received, start)
             if message["type"] == "http.disconnect":
                 raise Cancelled("The client left before its request was whole.")
-            pieces.append(message.get("body", b""))
-            received += len(pieces[-1])
+            part = message.get("body", b"")
+            if pieces and len(pieces[-1]) < PIECE:
+                pieces[-1] += part
+            else:
+                pieces.append(bytearray(part))
+            received += len(part)
             self._service.check_size(received)
             more = message.get("more_body", False)
         query = scope["query_string"].decode("latin-1")
         content_type = headers.get("content-type", "")
-        return Job(self._method, "http", b"".join(pieces), 0.0, content_type, query)
+        return Job(self._method, "http", b"", 0.0, content_type, query, pieces=pieces)
 
 
 async def _send_answer(call: Call, answer: Answer, send: Send) -> None:
-    """Send an answer; returns once the client has taken most of it."""
     if answer.error is not None:
         response = _problem_response(call, answer.error)
     else:
         response = Response(answer.body, media_type="application/json")
+    await _send_slowly(response, send)
+
+
+async def _send_slowly(response: Response, send: Send) -> None:
+    """Send a response as the client takes it; returns once it has taken most of it."""
     start = {"type": "http.response.start", "status": response.status_code}
     await send({**start, "headers": response.raw_headers})
-    await send({"type": "http.response.body", "body": response.body, "more_body": True})
+    for place in range(0, len(response.body), PIECE):
+        piece = response.body[place : place + PIECE]
+        await send({"type": "http.response.body", "body": piece, "more_body": True})
     await send({"type": "http.response.body"})
 
 

@@ -136,7 +136,7 @@ class GraspService:
             WorkerLost: The worker died for another reason.
         """
         call.end_stage("read")
-        call.bytes_in = len(job.body)
+        call.bytes_in = job.size
         self.check_size(call.bytes_in)
         self.admission.resize(ticket, call.bytes_in)
         ticket.whole = True
@@ -218,7 +218,8 @@ def _digest(job: Job) -> bytes:
     """Digest of a request as a worker sees it; run it in a thread, as bodies may be large."""
     kind = f"{job.method}\n{job.transport}\n{job.content_type}\n{job.query}\n"
     digest = hashlib.sha256(kind.encode("utf-8", "surrogateescape"))
-    digest.update(job.body)
+    for part in job.parts:
+        digest.update(part)
     return digest.digest()
 
 

@@ -2,12 +2,14 @@
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, Literal
 
 from edgegrasp_service.errors import Problem
 
 HEADER = struct.Struct(">QQ")  # bytes of a message's JSON, and of the body that follows it
+PIECE = 2**16  # bytes of a body that the front reads or writes at a time
 
 Method = Literal["DetectGrasps", "ScoreGrasps", "RecordOutcome", "Beat"]  # Beat: nothing
 Transport = Literal["http", "grpc"]
@@ -24,6 +26,17 @@ class Job:
     content_type: str = ""  # HTTP: the header as sent
     query: str = ""  # HTTP: the query string, without the question mark
     request_id: str = ""  # for the worker's log
+    pieces: Sequence[bytearray] = ()  # the body where the front has it in pieces
+
+    @property
+    def parts(self) -> Sequence[bytes | bytearray]:
+        """The body, in one or more parts."""
+        return self.pieces or (self.body,)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the body."""
+        return sum(map(len, self.parts))
 
 
 @dataclass
@@ -61,11 +74,11 @@ class Ready:
 MESSAGES = {kind.__name__: kind for kind in (Ready, Job, Answer)}
 
 
-def pack(message: object) -> tuple[bytes, bytes]:
+def pack(message: object) -> Sequence[bytes | bytearray]:
     """Serialize one of MESSAGES: lengths, plain fields as JSON, and the body without a copy."""
     text = json.dumps([type(message).__name__, message], default=_plain).encode()
-    body: bytes = getattr(message, "body", b"")
-    return HEADER.pack(len(text), len(body)) + text, body
+    parts = message.parts if isinstance(message, Job) else (getattr(message, "body", b""),)
+    return HEADER.pack(len(text), sum(map(len, parts))) + text, *parts
 
 
 def unpack(text: bytes, body: bytes) -> Any:
@@ -90,4 +103,6 @@ def receive(file: BinaryIO) -> Any:
 
 def _plain(value: Any) -> Any:
     """What JSON has in place of a value that it lacks: a message's fields; "" for a body."""
-    return "" if isinstance(value, bytes) else vars(value)
+    if isinstance(value, bytes):
+        return ""
+    return {name: field for name, field in vars(value).items() if name != "pieces"}

@@ -17,7 +17,7 @@ from typing import Any
 from edgegrasp_model.errors import EdgeGraspError
 from edgegrasp_service.errors import HarmfulRequest, InvalidSettings, WorkerLost, kind_of
 from edgegrasp_service.settings import Settings
-from edgegrasp_service.worker.job import HEADER, Answer, Job, pack, receive, unpack
+from edgegrasp_service.worker.job import HEADER, PIECE, Answer, Job, pack, receive, unpack
 from edgegrasp_service.worker.process import ENDED, LOST
 
 # -P: nothing is imported from the folder the server was started in.
@@ -334,10 +334,12 @@ class _Worker:
         answer.add_done_callback(lambda answer: answer.exception())  # nobody may be waiting
         self.at_work = job.method != "Beat"
         assert self._writer is not None
-        for part in pack(replace(job, remaining=deadline - loop.time())):
-            self._writer.write(part)
-        del job
         try:
+            with contextlib.suppress(OSError):  # if it has died, that becomes the answer
+                for part in pack(replace(job, remaining=deadline - loop.time())):
+                    for place in range(0, len(part), PIECE):
+                        self._writer.write(memoryview(part)[place : place + PIECE])
+                        await self._writer.drain()
             return await asyncio.shield(answer)
         except asyncio.CancelledError:
             if self.answer is answer:  # otherwise it has finished and may have another job
