@@ -16,6 +16,7 @@ from PIL import Image
 from tests.cloud_files import npy, npz, xyz
 
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
+from edgegrasp_client import GraspClient
 from edgegrasp_service.front.http import DOCUMENT
 
 OPTIONS = {"seed": 5, "num_approach_points": 20, "top_k": 7}
@@ -129,6 +130,13 @@ def test_debug_and_scoring_are_as_documented(cloud: np.ndarray, http) -> None:
     check(http.get("/v1/models"), "Models")
     check(http.get("/v1/robots"), "Robots")
     check(http.post("/v1/grasps", json={}), "Problem")
+
+
+def test_nothing_found_is_a_success(cloud: np.ndarray, dummy_server, transport: str) -> None:
+    with GraspClient(dummy_server.address(transport)) as client:
+        detection = client.detect(cloud, min_score=1.0)
+    assert detection.grasps == []
+    assert (detection.counts["points"], detection.counts["returned"]) == (500, 0)
 
 
 def test_probes_and_reflection(channel, http) -> None:
