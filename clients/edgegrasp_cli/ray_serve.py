@@ -2,7 +2,7 @@
 
 serve run docker/ray/serve.yaml
 
-docs/scaling.md says when to use it. Ray replaces `edgegrasp_service.front`: it admits and queues
+docs/containers.md says when to use it. Ray replaces `edgegrasp_service.front`: it admits and queues
 requests, and chooses, adds and replaces replicas. It has no streams, tokens or TLS.
 """
 
