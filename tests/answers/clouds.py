@@ -271,4 +271,3 @@ MAKERS = (packed_plane, pile_ransac, organised_mask, depth_image, two_views, giv
 MAKERS += (segments_own_gripper, robotiq_side, obstacles_clearance, indices_highest_debug)
 MAKERS += (tilted_up, score_edges, score_hand_poses)
 CASES = {make.__name__: make for make in MAKERS}
-OVER_THE_WIRE = ("depth_image", "segments_own_gripper", "score_edges")

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from edgegrasp_client import GraspClient
 from edgegrasp_model.detector import ModelCatalogue
 
-from .clouds import CASES, OVER_THE_WIRE
+from .clouds import CASES
 from .make import GRASP_FIELDS, Record, answer, load, record
 
 CLOSE = 1e-5  # of scores, metres and matrix entries: another processor rounds otherwise
@@ -52,14 +51,3 @@ def catalogue() -> ModelCatalogue:
 @pytest.mark.parametrize("name", CASES)
 def test_detector_answers_as_recorded(name: str, catalogue: ModelCatalogue) -> None:
     assert_same(record(answer(CASES[name](), catalogue)), load(name))
-
-
-@pytest.mark.parametrize("transport", ["rest", "grpc"])
-@pytest.mark.parametrize("name", OVER_THE_WIRE)
-def test_server_answers_as_recorded(name: str, transport: str, real_server) -> None:
-    case = CASES[name]()
-    with GraspClient(real_server.address(transport), timeout=120.0) as client:
-        ask = client.score if case.given else client.detect
-        sent = {"depth_images": case.depth_images, **case.beside, **case.given, **case.options}
-        found = ask(case.points, **sent)
-    assert_same(record(found), load(name))

@@ -29,14 +29,7 @@ def image(number: int) -> dict[str, Any]:
     return {"cloud": noisy.astype(np.float32), "view_ids": np.zeros(len(points), np.int32)}
 
 
-@pytest.fixture(scope="module")
-def server(start_server) -> Iterator[Any]:
-    with start_server() as running:
-        yield running
-
-
-@pytest.mark.parametrize("transport", ["grpc_address", "http_url"])
-def test_a_grasp_keeps_its_id_and_moves_with_its_object(server, transport: str) -> None:
+def test_a_grasp_keeps_its_id_and_moves_with_its_object(real_server, transport: str) -> None:
     tracker = GraspTracker(search_every=3, viewpoint=(0.35, 0.0, 0.55), max_object_size=0.3)
     wanted = threading.Semaphore(1)
 
@@ -45,7 +38,7 @@ def test_a_grasp_keeps_its_id_and_moves_with_its_object(server, transport: str) 
             wanted.acquire()
             yield image(number)
 
-    with GraspClient(getattr(server, transport)) as client:
+    with GraspClient(real_server.address(transport)) as client:
         found = []
         for _, detection in tracker.follow(client, camera()):
             found.append(detection)
@@ -60,8 +53,8 @@ def test_a_grasp_keeps_its_id_and_moves_with_its_object(server, transport: str) 
     assert ["scored" in one.counts for one in found] == [n % 3 == 0 for n in range(IMAGES)]
 
 
-def test_a_grasp_of_an_object_that_is_gone_is_lost_and_another_takes_its_place(server) -> None:
-    with GraspClient(server.http_url) as client:
+def test_a_grasp_of_an_object_that_is_gone_is_lost_and_another_takes_its_place(real_server) -> None:
+    with GraspClient(real_server.http_url) as client:
         first = client.detect(**image(0), viewpoint=(0.35, 0.0, 0.55), previous={})
         (box,), best = first.objects, first.grasps[0]
         previous = {

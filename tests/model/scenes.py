@@ -43,14 +43,16 @@ def detector(architecture: str = "hand") -> GraspDetector:
 
 
 @cache
-def box_on_table(count: int = 2000, table: bool = False) -> np.ndarray:
-    """The top and two sides of a 40 x 60 x 80 mm box on z = 0, with its table if wanted."""
+def box_on_table(
+    count: int = 2000, table: bool = False, size: tuple[float, ...] = (0.04, 0.06, 0.08)
+) -> np.ndarray:
+    """The top and two sides of a box (metres) on z = 0, with its table if wanted."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-0.5, 0.5, (2, count))
     top = np.stack([u, v, np.full(count, 0.5)], axis=1)
     front = np.stack([np.full(count, 0.5), u, v], axis=1)
     side = np.stack([u, np.full(count, 0.5), v], axis=1)
-    points = np.concatenate([top, front, side]) * (0.04, 0.06, 0.08) + (0, 0, 0.04)
+    points = np.concatenate([top, front, side]) * size + (0, 0, size[2] / 2)
     if table:
         flat = np.stack([u * 0.5, v * 0.5, np.zeros(count)], axis=1)
         points = np.concatenate([points, flat])

@@ -138,9 +138,3 @@ def test_normals_of_a_sphere_are_radial_and_face_the_camera() -> None:
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
     assert ((normals * (viewpoint - points)).sum(axis=1) >= 0).all()
     assert (cosine[points[:, 2] > 0.02] > 0.9).all()
-
-
-def test_a_handful_of_points_still_gets_normals() -> None:
-    points = np.array([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0.01, 0.01, 0]], np.float32)
-    normals = estimate_normals(points, Neighbors.within(points))
-    np.testing.assert_allclose(np.abs(normals[:, 2]), 1.0, atol=1e-6)

@@ -20,13 +20,11 @@ from edgegrasp_model.networks.config import HAND, NetworkConfig
 from edgegrasp_model.networks.hand import HandBatch
 from edgegrasp_model.options import SupportPlane
 from edgegrasp_model.scene.cloud import Cloud
-from edgegrasp_model.unseen import FAR, DepthMap, unseen, unseen_space
 
 from .scenes import PANDA, SEED, TINY
 
 UP = np.array([0.0, 0.0, 1.0], dtype=np.float32)
 CAMERA = np.array([0.3, 0.2, 0.5], dtype=np.float32)
-ABOVE = np.array([0.0, 0.0, 0.6], dtype=np.float32)
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -146,48 +144,3 @@ def test_weights_that_were_changed_are_those_that_score() -> None:
     with torch.inference_mode():
         assert not torch.equal(changed(batch), before)
         assert torch.equal(changed(batch), fresh(batch))
-
-
-def plate(spacing: float = 0.004) -> np.ndarray:
-    """A level plate of 0.1 m in the middle, at a height of 0.1 m, as a cloud.  # (N, 3)."""
-    steps = np.arange(-0.05, 0.05, spacing)
-    x, y = np.meshgrid(steps, steps)
-    return np.stack([x, y, np.full_like(x, 0.1)], axis=-1).reshape(-1, 3).astype(np.float32)
-
-
-def behind(cloud: np.ndarray, camera: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Metres that places (S, 3) of the cloud's frame lie behind what a camera saw.  # (S,)."""
-    seen = DepthMap.of_cloud(cloud, camera, UP)
-    return seen.behind(np.eye(4, dtype=np.float32)[None], places.astype(np.float32))[0]
-
-
-@pytest.mark.parametrize("exactly_above", [False, True])
-def test_only_what_is_behind_the_plate_is_hidden(exactly_above: bool) -> None:
-    camera = plate().mean(axis=0) + UP / 2 if exactly_above else ABOVE
-    places = np.array(
-        [[0, 0, 0.15], [0, 0, 0.1], [0.02, -0.03, 0.0], [0.09, 0, 0.0], [0, 0, -3.0], [3, 0, 0.1]]
-    )
-    hidden = unseen(behind(plate(), camera, places))
-    np.testing.assert_array_equal(hidden, [0, 0, 1, 0, 1, 0])
-
-
-def test_the_finger_behind_a_plate_is_unseen() -> None:
-    # A hand from the side, its fingers above and below the plate: y, the closing direction, is up.
-    hand = np.eye(4, dtype=np.float32)
-    hand[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
-    hand[:3, 3] = [-0.1, 0.0, 0.1]
-    met = np.zeros((1, 2), dtype=np.float32)
-    above_only = DepthMap.of_each(plate(), ABOVE[None], UP)
-    found = unseen_space(above_only, hand[None], met, PANDA)
-    above, below = found.parts[0][0], found.parts[1][0]
-    assert above == found.depths[0][0] == found.beyond[0][0] == 0.0
-    assert below > 0.9
-    assert 0.04 < found.depths[1][0] < FAR
-    assert found.beyond[1][0] > 0.04
-    assert found.ways[0][0] == 0.0
-    unknown = unseen_space([], hand[None], met, PANDA)
-    assert len(unknown.parts) == len(found.parts)
-    assert not np.any(unknown.parts + unknown.ways + unknown.depths + unknown.beyond)
-    both = DepthMap.of_each(plate(), np.stack([ABOVE, -ABOVE]), UP)
-    seen = unseen_space(both, hand[None], met, PANDA)  # one camera above the plate, one below
-    assert not np.any(seen.parts + seen.ways + seen.depths + seen.beyond)

@@ -11,7 +11,7 @@ from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_model.options import parse_options
 from edgegrasp_model.ranking import objects_first, openings
 
-from .scenes import PANDA, TINY, random_hands, scene_of
+from .scenes import PANDA, TINY, box_on_table, random_hands, scene_of
 
 
 def test_each_object_has_its_best_grasp_before_any_has_a_second() -> None:
@@ -72,15 +72,6 @@ def hopeless() -> GraspDetector:
     return GraspDetector(network, CheckpointMetadata("no", TINY["hand"], 0.0045, "panda"), PANDA)
 
 
-def seen_box(*size: float) -> np.ndarray:
-    """Top and two sides of a box on z = 0."""
-    rng = np.random.default_rng(0)
-    u, v = rng.uniform(-0.5, 0.5, (2, 3000))
-    end = np.full(3000, 0.5)
-    faces = [np.stack(face, axis=1) for face in ((u, v, end), (end, u, v), (u, end, v))]
-    return (np.concatenate(faces) * size + (0, 0, size[2] / 2)).astype(np.float32)
-
-
 LID = [{"kind": "box", "min": (-0.5, -0.5, 0.09), "max": (0.5, 0.5, 0.2)}]
 
 
@@ -98,7 +89,7 @@ def test_an_object_without_a_good_grasp_has_a_reason(size, options, reason) -> N
     floor = {"normal": (0, 0, 1), "offset": 0.0}
     known = {"viewpoint": (0.3, 0.2, 0.5), "support": floor, "objects": "off"}
     asked = parse_options(known | {"approach_direction": {"preset": "top-down"}} | options)
-    (single,) = hopeless().detect(seen_box(*size), asked).objects
+    (single,) = hopeless().detect(box_on_table(3000, size=size), asked).objects
     assert single.reason == reason
 
 
@@ -107,7 +98,7 @@ def test_an_object_with_a_good_grasp_needs_no_reason() -> None:
         ModelCatalogue.load()
         .get("edgegrasp-plus")
         .detect(
-            seen_box(0.04, 0.06, 0.08),
+            box_on_table(3000),
             parse_options({"viewpoint": (0.3, 0.2, 0.5), "objects": "off"}),
         )
         .objects

@@ -152,26 +152,6 @@ def test_views_are_fused() -> None:
         np.testing.assert_array_equal(seen, check_cloud(alone).points)
 
 
-@pytest.mark.parametrize(
-    ("images", "field", "value"),
-    [
-        ([], "depth_images", "0 images"),
-        ([image(depth_of(), pose(0))] * 65, "depth_images", "65 images"),
-        ([{}], "depth_images.0.intrinsics", "nothing"),
-        ([image(depth_of(), pose(0)) | {"depth": {"height": 1, "width": 1, "encoding": "rgb8",
-          "data": b"abc"}}], "depth_images.0.depth.encoding", "'rgb8'"),
-        ([image(depth_of(), pose(0)) | {"depht": 1}], "depth_images.0.depht", "unknown"),
-        ([image(depth_of(), pose(0)) | {"depth": [[1], [1, 2]]}], "depth_images.0.depth", "length"),
-        ([image(depth_of(), -pose(0))], "depth_images.0.T_cloud_camera", ""),
-    ],
-)  # fmt: skip
-def test_bad_images_are_refused_by_field(images: object, field: str, value: str) -> None:
-    with pytest.raises(InvalidRequest) as caught:
-        read_depth_images(images, MANY)
-    assert caught.value.field == field
-    assert value in caught.value.value
-
-
 # sensor_msgs/PointCloud2
 
 

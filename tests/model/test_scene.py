@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.optimize import lsq_linear
-from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.errors import InvalidRequest
 from edgegrasp_model.options import DetectOptions
 from edgegrasp_model.scene.cloud import CloudInput, check_cloud
-from edgegrasp_model.scene.obstacles import SolidBoxes, separation, signed_distance
 from edgegrasp_model.scene.scene import Scene, build_scene, select_points
-
-from .scenes import SEED
 
 VOXEL = 0.004
 
@@ -89,31 +82,3 @@ def test_a_found_plane_is_taken_away_and_stays_as_an_obstacle() -> None:
     assert scene.support is None
     assert counts["above_support"] == 1000
     assert "no support plane" in warnings[0]
-
-
-def random_boxes(rng: np.random.Generator, count: int) -> SolidBoxes:
-    turn = Rotation.random(count, rng=rng).as_matrix()
-    extent = rng.uniform(0.01, 0.2, (count, 3))
-    return SolidBoxes(rng.uniform(-0.25, 0.25, (count, 3)), extent[..., None] * turn)
-
-
-def least_distance(generators: np.ndarray, offset: np.ndarray) -> float:
-    """Distance of `offset` to all sums of generators, each times -1 to 1."""
-    return float(np.sqrt(2 * lsq_linear(generators.T, offset, (-1, 1), tol=1e-14).cost))
-
-
-@given(seed=st.integers(0, SEED))
-def test_distances_of_boxes_are_those_of_a_convex_optimiser(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    ours, theirs = random_boxes(rng, 8), random_boxes(rng, 8)
-    way = rng.normal(scale=0.2, size=(8, 3))
-    found, swept = signed_distance(ours, theirs), separation(ours, theirs, way)
-    for row in range(8):
-        offset = theirs.center[row] - ours.center[row]
-        both = [*ours.half[row], *-theirs.half[row]]
-        np.testing.assert_allclose(
-            max(found[row], 0.0), least_distance(np.array(both), offset), atol=1e-6
-        )
-        moved = least_distance(np.array([*both, way[row] / 2]), offset - way[row] / 2)
-        assert (swept[row] > 0) == (moved > 1e-7)
-        assert swept[row] <= moved + 1e-9

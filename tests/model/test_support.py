@@ -13,7 +13,6 @@ from edgegrasp_model.scene.scene import build_scene, select_points
 from edgegrasp_model.scene.support import (
     Seen,
     correct_depth_scale,
-    depth_scale,
     fit_plane,
 )
 
@@ -56,18 +55,6 @@ def test_the_table_is_found_in_any_frame(seed: int, share: float) -> None:
     assert abs(plane.heights(shift[None] + 0.05 * normal)[0]) < 0.002
 
 
-def test_points_near_objects_decide_between_two_planes() -> None:
-    rng = np.random.default_rng(3)
-    floor = rng.uniform(-1, 1, (4000, 3)) * (1, 1, 0)
-    table = rng.uniform(-0.2, 0.2, (1000, 3)) * (1, 1, 0) + (0, 0, 0.7)
-    points = np.concatenate([floor, table]).astype(np.float32)
-    weight = np.concatenate([np.full(4000, 0.1), np.ones(1000)])
-    seen_from = Seen(points, np.array([0.0, 0.0, 1.5]))
-    plane = fit_plane(seen_from, weight, np.random.default_rng(0))
-    assert plane is not None
-    assert plane.offset == pytest.approx(0.7, abs=0.002)
-
-
 def test_a_wall_is_a_plane_only_where_it_may_be_steep() -> None:
     rng = np.random.default_rng(1)
     wall = (rng.uniform(-0.3, 0.3, (2000, 3)) * (1, 0, 1)).astype(np.float32)  # plane y = 0
@@ -80,24 +67,6 @@ def test_a_wall_is_a_plane_only_where_it_may_be_steep() -> None:
 def seen(points: np.ndarray, factor: float, camera: np.ndarray = CAMERA) -> np.ndarray:
     """The points as a camera sees them whose depths are wrong by a factor."""
     return (camera + factor * (points - camera)).astype(np.float32)
-
-
-SCENE, BARE = scene(np.random.default_rng(0)), scene(np.random.default_rng(0), on_table=0)
-
-
-@pytest.mark.parametrize(
-    ("points", "camera"),
-    [
-        pytest.param(scene(np.random.default_rng(0), table=0), CAMERA, id="no table"),
-        pytest.param(np.empty((0, 3)), CAMERA, id="no points"),
-        pytest.param(seen(BARE, 1.3), CAMERA, id="out of reach"),
-        pytest.param(SCENE, np.array([0.0, -0.5, 0.02]), id="camera below it"),
-        pytest.param(SCENE, np.array([0.0, 0.0, 1e9]), id="camera in millimetres"),
-    ],
-)
-def test_without_its_plane_there_is_no_factor(points: np.ndarray, camera: np.ndarray) -> None:
-    plane = SupportPlane(**PLANE).model_copy(update={"max_depth_error": 0.05})
-    assert depth_scale(points, camera, plane) is None
 
 
 def test_every_view_has_a_factor_of_its_own() -> None:

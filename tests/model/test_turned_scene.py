@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from edgegrasp_model.options import DetectOptions
-from edgegrasp_model.scene.cloud import CanonicalFrame, CloudInput
+from edgegrasp_model.scene.cloud import CloudInput
 
 from .scenes import box_on_table, detector
 
@@ -107,9 +107,3 @@ def test_a_turned_scene_has_the_same_grasps_turned(request_of, seed) -> None:
             and abs(b.width - a.width) < 1e-3
             for b in same
         )
-
-
-def test_points_on_a_vertical_line_still_have_a_frame() -> None:
-    points = np.float32([[0, 0, 0.1], [0, 0, 0.2], [0, 0, 0.3]])
-    frame = CanonicalFrame.of_scene(points, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
-    assert np.linalg.det(frame.T_canonical_cloud) == pytest.approx(1.0)

@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import json
 import os
-import signal
 import socket
 import struct
 import subprocess
@@ -30,7 +29,6 @@ from tests.programs import run
 from edgegrasp.v1 import grasp_pb2, grasp_pb2_grpc
 from edgegrasp_client import GraspClient
 from edgegrasp_service.front.connections import HEALTH_PLACES, PAGES
-from edgegrasp_service.worker.job import PIECE
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 30
@@ -333,34 +331,6 @@ async def test_a_health_check_waits_for_no_other_calls(serve) -> None:
         time.sleep(0.5)  # all of them arrive before this event loop looks
         await running.until(lambda: len(order) == 90)
     assert order.index("HealthCheck") < 10
-
-
-async def test_pages_take_no_threads(serve, monkeypatch) -> None:
-    running = await serve()
-    async with httpx.AsyncClient(base_url=running.server.http_url, timeout=PATIENCE) as http:
-        with monkeypatch.context() as patched:
-            patched.setattr(threading.Thread, "start", lambda thread: pytest.fail("a thread"))
-            for path in ("/docs/assets/swagger-ui-bundle.js", "/playground/"):
-                assert (await http.get(path)).status_code == 200
-        assert (await http.post("/playground/style.css")).status_code == 405
-        assert (await http.get("/playground/none.css")).status_code == 404
-
-
-async def test_a_large_body_goes_to_its_worker_in_pieces(serve) -> None:
-    """Or the event loop copies 30 MB at once, for each of many bodies."""
-    running = await serve()
-    (worker,) = running.server.pool._workers
-    os.kill(worker.pid, signal.SIGSTOP)
-    try:
-        async with httpx.AsyncClient(base_url=running.server.http_url, timeout=PATIENCE) as http:
-            asked = asyncio.create_task(http.post("/v1/grasps", content=bytes(30 * MIB)))
-            await running.until(lambda: running.server.pool.busy == 1)
-            await asyncio.sleep(0.1)
-            assert 0 < worker._writer.transport.get_write_buffer_size() <= 2 * PIECE
-            os.kill(worker.pid, signal.SIGCONT)
-            assert (await asked).status_code >= 400
-    finally:
-        os.kill(worker.pid, signal.SIGCONT)
 
 
 async def test_answers_of_pages_are_given_up_too(serve) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.cloud_files import npy
 from tests.many_options import MANY
+from tests.model.scenes import box_on_table
 from typer.testing import CliRunner
 
 from edgegrasp_cli import main
@@ -27,25 +28,12 @@ def catalogue() -> ModelCatalogue:
 
 
 @pytest.fixture(scope="module")
-def box() -> np.ndarray:
-    """The visible surface of a box that fits the hand, metres."""
-    rng = np.random.default_rng(0)
-    surface = rng.uniform(-1.0, 1.0, (6000, 3))
-    axis = rng.integers(0, 3, 6000)
-    surface[np.arange(6000), axis] = np.where(rng.random(6000) < 0.5, -1.0, 1.0)
-    surface[axis == 2, 2] = 1.0
-    return (surface * (0.02, 0.03, 0.05) + (0, 0, 0.05)).astype(np.float32)
-
-
-@pytest.fixture(scope="module")
-def scene(box: np.ndarray) -> dict[str, np.ndarray]:
-    """The box on a table, as the arrays of an .npz file."""
-    rng = np.random.default_rng(1)
-    table = np.column_stack([rng.uniform(-0.2, 0.2, (6000, 2)), rng.normal(0.0, 5e-4, 6000)])
-    points = np.concatenate([box, table]).astype(np.float32)
+def scene() -> dict[str, np.ndarray]:
+    """A box on a table, as the arrays of an .npz file."""
+    points = box_on_table(3000, table=True)
     return {
         "points": points,
-        "segment_ids": np.repeat(np.array([2, 1], np.int32), 6000),
+        "segment_ids": np.repeat(np.array([2, 1], np.int32), [9000, 3000]),
         "view_ids": (points[:, 0] < 0).astype(np.int32),
     }
 
@@ -111,7 +99,7 @@ def test_scores_are_the_same_everywhere(catalogue, scene, real_server) -> None:
     points, detector, parsed = scene["points"], catalogue.get(), parse_options(options)
     found = detector.detect(points, parsed).grasps
     poses = np.stack([grasp.T_cloud_hand for grasp in found])
-    edges = np.random.default_rng(2).integers(0, 6000, (40, 2))
+    edges = np.random.default_rng(2).integers(0, 9000, (40, 2))
     for given in ({"edges": edges}, {"hand_poses": poses}):
         expected = detector.score(points, parsed, **given)
         assert any(evaluation.grasp for evaluation in expected.evaluations)

@@ -70,7 +70,7 @@ async def test_what_is_there_already_counts_and_is_looked_at_once(serve, cloud, 
 
 
 async def test_how_many_files_lie_there_costs_nothing_later(tmp_path, monkeypatch) -> None:
-    for number in range(60_000):
+    for number in range(2_000):
         os.mknod(tmp_path / f"20200101T000000{number:06}Z-old.job")
     recorder = Recorder(tmp_path, 2**20, lambda size: True)
     for looks in ("scandir", "listdir"):
@@ -79,7 +79,7 @@ async def test_how_many_files_lie_there_costs_nothing_later(tmp_path, monkeypatc
         recorder.record(Job("DetectGrasps", "http", bytes(600), 1.0), Answer(b"", Facts()))
     recorder.close()
     monkeypatch.undo()
-    assert len([*tmp_path.glob("*.job")]) == 60_003
+    assert len([*tmp_path.glob("*.job")]) == 2_003
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:

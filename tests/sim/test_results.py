@@ -63,13 +63,6 @@ def test_an_arm_s_figures_are_those_of_its_motions() -> None:
     assert summarise(ROUNDS)["arm"] is None
 
 
-def test_figures_of_nothing_are_none() -> None:
-    summary = summarise([Round(0, 0, (), (), 0, RoundEnd.CLEARED)])
-    assert summary["grasp_success_rate"]["value"] is None
-    assert summary["declutter_rate"]["wilson_95"] is None
-    assert summary["planning_seconds"] is None
-
-
 def test_times_do_not_change_the_digest_and_outcomes_do() -> None:
     slower = replace(ROUNDS[1], attempts=(replace(HELD, planning_seconds=9.0),))
     assert attempts_digest([slower, ROUNDS[0]]) == attempts_digest(ROUNDS)

@@ -10,30 +10,11 @@ from edgegrasp_model.networks.checkpoint import build_network, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
 from edgegrasp_training.evaluation import (
     Scored,
-    auroc,
-    calibration_error,
     evaluate_scores,
     reliability,
     reliability_tables,
     score_views,
 )
-
-
-def test_auroc_is_the_share_of_pairs_in_the_right_order() -> None:
-    rng = np.random.default_rng(0)
-    logit, label = rng.integers(0, 5, 30).astype(float), rng.integers(0, 2, 30).astype(float)
-    label[:2] = 0, 1
-    pairs = np.subtract.outer(logit[label == 1], logit[label == 0])
-    expected = ((pairs > 0) + 0.5 * (pairs == 0)).mean()
-    assert auroc(logit, label) == pytest.approx(expected)
-    assert np.isnan(auroc(np.zeros(3), np.ones(3)))
-
-
-def test_loss_and_accuracy_of_known_scores() -> None:
-    logit, label = np.array([0.0, np.log(3), -np.log(3)]), np.array([1.0, 1.0, 1.0])
-    found = evaluate_scores(logit, label)
-    assert found.loss == pytest.approx(-np.log([0.5, 0.75, 0.25]).mean())
-    assert found.accuracy == pytest.approx(1 / 3)
 
 
 def test_the_temperature_undoes_overconfidence() -> None:
@@ -45,14 +26,6 @@ def test_the_temperature_undoes_overconfidence() -> None:
     ranges = reliability(expit(found.logit / found.temperature), found.label)
     assert all(each.score == pytest.approx(each.held, abs=0.05) for each in ranges.values())
     assert sum(each.number for each in ranges.values()) == 20_000
-
-
-def test_scores_as_good_as_shares_have_no_calibration_error() -> None:
-    score = np.repeat([0.25, 0.75], 400)
-    held = np.concatenate([np.arange(400) % 4 == 0, np.arange(400) % 4 != 0])
-    assert calibration_error(score, held) == pytest.approx(0.0)
-    assert calibration_error(score, ~held) == pytest.approx(0.5)
-    assert calibration_error(np.ones(4), np.array([True, True, False, False])) == 0.5
 
 
 def test_tables_tell_the_better_weights_from_the_worse_ones_by_group() -> None:

@@ -71,16 +71,6 @@ def test_a_stretched_object_is_longer_by_each_factor(shapes, tmp_path) -> None:
     assert 'scale="0.65000 0.80000 4.00000"' in twice.urdf.read_text()
 
 
-def test_objects_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "box.urdf"
-    path.write_text(
-        '<robot name="box"><link name="a"><visual><geometry><box size="1 1 1"/></geometry>'
-        "</visual></link></robot>"
-    )
-    with pytest.raises(ValueError, match=r"box\.urdf.*plain meshes"):
-        stretched(ObjectModel("box", path), (1.0, 1.0, 1.0), tmp_path)
-
-
 def test_varied_sets_hold_both_sorts_and_depend_on_the_seed_alone(shapes, tmp_path) -> None:
     plain = ObjectSet("plain", shapes[:4])
 

@@ -8,14 +8,10 @@ import torch
 
 from edgegrasp_model.networks.checkpoint import build_network, load_checkpoint, save_checkpoint
 from edgegrasp_model.networks.config import CheckpointMetadata
-from edgegrasp_training.examples import pack_balls, pack_hands, tried_grasps
+from edgegrasp_training.examples import pack_hands, tried_grasps
 from edgegrasp_training.options import TrainingOptions
 from edgegrasp_training.recipes import (
-    LENGTH_UNIT,
     RECIPES,
-    in_metres,
-    in_units,
-    prepare_to_train,
     recipe,
 )
 from edgegrasp_training.training import Trainer
@@ -135,14 +131,6 @@ def test_weights_of_another_network_are_no_start(make_trainer, tmp_path) -> None
         make_trainer(tmp_path / "on", "hands", start=tmp_path / "balls" / "tiny.safetensors")
 
 
-def test_a_cosine_takes_the_learning_rate_to_nothing_by_the_last_step(make_trainer, tmp_path):
-    run = make_trainer(tmp_path, "balls", steps=8, evaluate_every=4)
-    run.run(ignore)
-    rates = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)[:, 1]
-    half, last = 3e-3 * (1 + np.cos(np.pi * np.array([3 / 8, 7 / 8]))) / 2
-    np.testing.assert_allclose(rates, [half, last], rtol=1e-3)
-
-
 def test_a_view_without_labels_is_passed_over(made_up_view, make_trainer, views, tmp_path) -> None:
     view, path = made_up_view(3), tmp_path / "packed_99_0.npz"
     replace(view, success=np.full_like(view.success, -1)).save(path)
@@ -156,27 +144,3 @@ def test_every_recipe_can_be_built_and_an_unknown_one_lists_them() -> None:
         assert recipe(name).name == name
     with pytest.raises(ValueError, match=re.escape(", ".join(RECIPES))):
         recipe("edgegrasp-huge")
-
-
-@pytest.mark.parametrize("name", ["balls", "vn"])
-def test_a_network_trained_in_other_units_scores_the_same_in_metres(made_up_view, networks, name):
-    config = networks[name]
-    grasps = tried_grasps(made_up_view(1), config)
-    batch = pack_balls(grasps, grasps.balls(), config).batch
-    network = build_network(config, torch.Generator().manual_seed(1))
-    prepare_to_train(network)
-    network = network.double()
-    own = replace(
-        batch,
-        points=batch.points.double(),
-        depth=batch.depth.double(),
-        normals=batch.normals.double(),
-        approach=batch.approach.double(),
-    )
-    metres = replace(own, points=own.points * LENGTH_UNIT, depth=own.depth * LENGTH_UNIT)
-    with torch.no_grad():
-        scores = network(own)
-        torch.testing.assert_close(in_metres(network)(metres), scores, rtol=0, atol=0)
-        assert not torch.allclose(network(metres), scores, rtol=0, atol=1e-6)
-    for key, weight in in_units(in_metres(network)).state_dict().items():
-        torch.testing.assert_close(weight, network.state_dict()[key], rtol=0, atol=0)

@@ -1,6 +1,5 @@
 """The worker: the same answer over both transports, facts, deadlines and faults."""
 
-import io
 import json
 from typing import Any
 
@@ -10,7 +9,7 @@ from benchmarks.dummy import DummyCatalogue
 
 from edgegrasp_service.settings import Settings
 from edgegrasp_service.worker.answer import answer
-from edgegrasp_service.worker.job import Answer, Job, pack, receive
+from edgegrasp_service.worker.job import Job
 
 
 class FailingCatalogue(DummyCatalogue):
@@ -33,21 +32,6 @@ class FailingCatalogue(DummyCatalogue):
 def job(points: np.ndarray, remaining: float = 30.0, **options: Any) -> Job:
     body = json.dumps({"points": points.tolist(), "options": options}).encode()
     return Job("DetectGrasps", "http", body, remaining, "application/json")
-
-
-def sent(message: Any) -> Any:
-    """As it is at the other end."""
-    return receive(io.BytesIO(b"".join(pack(message))))
-
-
-def test_facts(points: np.ndarray) -> None:
-    asked = sent(job(points, top_k=3))
-    told: Answer = sent(answer(asked, DummyCatalogue(), Settings()))
-    facts = told.facts
-    assert (facts.model, facts.points, facts.grasps) == ("dummy", 60, 3)
-    assert list(facts.seconds) == ["decode", "prepare", "network", "finish", "encode"]
-    assert facts.counts["returned"] == 3
-    assert facts.traceback == ""
 
 
 def test_a_fault_is_told_to_the_log_alone(points: np.ndarray) -> None:
