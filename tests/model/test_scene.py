@@ -67,6 +67,15 @@ def test_several_cameras_need_to_know_who_saw_what(views: np.ndarray | None, val
     assert (caught.value.field, caught.value.value) == ("view_ids", value)
 
 
+def test_a_cloud_below_the_given_plane_has_no_object() -> None:
+    plane = {"normal": (0.0, 0.0, 1.0), "offset": 0.2}
+    asked = DetectOptions(viewpoint=(0.0, 0.0, 0.5), support=plane)
+    counts: dict[str, int] = {}
+    selected = select_points(check_cloud(sheet(0.1)), asked, counts, [])
+    assert len(selected.number) == 0
+    assert counts["above_support"] == 0
+
+
 def test_a_found_plane_is_taken_away_and_stays_as_an_obstacle() -> None:
     box = np.random.default_rng(2).uniform(-0.02, 0.02, (1000, 3)) + np.array([0, 0, 0.35])
     cloud = np.concatenate([sheet(0.3, 4000), box]).astype(np.float32)
