@@ -206,7 +206,9 @@ def _recognised(
         number = with_risen(number, plan, height[above], margin[above], likely)
         if math.isnan(support.growth):
             number = with_clusters(number, plan)
-            confidence |= dict.fromkeys(range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED)
+            confidence |= dict.fromkeys(
+                range(len(confidence), number.max(initial=-1) + 1), UNRECOGNISED
+            )
     return number, confidence
 
 
