@@ -67,10 +67,20 @@ def test_several_cameras_need_to_know_who_saw_what(views: np.ndarray | None, val
     assert (caught.value.field, caught.value.value) == ("view_ids", value)
 
 
-def test_a_cloud_below_the_given_plane_has_no_object() -> None:
-    plane = {"normal": (0.0, 0.0, 1.0), "offset": 0.2}
-    asked = DetectOptions(viewpoint=(0.0, 0.0, 0.5), support=plane)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"viewpoint": (0.0, 0.0, 0.5), "support": {"normal": (0.0, 0.0, 1.0), "offset": 0.2}},
+        {
+            "support": {"normal": (0.0, 0.6, 0.8), "offset": 0.2},
+            "workspace": {"min": (1.0, 1.0, 1.0), "max": (1.1, 1.1, 1.1)},
+        },
+    ],
+    ids=["below the plane", "outside the workspace"],
+)
+def test_nothing_above_a_given_plane_is_no_error(options: dict[str, object]) -> None:
     counts: dict[str, int] = {}
+    asked = DetectOptions.model_validate(options)
     selected = select_points(check_cloud(sheet(0.1)), asked, counts, [])
     assert len(selected.number) == 0
     assert counts["above_support"] == 0

@@ -321,11 +321,12 @@ class CanonicalFrame:
         """The frame of a scene; it rotates and moves with the scene.
 
         Args:
-            points: (N, 3) metres.
+            points: (N, 3) metres; without any, the origin stays.
             up: (3,) of any length but zero.
             viewpoint: (3,) the camera. If unknown or straight above, x points to the farthest point
                 instead.
         """
+        points = points if len(points) else np.zeros((1, 3), dtype=np.float32)
         origin = points.mean(axis=0, dtype=np.float64)
         z = np.asarray(up, dtype=np.float64)
         z = z / np.linalg.norm(z)
